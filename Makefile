@@ -1,0 +1,56 @@
+# Everything starts here: `make train` and `make test` set up what they need.
+#
+# People without a GPU can name an index of CPU-only torch wheels, which saves gigabytes:
+#   make train TORCH_INDEX=...
+
+VENV ?= .venv
+PYTHON ?= python3
+TORCH_INDEX ?=
+ENV ?= LunarLander-v3
+ARGS ?=
+
+PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
+	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+
+.PHONY: train test test-slow lint format types bench setup setup-dev clean
+
+train: setup  ## Train LunarLander until it lands.
+	$(VENV)/bin/udrl train $(ENV) --stop-return 100 $(ARGS)
+
+test: setup-dev  ## The tests, except the slow ones.
+	$(VENV)/bin/python -m pytest -m "not slow" -n 2 $(ARGS)
+
+test-slow: setup-dev  ## What is too slow for `make test`.
+	$(VENV)/bin/python -m pytest -m slow $(ARGS)
+
+lint: setup-dev  ## Linter, formatter, and the direction of imports.
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/lint-imports
+
+format: setup-dev  ## Format the code.
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+types: setup-dev  ## The type checker.
+	$(VENV)/bin/mypy
+
+bench: setup-dev  ## Speed: the whole system beside the limit of its parts (docs/performance.md).
+	$(VENV)/bin/python benchmarks/speed.py $(ARGS)
+
+setup: $(VENV)/.installed
+setup-dev: $(VENV)/.installed-dev
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
+	$(PIP_INSTALL) --editable '.[box2d,plot]'
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(PIP_INSTALL) --editable '.[box2d,plot,dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

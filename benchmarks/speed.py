@@ -1,0 +1,250 @@
+"""The whole system's env steps per second beside the limit that its parts set.
+
+One training run with the shipped preset is measured in steady state, evaluation steps counted too.
+Then its parts are timed alone, on the same machine: a bare environment step (replaying actions that
+the run recorded), a row of batched inference, an update. From these::
+
+    limit = cores / (step + inference + update x updates per env step)
+
+Run it on an otherwise idle machine: ``make bench``.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import torch
+
+from udrl.acting import EpisodeGenerator
+from udrl.algorithm1 import algorithm1
+from udrl.behavior import initialise
+from udrl.commands import TRAINING_SEEDS
+from udrl.config import Budget, Config
+from udrl.environments import make_environment
+from udrl.episode import Episode
+from udrl.errors import UdrlError
+from udrl.numerics import use_one_thread
+from udrl.segments import Experience
+from udrl.streams import Purpose, Stream, stream_key
+from udrl.training import train, untrained
+from udrl_launch.inspection import load_agent, status_of
+from udrl_proto.codec import LARGEST, decode, decode_episode
+from udrl_proto.messages import EpisodeMessage, Hello
+from udrl_replay.store import Store
+
+_TICK = os.sysconf("SC_CLK_TCK")
+
+
+class Window(NamedTuple):
+    """What happened in the steady part of a run."""
+
+    seconds: float
+    steps: int
+    iterations: int
+
+
+class Parts(NamedTuple):
+    """Seconds of each part alone."""
+
+    step: float
+    inference: float
+    update: float
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="LunarLander-v3")
+    parser.add_argument("--max-env-steps", type=int, default=1_000_000)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--lead", type=int)
+    parser.add_argument("--actors", type=int, default=2)
+    parser.add_argument("--envs-per-actor", type=int, default=16)
+    options = parser.parse_args()
+    use_one_thread()
+    print(f"machine: {_machine()}")
+    rows = [measure(options, Path(folder)) for folder in _folders(options.repeats)]
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        low, middle, high = min(values), statistics.median(values), max(values)
+        print(f"{name:58} {middle:12,.2f}   ({low:,.2f} to {high:,.2f})")
+
+
+def _folders(count: int) -> Any:
+    for _ in range(count):
+        with tempfile.TemporaryDirectory() as folder:
+            yield folder
+
+
+def _machine() -> str:
+    model = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in x]
+    name = model[0].split(":")[1].strip() if model else platform.processor()
+    versions = f"Python {platform.python_version()}, torch {torch.__version__}"
+    return f"{os.cpu_count()} cores, {name}, {versions}"
+
+
+def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """Return the figures of one run."""
+    run_dir = folder / "run"
+    status, replay_cpu = _train(options, run_dir)
+    window = _window(run_dir)
+    with closing(Store(run_dir, read_only=True)) as store:
+        config = store.fact("hello", Hello).config
+        held = [p.entry.id for p in store.buffer(status["iteration"])]
+        bodies = [store.episode_bodies([i], LARGEST)[0] for i in held]
+    episodes = [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in bodies]
+    parts = _parts(config, episodes)
+    cores = os.cpu_count() or 1
+    per_step = config.n_updates_per_iter * window.iterations / window.steps
+    limit = cores / (parts.step + parts.inference + parts.update * per_step)
+    system = window.steps / window.seconds
+    return {
+        "bare environment step, us": parts.step * 1e6,
+        "bare environment, random actions, env steps/s per core": _random_speed(config),
+        "inference, us per row (full call)": parts.inference * 1e6,
+        "update, ms": parts.update * 1e3,
+        "updates per env step": per_step,
+        "limit, env steps/s": limit,
+        "system, env steps/s": system,
+        "system / limit": system / limit,
+        "reference implementation (1 core), env steps/s": _reference_speed(config),
+        "replay service, CPU ms per episode (start-up included)": 1e3
+         * replay_cpu / status["episodes"]["delivered"],
+        "episode on the wire, bytes per env step": sum(map(len, bodies))
+        / sum(e.length for e in episodes),
+        "weights, bytes per iteration": len(load_agent(run_dir).weights),
+        "weights trained to weights acting, ms": 1e3 * status["weights_lag_s"],
+    }  # fmt: skip
+
+
+def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], float]:
+    """Train; return the last live status and the CPU seconds that the replay service used."""
+    command = [
+        sys.executable, "-m", "udrl_launch", "train", options.env, "--run-dir", str(run_dir),
+        "--max-env-steps", str(options.max_env_steps), "--actors", str(options.actors),
+        "--envs-per-actor", str(options.envs_per_actor), "--json",
+    ]  # fmt: skip
+    if options.lead is not None:
+        command += ["--lead", str(options.lead)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert process.stdout is not None
+    cpu = 0.0
+    lags: list[float] = []
+    while process.poll() is None:
+        cpu = max(cpu, _cpu_of_replay(run_dir))
+        with contextlib.suppress(UdrlError):
+            lags.append(status_of(run_dir).weights_lag_s)
+        time.sleep(2)
+    status: dict[str, Any] = json.loads(process.stdout.read().strip().splitlines()[-1])
+    status["weights_lag_s"] = statistics.median(lags)
+    return status, cpu
+
+
+def _cpu_of_replay(run_dir: Path) -> float:
+    try:
+        pid = json.loads((run_dir / "endpoint.json").read_text())["pid"]
+        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    except (OSError, ValueError, KeyError):
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / _TICK
+
+
+def _window(run_dir: Path) -> Window:
+    """Return the second half of the run."""
+    lines = (run_dir / "metrics.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
+    total = [int(r["env_steps"]) + int(r["eval_env_steps"]) for r in rows]
+    first = next(i for i, t in enumerate(total) if t >= total[-1] / 2)
+    return Window(
+        float(rows[-1]["wall_s"]) - float(rows[first]["wall_s"]),
+        total[-1] - total[first],
+        len(rows) - 1 - first,
+    )
+
+
+def _parts(config: Config, episodes: list[Episode]) -> Parts:
+    generator = EpisodeGenerator(config, 1)
+    spec = generator.spec
+    env = make_environment(config)
+    steps = 0
+    began = time.perf_counter()
+    for episode in episodes[-200:]:
+        env.reset(seed=_seed_of(config, episode.command_id))
+        for action in episode.actions.tolist():
+            env.step(action)
+        steps += episode.length
+    step = (time.perf_counter() - began) / steps
+
+    behavior = initialise(config, spec)
+    rows = config.inference_rows
+    observation, command = torch.zeros(rows, spec.observation_size), torch.zeros(rows, 2)
+    with torch.inference_mode():
+        inference = _seconds(lambda: behavior(observation, command), 5000) / rows
+
+    experience = Experience(config, spec)
+    for episode in episodes:
+        experience.add(episode)
+    state = untrained(config, spec)
+    ranked = experience.by_rank([e.command_id for e in episodes])
+    update = _seconds(lambda: train(state, ranked, config), 5) / config.n_updates_per_iter
+    return Parts(step, inference, update)
+
+
+def _seed_of(config: Config, command_id: int) -> int:
+    iteration, index = divmod(command_id, 1_000_000)
+    stream = Stream(stream_key(config.seed, Purpose.COMMANDS, iteration, 0))
+    return int(stream.integers(index + 1, *TRAINING_SEEDS)[index])
+
+
+def _seconds(work: Callable[[], object], times: int) -> float:
+    work()
+    began = time.perf_counter()
+    for _ in range(times):
+        work()
+    return (time.perf_counter() - began) / times
+
+
+def _random_speed(config: Config) -> float:
+    env = make_environment(config)
+    actions = Stream(stream_key(0, Purpose.PROBE, 9)).integers(200_000, 0, int(env.action_space.n))  # type: ignore[attr-defined]
+    env.reset(seed=1)
+    began = time.perf_counter()
+    steps = 0
+    for action in actions.tolist():
+        _, _, terminated, truncated, _ = env.step(action)
+        steps += 1
+        if terminated or truncated:
+            env.reset()
+            if time.perf_counter() - began > 3:
+                break
+    return steps / (time.perf_counter() - began)
+
+
+def _reference_speed(config: Config) -> float:
+    began: list[tuple[float, int]] = []
+    algorithm1(
+        msgspec.structs.replace(config, lead=0, eval_every=2**30),
+        Budget(max_env_steps=150_000),
+        report=lambda run: began.append((time.perf_counter(), run.env_steps)),
+    )
+    (t0, s0), (t1, s1) = began[len(began) // 2], began[-1]
+    return (s1 - s0) / (t1 - t0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Writes ``docs/cli.md``, the reference of the command line, from the command line itself.
+
+::
+
+    .venv/bin/python docs/make_cli.py
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+from click.types import FloatRange, IntRange
+
+from udrl.config import Budget, Config
+from udrl_launch.cli import cli
+from udrl_launch.settings import Fleet
+
+PAGE = Path(__file__).with_name("cli.md")
+
+_HEAD = """\
+# Command line
+
+<!-- Written by docs/make_cli.py; edit the help texts in services/launch/udrl_launch/cli.py. -->
+
+{about} `python -m udrl_launch` is the same command.
+
+| command | |
+|---|---|
+{index}
+
+- `ENV` is a Gymnasium id, registered (`LunarLander-v3`) or importable (`package.module:Env-v0`).
+- `RUN_DIR` is the [directory of a run](operations.md#the-run-directory).
+- An endpoint is `tcp/HOST:PORT`, e.g. `tcp/127.0.0.1:7447`.
+
+Every command has `--help`, and `udrl --version` prints the version. Results go to standard output;
+progress, logs and errors go to standard error. An error is one line that names the value, what was
+expected and the remedy. The [exit code](operations.md#exit-codes) says of which kind it is.
+
+Settings that have no option of their own are set with `--set NAME=VALUE`, or in a file named by
+`--config`: see [configuration](configuration.md).
+"""
+
+_SETTINGS = {name for kind in (Config, Budget, Fleet) for name in kind.__struct_fields__}
+_TYPES = {"float": "NUMBER", "float range": "NUMBER", "integer range": "INTEGER"}
+
+
+def page() -> str:
+    """Return the text of ``docs/cli.md``."""
+    commands = cli.commands.items()
+    index = "\n".join(
+        f"| [`udrl {name}`](#udrl-{name}) | {_prose(command)[0]} |" for name, command in commands
+    )
+    sections = [_HEAD.format(about=str(cli.help).strip(), index=index)]
+    sections += ["\n".join(_section(name, command)) for name, command in commands]
+    return "\n".join(sections)
+
+
+def _section(name: str, command: click.Command) -> Iterator[str]:
+    about, example = _prose(command)
+    options = [p for p in command.params if isinstance(p, click.Option) and not p.hidden]
+    usage = ["udrl", name]
+    for param in command.params:
+        if isinstance(param, click.Argument):
+            metavar = str(param.name).upper()
+            usage.append(metavar if param.required else f"[{metavar}]")
+    usage += [_signature(option) for option in options if option.required]
+    yield f"## udrl {name}\n"
+    yield f"    {' '.join(usage)}{' [OPTIONS]' if options else ''}\n"
+    yield f"{about}\n"
+    if example:
+        yield f"```sh\n{example}\n```\n"
+    if options:
+        yield "| option | meaning |\n|---|---|"
+    for option in options:
+        yield f"| `{_signature(option)}` | {' '.join(_meaning(option))} |"
+    yield ""
+
+
+def _prose(command: click.Command) -> tuple[str, str]:
+    """Return a command's description and its example."""
+    about, _, example = " ".join(str(command.help).split()).partition(" Example: ")
+    return about, example
+
+
+def _signature(option: click.Option) -> str:
+    if option.is_flag:
+        return option.opts[0]
+    kind = option.metavar or _TYPES.get(option.type.name, option.type.name.upper())
+    return f"{option.opts[0]} {kind}".replace("|", "\\|")
+
+
+def _meaning(option: click.Option) -> Iterator[str]:
+    if option.help:
+        yield option.help
+    if isinstance(option.type, IntRange | FloatRange):
+        low, high = option.type.min, option.type.max
+        yield f"At least {low:,}." if high is None else f"{low:,} to {high:,}."
+    default = option.to_info_dict()["default"]
+    if option.required:
+        yield "Required."
+    elif default is not None and not option.is_flag:
+        yield f"Default: `{default}`."
+    if option.name in _SETTINGS:
+        yield f"Sets [`{option.name}`](configuration.md)."
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,319 @@
+"""Write the golden vectors: ``python proto/golden/make.py``.
+
+Every message type has one example here. Its bytes are in ``<name>.msgpack`` and its values in
+``README.md``; ``streams.json`` and ``choices.json`` are test vectors for an actor's arithmetic.
+"""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from udrl.commands import Command
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.streams import Purpose, Stream, stream_key
+from udrl_proto.codec import decode, encode, encode_array, encode_episode
+from udrl_proto.messages import (
+    Acknowledged,
+    ActorStatus,
+    BufferStatus,
+    ChangesReply,
+    ChangesRequest,
+    CommandLedger,
+    CommandsReply,
+    CommandsRequest,
+    EpisodeLedger,
+    EpisodeMessage,
+    EpisodeReply,
+    EpisodesReply,
+    EpisodesRequest,
+    EvaluationStatus,
+    FailureMessage,
+    Hello,
+    HelloRequest,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Problem,
+    Progress,
+    StateReply,
+    StateRequest,
+    Status,
+    StatusRequest,
+    VersionMessage,
+    VersionReply,
+    Wait,
+    Waiting,
+    Weights,
+    WeightsRequest,
+)
+
+FOLDER = Path(__file__).parent
+
+CONFIG = Config(
+    environment="CartPole-v1",
+    environment_kwargs={"sutton_barto_reward": False},
+    max_return=500.0,
+    seed=7,
+    lead=1,
+    batch_size=256,
+    horizon_scale=0.02,
+    last_few=50,
+    learning_rate=0.001,
+    n_episodes_per_iter=15,
+    n_updates_per_iter=100,
+    n_warm_up_episodes=30,
+    replay_size=300,
+    return_scale=0.02,
+    hidden=(32, 64, 64),
+    eval_every=20_000,
+)
+ENVIRONMENT = EnvironmentSpec(
+    observation_size=4, n_actions=2, max_episode_steps=500, max_return=500.0
+)
+EPISODE = Episode(
+    command_id=5_000_003,
+    observations=np.array(
+        [[0.0, 0.5, -0.25, 1.0], [0.125, -1.5, 0.75, -0.0], [3.0, 1e-3, -2.5, 0.1]], np.float32
+    ),
+    actions=np.array([1, 0, 1], np.uint8),
+    rewards=np.array([1.0, 1.0, -0.5], np.float32),
+    terminated=True,
+    truncated=False,
+)
+COMMAND = Command(
+    id=5_000_003,
+    kind="explore",
+    desired_return=212.40625,
+    desired_horizon=198,
+    environment_seed=4_321_987,
+    stream_key=stream_key(7, Purpose.EPISODE, 5, 3),
+    weights_version=4,
+    max_steps=500,
+)
+EVALUATION = EvaluationStatus(
+    iteration=4,
+    env_steps=20_113,
+    mean=187.25,
+    std=12.5,
+    ci95_low=184.8,
+    ci95_high=189.7,
+    episodes=100,
+)
+COMMANDS = CommandLedger(issued=120, accepted=100, cancelled=0, outstanding=20)
+EPISODES = EpisodeLedger(delivered=103, accepted=100, duplicate=2, rejected=1)
+BUFFER = BufferStatus(episodes=90, return_min=21.0, return_mean=95.5, return_max=500.0)
+ACTOR = ActorStatus(
+    id="actor-1",
+    host="node7",
+    environments=16,
+    env_steps_per_s=9120.5,
+    weights_version=4,
+    weights_lag=1,
+    running=12,
+    last_seen_s=0.125,
+)
+WAITING = Waiting(who="actor actor-1", on="learner", why="weights version 6", seconds=0.25)
+
+#: One example of every message type.
+EXAMPLES: tuple[Message, ...] = (
+    encode_array(np.arange(6, dtype=np.int32).reshape(2, 3)),
+    Wait(on="learner: weights version 6", retry_after_s=0.28125),
+    Problem(code="rewind", message="version 6 is next, not 5; ask for the state"),
+    HelloRequest(),
+    Hello(
+        protocol=1,
+        software="0.1.0",
+        run_id="cartpole-v1-seed7-20260102-030405-678901",
+        config=CONFIG,
+        environment=ENVIRONMENT,
+        acting_class="0123456789abcdef",
+    ),
+    JoinRequest(
+        role="actor",
+        id="actor-1",
+        host="node7",
+        pid=4242,
+        software="0.1.0",
+        environments=16,
+        numerics_class="0123456789abcdef",
+        environment=ENVIRONMENT,
+    ),
+    JoinReply(),
+    CommandsRequest(
+        actor="actor-1",
+        wanted=4,
+        running=(5_000_001, 5_000_007),
+        spare_cores=1.5,
+        env_steps_per_s=9120.5,
+        weights_version=4,
+    ),
+    CommandsReply(commands=(COMMAND,)),
+    decode(encode_episode(EPISODE, "actor-1"), EpisodeMessage),
+    EpisodeReply(result="accepted"),
+    FailureMessage(
+        actor="actor-1",
+        command_id=5_000_003,
+        error="the environment failed in step() under command 5000003 (seed 4321987): no fuel",
+    ),
+    Acknowledged(),
+    ChangesRequest(learner="learner-1", version=6),
+    ChangesReply(ids=(5_000_003, 29, 4_000_000)),
+    EpisodesRequest(ids=(5_000_003, 29)),
+    EpisodesReply(episodes=(encode_episode(EPISODE, "actor-1"),)),
+    VersionMessage(
+        learner="learner-1",
+        version=6,
+        weights=b"safetensors of the weights",
+        optimizer=b"safetensors of Adam's state",
+        loss=0.6875,
+        train_s=0.25,
+    ),
+    VersionReply(result="duplicate"),
+    StateRequest(learner="learner-1"),
+    StateReply(version=5, weights=b"safetensors", optimizer=b"safetensors"),
+    WeightsRequest(version="latest"),
+    Weights(version=5, weights=b"safetensors"),
+    Progress(iteration=5),
+    StatusRequest(),
+    COMMANDS,
+    EPISODES,
+    BUFFER,
+    ACTOR,
+    WAITING,
+    EVALUATION,
+    Status(
+        run_id="cartpole-v1-seed7-20260102-030405-678901",
+        state="running",
+        environment="CartPole-v1",
+        iteration=5,
+        env_steps=24_120,
+        eval_env_steps=18_725,
+        env_steps_per_s=9120.5,
+        wall_s=6.125,
+        max_env_steps=200_000,
+        time_left_s=44.5,
+        commands=COMMANDS,
+        episodes=EPISODES,
+        buffer=BUFFER,
+        weights_version=5,
+        weights_lag=1,
+        weights_lag_s=0.0125,
+        weights_sha256="ab" * 32,
+        replay_sha256="cd" * 32,
+        loss=0.6875,
+        evaluation=EVALUATION,
+        closing_evaluation=None,
+        exact=True,
+        inexact_reason="",
+        useful_concurrency=30,
+        env_failures=0,
+        actors=(ACTOR,),
+        waiting=(WAITING,),
+        problem="",
+    ),
+)
+
+_STREAMS = (
+    (7, Purpose.EPISODE, 5, 3),
+    (7, Purpose.COMMANDS, 5, -1),
+    (0, Purpose.PROBE, 0, 0),
+    (2**63 - 1, Purpose.TRAINING, 1, 0),
+)
+_LOGITS = ((0.0, 0.0, 0.0), (1.5, -0.25, 0.125), (-100.0, 0.0, 100.0), (2.0, 2.0, 1.0))
+
+_INTRODUCTION = """\
+# Golden vectors
+
+Bytes to test a codec and an actor's arithmetic with; [the protocol](../README.md) says what they
+mean. All files here are written by `make.py` and checked by the tests.
+
+- `<name>.msgpack` holds one message, and the same name below has its values: as JSON, with bytes as
+  `hex:...`. An encoder must give values that decode to these; the order of fields and the width of
+  numbers are free, but ours are in the order shown, with the shortest form of every integer.
+- `streams.json` holds random streams: what the key is made from, the key, the first 64-bit words of
+  Philox4x64-10 and the numbers that are made of them.
+- `choices.json` holds choices of the first action of an episode: the key of its stream, the first
+  number u of that, float32 logits, and the action; `greedy` is the action of a greedy command.
+
+"""
+
+
+def file_name(message: Message) -> str:
+    """Return the file of a message: ``CommandsRequest`` is in ``commands-request.msgpack``."""
+    words = re.findall(r"[A-Z][a-z]*", type(message).__name__)
+    return "-".join(words).lower() + ".msgpack"
+
+
+def as_json(value: Any) -> str:
+    """Return plain values as JSON, with bytes as ``hex:...``."""
+    text: str = json.dumps(value, indent=1, default=lambda data: f"hex:{data.hex()}")
+    return text
+
+
+def streams() -> list[dict[str, Any]]:
+    """Return the first numbers of some random streams; words are text, since they have 64 bits."""
+    found = []
+    for address in _STREAMS:
+        key = stream_key(*address)
+        words = np.random.Philox(key=int.from_bytes(key, "little")).random_raw(9)
+        found.append(
+            {
+                "hashed": "udrl/stream/1|" + "|".join(map(str, address)),
+                "key": key.hex(),
+                "words": [str(word) for word in words],
+                "numbers": Stream(key).uniforms(9).tolist(),
+            }
+        )
+    return found
+
+
+def choices() -> list[dict[str, Any]]:
+    """Return the first actions of some episodes, chosen one by one as the protocol says."""
+    found = []
+    for logits in _LOGITS:
+        for index in range(5):
+            key = stream_key(7, Purpose.EPISODE, 5, index)
+            (u,) = Stream(key).uniforms(1).tolist()
+            found.append(
+                {
+                    "key": key.hex(),
+                    "u": u,
+                    "logits": list(logits),
+                    "action": choose(logits, u),
+                    "greedy": logits.index(max(logits)),
+                }
+            )
+    return found
+
+
+def choose(logits: tuple[float, ...], u: float) -> int:
+    """Return the action for logits and a number of the stream."""
+    total = 0.0
+    cumulative = [total := total + math.exp(x - max(logits)) for x in logits]
+    return min(sum(c <= u * total for c in cumulative), len(logits) - 1)
+
+
+def contents() -> dict[str, bytes]:
+    """Return every golden file by its name."""
+    files = {file_name(message): encode(message) for message in EXAMPLES}
+    readme = _INTRODUCTION
+    for message in EXAMPLES:
+        plain = msgspec.to_builtins(message, builtin_types=(bytes,))
+        readme += f"## `{file_name(message)}`: {type(message).__name__}\n\n"
+        readme += f"```json\n{as_json(plain)}\n```\n\n"
+    files["README.md"] = (readme.rstrip() + "\n").encode()
+    files["streams.json"] = (as_json(streams()) + "\n").encode()
+    files["choices.json"] = (as_json(choices()) + "\n").encode()
+    return files
+
+
+if __name__ == "__main__":
+    for name, content in contents().items():
+        (FOLDER / name).write_bytes(content)

@@ -1,0 +1,181 @@
+"""Opening Zenoh sessions: the settings that every service of a run shares."""
+
+import ipaddress
+import json
+import logging
+import re
+import threading
+import time
+
+import zenoh
+
+from udrl.errors import ConfigError, Interrupted, Unreachable
+from udrl_proto import PROTOCOL, keys
+from udrl_proto.codec import decode, encode
+from udrl_proto.messages import Hello, HelloRequest
+
+log = logging.getLogger("udrl")
+
+_ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9a-fA-F:]+\]|[^:/\s\[\]]+):(?P<port>\d+)")
+
+#: A hung or cut-off service is noticed after this many milliseconds.
+LEASE_MS = 2000
+
+
+def check_endpoint(endpoint: str) -> str:
+    """Return an endpoint as it came.
+
+    Raises:
+        ConfigError: it is not one.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or not 0 < int(match["port"]) < 65536:
+        raise ConfigError(f"endpoint {endpoint!r}: expected tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+    return endpoint
+
+
+def _is_loopback(endpoint: str) -> bool:
+    match = _ENDPOINT.fullmatch(endpoint)
+    assert match is not None
+    host = match["host"].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _config(mode: str) -> zenoh.Config:
+    config = zenoh.Config()
+    for path, value in {
+        "mode": mode,
+        # Peers are named, never searched for: scouting costs 0.5 s and crosses site borders.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        # Silent losses are reported for shared memory when a receiver is descheduled.
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def listen(endpoint: str, *, insecure: bool = False) -> zenoh.Session:
+    """Open a session that is the router of a run.
+
+    Args:
+        endpoint: where others connect to.
+        insecure: allow an endpoint beyond loopback although nobody is authenticated.
+
+    Raises:
+        ConfigError: the endpoint is malformed, in use, or would let strangers in.
+    """
+    if not _is_loopback(check_endpoint(endpoint)) and not insecure:
+        raise ConfigError(
+            f"endpoint {endpoint!r} can be reached from other machines and nobody would be "
+            f"authenticated; listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
+        )
+    config = _config("router")
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"cannot listen on {endpoint!r}: {error}; is the port in use? choose another endpoint"
+        ) from error
+
+
+def connect(endpoint: str, patience_s: float, stop: threading.Event | None = None) -> zenoh.Session:
+    """Open a session with the router at an endpoint, trying again until it is there.
+
+    Raises:
+        ConfigError: the endpoint is malformed.
+        Unreachable: nobody answers within ``patience_s`` seconds.
+        Interrupted: ``stop`` was set meanwhile.
+    """
+    config = _config("client")
+    config.insert_json5("connect/endpoints", json.dumps([check_endpoint(endpoint)]))
+    config.insert_json5("connect/timeout_ms", "1000")
+    began = time.monotonic()
+    stop = stop or threading.Event()
+    pause = 0.05
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            waited = time.monotonic() - began
+            if waited >= patience_s:
+                raise Unreachable(
+                    f"nobody answers at {endpoint!r} after {waited:.0f} s; start `udrl replay ENV "
+                    f"--listen {endpoint}` there, or correct the endpoint"
+                ) from error
+        if pause > 0.4:
+            log.warning("waiting for a replay service or router at %s", endpoint)
+        if stop.wait(pause):
+            raise Interrupted(f"stopped while connecting to {endpoint}")
+        pause = min(2 * pause, 1.0)
+
+
+def find_run(
+    session: zenoh.Session,
+    run_id: str | None,
+    patience_s: float,
+    stop: threading.Event | None = None,
+) -> Hello:
+    """Return the specification of the run that a router carries.
+
+    Args:
+        session: connected to the router.
+        run_id: which run; None: the only one.
+        patience_s: seconds to wait for it to appear.
+        stop: ends the wait.
+
+    Raises:
+        Unreachable: no such run answers.
+        ConfigError: there are several runs and none was named, or it speaks another protocol.
+        Interrupted: ``stop`` was set meanwhile.
+    """
+    deadline = time.monotonic() + patience_s
+    stop = stop or threading.Event()
+    pause = 0.05
+    while True:
+        found = _hellos(session)
+        if run_id is not None:
+            found = {name: hello for name, hello in found.items() if name == run_id}
+        if len(found) > 1:
+            raise ConfigError(
+                f"several runs are here: {', '.join(sorted(found))}; name one: --run RUN"
+            )
+        if found:
+            ((protocol, payload),) = found.values()
+            if protocol != str(PROTOCOL):
+                raise ConfigError(
+                    f"the run speaks protocol {protocol}, this program speaks {PROTOCOL}; "
+                    f"install the same version of udrl on both sides"
+                )
+            return decode(payload, Hello)
+        if time.monotonic() >= deadline:
+            wanted = "no run" if run_id is None else f"no run {run_id!r}"
+            raise Unreachable(
+                f"{wanted} answers after {patience_s:.0f} s; start `udrl replay ENV` or check --run"
+            )
+        if stop.wait(pause):
+            raise Interrupted("stopped while looking for a run")
+        pause = min(2 * pause, 1.0)
+
+
+def _hellos(session: zenoh.Session) -> dict[str, tuple[str, bytes]]:
+    """Return protocol and payload of every run's answer, by run id."""
+    found = {}
+    for reply in session.get(
+        keys.every_hello(),
+        payload=encode(HelloRequest()),
+        timeout=1.0,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    ):
+        if reply.ok is not None:
+            protocol, run_id, _ = keys.parse(str(reply.ok.key_expr))
+            found[run_id] = protocol, reply.ok.payload.to_bytes()
+    return found

@@ -1,0 +1,258 @@
+"""The actor's messenger: a thread that fetches commands and weights and delivers episodes.
+
+The loop that steps environments never waits for the network while it has something to do; the
+loop rests when ``capacity`` episodes wait for delivery.
+"""
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from typing import NamedTuple
+
+import zenoh
+
+from udrl.acting import Failure
+from udrl.behavior import BehaviorFunction
+from udrl.checkpoint import decode_weights
+from udrl.commands import Command
+from udrl.episode import Episode
+from udrl.errors import InvalidMessage, Refused
+from udrl_proto import keys
+from udrl_proto.asking import Asker
+from udrl_proto.codec import LARGEST, decode, encode_episode
+from udrl_proto.messages import (
+    Acknowledged,
+    CommandsReply,
+    CommandsRequest,
+    EpisodeReply,
+    FailureMessage,
+    Hello,
+    JoinReply,
+    JoinRequest,
+    Weights,
+    WeightsRequest,
+)
+
+log = logging.getLogger("udrl")
+
+
+class Order(NamedTuple):
+    """A command and the behavior function to obey it with; None: act at random."""
+
+    command: Command
+    behavior: BehaviorFunction | None
+
+
+class Courier(threading.Thread):
+    """Talks to the replay service for one actor.
+
+    Args:
+        session: connected to the run's router.
+        hello: the run's specification.
+        join: who the actor is.
+        asker: its line to the replay service.
+        stop: ends everything.
+        capacity: episodes that may wait for delivery.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        hello: Hello,
+        join: JoinRequest,
+        asker: Asker,
+        stop: threading.Event,
+        capacity: int,
+    ) -> None:
+        super().__init__(name=f"courier of {join.id}", daemon=True)
+        self._session = session
+        self._hello = hello
+        self._join = join
+        self._asker = asker
+        self._stop_event = stop
+        self._capacity = capacity
+        self._changed = threading.Condition()
+        self._orders: deque[Order] = deque()
+        self._outbox: deque[Episode | Failure] = deque()
+        self._held: set[int] = set()
+        self._free = 0
+        self._steps = 0
+        self._announced: bytes | None = None
+        self._behaviors: dict[int, BehaviorFunction] = {}
+        self._newest = 0
+        self.ended = False
+        self.error: Exception | None = None
+
+    # Called by the loop that steps environments.
+
+    def exchange(
+        self, outcomes: list[Episode | Failure], free: int, steps: int, *, wait_s: float
+    ) -> list[Order]:
+        """Hand over finished episodes and take new orders.
+
+        Args:
+            outcomes: what ended.
+            free: environments that have nothing to do.
+            steps: env steps made since the last call.
+            wait_s: seconds to wait for news when there are no orders.
+        """
+        with self._changed:
+            self._outbox.extend(outcomes)
+            self._free = free
+            self._steps += steps
+            self._changed.notify_all()
+            if not self._orders and wait_s and self._alive():
+                self._changed.wait(wait_s)
+            orders = [self._orders.popleft() for _ in range(min(free, len(self._orders)))]
+            self._free -= len(orders)
+            return orders
+
+    @property
+    def has_orders(self) -> bool:
+        """Whether :meth:`exchange` would return orders at once."""
+        return bool(self._orders)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether so many episodes wait for delivery that no more should be made."""
+        return len(self._outbox) >= self._capacity
+
+    def _alive(self) -> bool:
+        return not (self.ended or self._stop_event.is_set() or self.error is not None)
+
+    # The courier's own thread.
+
+    def run(self) -> None:
+        """Deliver and fetch until the run ends, ``stop`` is set, or the replay service says no."""
+        key = keys.key(self._hello.run_id, keys.NEW_WEIGHTS)
+        subscriber = self._session.declare_subscriber(key, self._note_weights)
+        try:
+            self._work()
+        except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
+            self.error = error
+        finally:
+            subscriber.undeclare()
+            with self._changed:
+                self._changed.notify_all()
+
+    def _work(self) -> None:
+        ask_at = 0.0
+        rate_at, rate = time.monotonic(), 0.0
+        while self._alive():
+            with self._changed:
+                now = time.monotonic()
+                wants = self._free > len(self._orders)
+                if not self._outbox and not (wants and now >= ask_at):
+                    pause = ask_at - now if wants else 0.5
+                    self._changed.wait(min(max(pause, 0.0), 0.5))
+                if self._announced is not None:
+                    ask_at = 0.0
+                outcome = self._outbox[0] if self._outbox else None
+                wanted = self._free - len(self._orders)
+            if outcome is not None:
+                self._deliver(outcome)
+            elif wanted > 0 and time.monotonic() >= ask_at:
+                now = time.monotonic()
+                if now - rate_at >= 1.0:
+                    with self._changed:
+                        rate, self._steps = self._steps / (now - rate_at), 0
+                    rate_at = now
+                ask_at = self._fetch(wanted, rate)
+
+    def _fetch(self, wanted: int, rate: float) -> float:
+        """Ask for commands; return when to ask again at the earliest."""
+        self._learn_announced()
+        request = CommandsRequest(
+            actor=self._join.id,
+            wanted=wanted,
+            running=tuple(sorted(self._held)),
+            spare_cores=(os.cpu_count() or 1) - os.getloadavg()[0],
+            env_steps_per_s=round(rate, 1),
+            weights_version=self._newest,
+        )
+        try:
+            reply = self._asker.ask(keys.COMMANDS, request, CommandsReply)
+        except Refused as refusal:
+            if refusal.code != "join_first":
+                raise
+            self._asker.ask(keys.JOIN, self._join, JoinReply)
+            return 0.0
+        if reply.ended:
+            self.ended = True
+        self._held |= {command.id for command in reply.commands}
+        orders = [order for c in reply.commands if (order := self._order(c)) is not None]
+        with self._changed:
+            self._orders.extend(orders)
+            self._changed.notify_all()
+        return time.monotonic() + (reply.wait.retry_after_s if reply.wait else 0.0)
+
+    def _deliver(self, outcome: Episode | Failure) -> None:
+        if isinstance(outcome, Failure):
+            command_id = outcome.command.id
+            failure = FailureMessage(
+                actor=self._join.id, command_id=command_id, error=str(outcome.error)[:4000]
+            )
+            self._asker.ask(keys.FAILURE, failure, Acknowledged)
+        else:
+            command_id = outcome.command_id
+            try:
+                message = encode_episode(outcome, self._join.id)
+                self._asker.ask(keys.EPISODE, message, EpisodeReply)
+            except Refused as refusal:
+                if refusal.code != "rejected":
+                    raise  # malformed: the next one would be too
+                # Cancelled: the run has ended meanwhile.
+                log.info("episode %d was rejected: %s", command_id, refusal)
+        with self._changed:
+            self._outbox.popleft()
+            self._held.discard(command_id)
+            self._changed.notify_all()
+
+    # Weights.
+
+    def _note_weights(self, sample: zenoh.Sample) -> None:
+        """Keep the newest announcement; it also means that there are new commands."""
+        with self._changed:
+            self._announced = sample.payload.to_bytes()
+            self._changed.notify_all()
+
+    def _learn_announced(self) -> None:
+        with self._changed:
+            payload, self._announced = self._announced, None
+        if payload is None:
+            return
+        try:
+            self._learn(decode(payload, Weights, LARGEST))
+        except InvalidMessage as error:
+            log.warning("an announcement of weights was ignored: %s", error)
+
+    def _order(self, command: Command) -> Order | None:
+        """Return a command with its weights; None when they are gone, and the command with them."""
+        try:
+            return Order(command, self._behavior(command.weights_version))
+        except Refused as refusal:
+            if refusal.code != "unknown_version":
+                raise
+            log.info("command %d is dropped: %s", command.id, refusal)
+            self._held.discard(command.id)
+            return None
+
+    def _behavior(self, version: int) -> BehaviorFunction | None:
+        """Return a weights version, asking for it if it was not announced."""
+        if version == 0:
+            return None
+        if version not in self._behaviors:
+            request = WeightsRequest(version=version)
+            self._learn(self._asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
+        return self._behaviors[version]
+
+    def _learn(self, message: Weights) -> None:
+        config, spec = self._hello.config, self._hello.environment
+        self._behaviors[message.version] = decode_weights(message.weights, config, spec)
+        self._newest = max(self._newest, message.version)
+        # Commands of lead + 1 iterations are about, each with its own version; the oldest to have
+        # been learned goes first, whatever its number, since a restored run may go back.
+        while len(self._behaviors) > config.lead + 2:
+            del self._behaviors[next(iter(self._behaviors))]

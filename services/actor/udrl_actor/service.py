@@ -1,0 +1,133 @@
+"""The actor service: obey commands in many environments at once until the run ends."""
+
+import faulthandler
+import logging
+import os
+import platform
+import threading
+import time
+
+import zenoh
+
+import udrl
+from udrl.acting import EpisodeGenerator, Failure
+from udrl.episode import Episode
+from udrl.errors import Interrupted
+from udrl.numerics import acting_class, check_batch_invariance, use_one_thread
+from udrl_actor.courier import Courier
+from udrl_proto import keys
+from udrl_proto.asking import Asker
+from udrl_proto.messages import Hello, JoinReply, JoinRequest
+
+log = logging.getLogger("udrl")
+
+#: Seconds between two times that the watchdog is told that all is well.
+_REARM_S = 0.25
+
+
+class ActorService:
+    """Carries out commands of one run.
+
+    Args:
+        session: connected to the run's router.
+        hello: the run's specification.
+        name: unique to this process.
+        environments: how many to step at once.
+        stop: ends everything.
+        hang_s: end the whole process, from outside Python, when a round of environment steps takes
+            so many seconds; None: do not.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        hello: Hello,
+        name: str,
+        environments: int,
+        stop: threading.Event,
+        hang_s: float | None = None,
+    ) -> None:
+        self._session = session
+        self._hello = hello
+        self._name = name
+        self._environments = environments
+        self._stop = stop
+        self._hang_s = hang_s
+
+    def run(self) -> None:
+        """Act until the run ends or ``stop`` is set.
+
+        Raises:
+            UnsupportedEnvironment: this machine cannot make the run's environment.
+            InexactArithmetic: a row's result depends on its neighbours here.
+            Refused: the run does not want this actor.
+            Unreachable: the replay service has not answered for long.
+        """
+        use_one_thread()
+        config, run_id = self._hello.config, self._hello.run_id
+        self._arm()
+        generator = EpisodeGenerator(config, self._environments)
+        asker = Asker(self._session, run_id, f"actor {self._name}", self._stop)
+        token = None
+        try:
+            check_batch_invariance(config, generator.spec)
+            join = JoinRequest(
+                role="actor",
+                id=self._name,
+                host=platform.node(),
+                pid=os.getpid(),
+                software=udrl.__version__,
+                environments=self._environments,
+                numerics_class=acting_class(config, generator),
+                environment=generator.spec,
+            )
+            asker.ask(keys.JOIN, join, JoinReply)
+            token = self._session.liveliness().declare_token(
+                keys.alive(run_id, "actor", self._name)
+            )
+            courier = Courier(
+                self._session, self._hello, join, asker, self._stop, capacity=self._environments
+            )
+            courier.start()
+            self._act(generator, courier)
+        except Interrupted as interruption:
+            log.info("%s", interruption)
+        finally:
+            self._disarm()
+            if token is not None:
+                token.undeclare()
+            generator.close()
+
+    def _act(self, generator: EpisodeGenerator, courier: Courier) -> None:
+        outcomes: list[Episode | Failure] = []
+        steps = running = 0
+        armed = time.monotonic()
+        while not (courier.ended or self._stop.is_set()):
+            if courier.error is not None:
+                raise courier.error
+            busy = running and not courier.is_full
+            if outcomes or courier.has_orders or not busy:
+                wait_s = 0.0 if busy else 1.0
+                orders = courier.exchange(outcomes, generator.free, steps, wait_s=wait_s)
+                steps = 0
+                failures = [generator.start(*order) for order in orders]
+                outcomes = [f for f in failures if f is not None]
+                running = len(generator.running)
+            if running and not courier.is_full:
+                ended = generator.step()
+                steps += running
+                running -= len(ended)
+                outcomes += ended
+            now = time.monotonic()
+            if now - armed > _REARM_S:
+                self._arm()
+                armed = now
+        courier.join(timeout=5.0)
+
+    def _arm(self) -> None:
+        if self._hang_s is not None:
+            faulthandler.dump_traceback_later(self._hang_s, exit=True)
+
+    def _disarm(self) -> None:
+        if self._hang_s is not None:
+            faulthandler.cancel_dump_traceback_later()

@@ -1,0 +1,138 @@
+"""All services of a run on this machine: a process each, or threads of this one."""
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from udrl_launch import roles
+from udrl_launch.settings import Settings
+from udrl_launch.supervisor import Supervisor
+from udrl_replay.store import Store
+
+#: Seconds that freshly started services look for the replay service.
+_PATIENCE_S = "60"
+
+
+class Local(Protocol):
+    """The services of a run on this machine."""
+
+    @property
+    def done(self) -> bool:
+        """Whether all have ended well."""
+        ...
+
+    def check(self) -> None:
+        """Start again what has died; raise what cannot be mended."""
+        ...
+
+    def end(self) -> None:
+        """End all of them, within five seconds."""
+        ...
+
+
+class Processes:
+    """A process for each service, started again when it dies."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        store: Store,
+        settings: Settings,
+        endpoint: str,
+        *,
+        insecure: bool,
+    ) -> None:
+        fleet, environment = settings.fleet, settings.config.environment
+        store.close()
+        self._supervisor = Supervisor(run_dir / "logs")
+        start = self._supervisor.start
+        start(
+            "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
+            "--listen", endpoint, *(["--insecure"] if insecure else []),
+        )  # fmt: skip
+        start("learner", "learner", "--connect", endpoint, "--patience", _PATIENCE_S)
+        envs = str(fleet.envs_per_actor)
+        for number in range(1, fleet.actors + 1):
+            start(
+                f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
+                "--nice", "5", "--patience", _PATIENCE_S,
+            )  # fmt: skip
+
+    @property
+    def done(self) -> bool:
+        """Whether all have ended well."""
+        return self._supervisor.done
+
+    def check(self) -> None:
+        """Start again what has died; raise what cannot be mended."""
+        self._supervisor.check()
+
+    def end(self) -> None:
+        """End all of them."""
+        self._supervisor.end()
+
+
+class Threads:
+    """A thread for each service; the first that fails ends all."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        store: Store,
+        settings: Settings,
+        endpoint: str,
+        *,
+        insecure: bool,
+    ) -> None:
+        fleet = settings.fleet
+        self._stop = threading.Event()
+        self._errors: list[BaseException] = []
+        self._threads: list[threading.Thread] = []
+        self._start(
+            "replay",
+            partial(
+                roles.replay,
+                run_dir,
+                store,
+                settings.budget,
+                self._stop,
+                listen=endpoint,
+                insecure=insecure,
+            ),
+        )
+        address = roles.Address(endpoint, patience_s=float(_PATIENCE_S))
+        self._start("learner", partial(roles.learner, address, self._stop))
+        for number in range(1, fleet.actors + 1):
+            self._start(
+                f"actor-{number}",
+                partial(roles.actor, address, fleet.envs_per_actor, self._stop),
+            )
+
+    def _start(self, name: str, service: Callable[[], None]) -> None:
+        def target() -> None:
+            try:
+                service()
+            except BaseException as error:  # noqa: BLE001 - raised by check() in the main thread
+                self._errors.append(error)
+
+        thread = threading.Thread(target=target, name=name, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    @property
+    def done(self) -> bool:
+        """Whether all have ended."""
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def check(self) -> None:
+        """Raise the first error of a service."""
+        if self._errors:
+            raise self._errors[0]
+
+    def end(self) -> None:
+        """End all of them."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(5.0)

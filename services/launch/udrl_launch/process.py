@@ -1,0 +1,84 @@
+"""One service in one process: signals, the parent's death, exit codes."""
+
+import ctypes
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+from udrl.errors import Interrupted, UdrlError
+
+log = logging.getLogger("udrl")
+
+#: Seconds that a service gets to end after SIGINT or SIGTERM.
+GRACE_S = 4.0
+
+_PR_SET_PDEATHSIG = 1
+
+
+def log_to_stderr(level: int = logging.INFO) -> None:
+    """Let the log go to standard error, a line each, with the time."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+    log.handlers[:] = [handler]
+    log.setLevel(level)
+
+
+def die_with_parent(parent: int) -> None:
+    """Let the kernel end this process when its parent does, however that happens.
+
+    Nothing is lost: a killed service is what the whole design is made for.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        sys.exit(0)
+
+
+def run_service(service: Callable[[threading.Event], None]) -> int:
+    """Run a service in a thread until it returns or a signal comes; return the exit code.
+
+    The main thread only waits, so that a signal is answered at once whatever the service does.
+    """
+    stop = threading.Event()
+    outcome: list[BaseException | None] = []
+
+    def target() -> None:
+        try:
+            service(stop)
+            outcome.append(None)
+        except BaseException as error:  # noqa: BLE001 - handed to the main thread, which reports it
+            outcome.append(error)
+
+    received: list[int] = []
+
+    def on_signal(number: int, frame: object) -> None:
+        received.append(number)
+        stop.set()
+
+    previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+    thread = threading.Thread(target=target, name="service", daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive() and not stop.is_set():
+            thread.join(0.2)
+        thread.join(GRACE_S)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if thread.is_alive():
+        log.warning("the service did not end in %.0f s and is abandoned", GRACE_S)
+        sys.stderr.flush()
+        os._exit(128 + received[0])
+    error = outcome[0]
+    if received and (error is None or isinstance(error, Interrupted)):
+        log.warning("%s", error or "stopped")
+        return 128 + received[0]
+    if error is None:
+        return 0
+    if isinstance(error, UdrlError):
+        log.error("%s", error)
+        return error.exit_code
+    raise error

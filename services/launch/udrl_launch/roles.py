@@ -1,0 +1,117 @@
+"""The three services as functions, for a process or a thread of their own."""
+
+import json
+import logging
+import os
+import platform
+import re
+import sys
+import threading
+import uuid
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import zenoh
+
+from udrl.config import Budget
+from udrl.errors import RunFailed
+from udrl_actor.service import ActorService
+from udrl_learner.service import LearnerService
+from udrl_proto import session as sessions
+from udrl_proto.messages import Hello
+from udrl_replay.service import ReplayService
+from udrl_replay.store import Store
+
+log = logging.getLogger("udrl")
+
+ENDPOINT_FILE = "endpoint.json"
+
+
+class Address(NamedTuple):
+    """Where a run is.
+
+    Attributes:
+        endpoint: of its router.
+        run_id: which one, where the router carries several.
+        patience_s: seconds to try until somebody answers.
+    """
+
+    endpoint: str
+    run_id: str | None = None
+    patience_s: float = 3.0
+
+
+def replay(
+    run_dir: Path,
+    store: Store,
+    budget: Budget,
+    stop: threading.Event,
+    *,
+    listen: str | None = None,
+    connect: str | None = None,
+    insecure: bool = False,
+) -> None:
+    """Serve a run until it has ended; either host its router or use one.
+
+    Raises:
+        ConfigError: the endpoint cannot be used.
+        StoreError: the run's file cannot be written.
+        RunFailed: the run cannot go on.
+    """
+    with closing(store):
+        endpoint = listen or connect
+        assert endpoint is not None
+        session = (
+            sessions.listen(endpoint, insecure=insecure)
+            if listen
+            else sessions.connect(endpoint, Address(endpoint).patience_s, stop)
+        )
+        with session:
+            where = {"endpoint": endpoint, "pid": os.getpid()}
+            endpoint_file = run_dir / ENDPOINT_FILE
+            endpoint_file.write_text(json.dumps(where), encoding="utf-8")
+            service = ReplayService(session, store, budget, run_dir)
+            try:
+                service.serve(stop)
+            finally:
+                endpoint_file.unlink(missing_ok=True)
+            if service.run.progress.state == "failed":
+                raise RunFailed(service.run.progress.problem)
+
+
+def learner(address: Address, stop: threading.Event) -> None:
+    """Train the run at an address until it has ended."""
+    with _connected(address, stop) as (session, hello):
+        LearnerService(session, hello, unique_name("learner"), stop).run()
+
+
+def actor(
+    address: Address, environments: int, stop: threading.Event, hang_s: float | None = None
+) -> None:
+    """Act for the run at an address until it has ended.
+
+    Args:
+        address: where the run is.
+        environments: how many to step at once.
+        stop: ends everything.
+        hang_s: end the whole process when a round of steps takes longer; None: do not.
+    """
+    # The courier's thread must get the interpreter soon while the loop steps environments: at the
+    # default of 5 ms a query takes 5 ms instead of 0.2.
+    sys.setswitchinterval(0.0005)
+    with _connected(address, stop) as (session, hello):
+        ActorService(session, hello, unique_name("actor"), environments, stop, hang_s).run()
+
+
+@contextmanager
+def _connected(address: Address, stop: threading.Event) -> Iterator[tuple[zenoh.Session, Hello]]:
+    with sessions.connect(address.endpoint, address.patience_s, stop) as session:
+        yield session, sessions.find_run(session, address.run_id, address.patience_s, stop)
+
+
+def unique_name(role: str) -> str:
+    """Return a name for a service that no other has."""
+    host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node())[:30] or "host"
+    return f"{role}-{host}-{os.getpid()}-{uuid.uuid4().hex[:6]}"

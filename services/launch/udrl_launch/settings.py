@@ -1,0 +1,97 @@
+"""Where settings come from: preset, then file, then command line; the last word counts."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from udrl.config import (
+    Budget,
+    Config,
+    build,
+    parse_assignment,
+    preset,
+    preset_names,
+    read_toml,
+    refuse_unknown,
+)
+from udrl.errors import ConfigError
+
+Kind = TypeVar("Kind", bound=msgspec.Struct)
+
+
+class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who carries the run out; changes its speed, never its result.
+
+    Attributes:
+        actors: actor processes on this machine.
+        envs_per_actor: environments that each steps at once.
+    """
+
+    actors: Annotated[int, Meta(ge=0, le=1024)] = 2
+    envs_per_actor: Annotated[int, Meta(ge=1, le=4096)] = 16
+
+
+def _from_file(file: Path, environment: str) -> dict[str, Any]:
+    values = read_toml(file)
+    named = values.get("environment", environment)
+    if named != environment:
+        raise ConfigError(
+            f"environment = {named!r} in {file}, but ENV is {environment!r}; make them agree"
+        )
+    return values
+
+
+class Settings(NamedTuple):
+    """All settings of a command."""
+
+    config: Config
+    budget: Budget
+    fleet: Fleet
+
+
+def gather(
+    environment: str,
+    *,
+    preset_name: str | None = None,
+    file: Path | None = None,
+    stored: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any],
+    assignments: Iterable[str] = (),
+) -> Settings:
+    """Return the settings of a command.
+
+    Args:
+        environment: its ENV argument, which wins over everything.
+        preset_name: a shipped preset; None: the one named like the environment, if there is one.
+        file: a TOML file.
+        stored: the settings of a run to go on with, instead of a preset's.
+        options: command-line options; None means: not given.
+        assignments: those of ``--set``.
+
+    Raises:
+        ConfigError: a setting is unknown or impossible.
+    """
+    values: dict[str, Any] = dict(stored or {})
+    if preset_name is None and stored is None and environment in preset_names():
+        preset_name = environment
+    if preset_name is not None:
+        values |= preset(preset_name)
+    if file is not None:
+        values |= _from_file(file, environment)
+    values |= {name: value for name, value in options.items() if value is not None}
+    for text in assignments:
+        name, value = parse_assignment(text)
+        if name == "environment":
+            raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
+        values[name] = value
+    values["environment"] = environment
+    kinds = (Config, Budget, Fleet)
+    refuse_unknown(values, tuple(name for kind in kinds for name in kind.__struct_fields__))
+
+    def part(kind: type[Kind]) -> Kind:
+        return build(kind, {n: v for n, v in values.items() if n in kind.__struct_fields__})
+
+    return Settings(part(Config), part(Budget), part(Fleet))

@@ -1,0 +1,125 @@
+"""Child processes: started, watched, started again, and ended with their parent."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from udrl.errors import RunFailed
+
+log = logging.getLogger("udrl")
+
+#: Exit codes that starting again would only repeat (``docs/operations.md``).
+FINAL_CODES = frozenset({2, 4, 7, 8, 9})
+
+#: A child that ended so often within ``_PERIOD_S`` seconds is given up.
+_MAX_RESTARTS = 5
+_PERIOD_S = 60.0
+_END_S = 4.5
+
+
+@dataclass
+class Child:
+    """A service in a process of its own.
+
+    Attributes:
+        name: for logs, and the name of its log file.
+        arguments: of the ``udrl`` command.
+        restarts: when it was started again.
+    """
+
+    name: str
+    arguments: list[str]
+    log_file: Path
+    process: subprocess.Popen[bytes] | None = None
+    restarts: list[float] = field(default_factory=list)
+    done: bool = False
+
+    def start(self) -> None:
+        """Start the process."""
+        with self.log_file.open("ab") as output:
+            self.process = subprocess.Popen(  # noqa: S603 - our own program
+                [
+                    sys.executable,
+                    "-m",
+                    "udrl_launch",
+                    *self.arguments,
+                    "--parent",
+                    str(os.getpid()),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,  # a Ctrl-C at the terminal is the parent's to handle
+            )
+
+    def last_words(self) -> str:
+        """Return the end of its log."""
+        lines = self.log_file.read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(lines[-5:])
+
+
+class Supervisor:
+    """Keeps children running until they are done.
+
+    Args:
+        log_dir: where their output goes, a file each.
+    """
+
+    def __init__(self, log_dir: Path) -> None:
+        log_dir.mkdir(parents=True, exist_ok=True)
+        self._log_dir = log_dir
+        self.children: list[Child] = []
+
+    def start(self, name: str, *arguments: str) -> None:
+        """Start ``udrl ARGUMENTS`` as a child."""
+        child = Child(name, list(arguments), self._log_dir / f"{name}.log")
+        child.start()
+        self.children.append(child)
+
+    def check(self) -> None:
+        """Start again what has died; call it now and then.
+
+        Raises:
+            RunFailed: a child ended in a way that it would end again.
+        """
+        for child in self.children:
+            assert child.process is not None
+            code = child.process.poll()
+            if code is None or child.done:
+                continue
+            if code == 0:
+                child.done = True
+                continue
+            now = time.monotonic()
+            child.restarts = [t for t in child.restarts if now - t < _PERIOD_S]
+            if code in FINAL_CODES or len(child.restarts) >= _MAX_RESTARTS:
+                failure = RunFailed(f"{child.name} ended with code {code}:\n{child.last_words()}")
+                failure.exit_code = code if code in FINAL_CODES else failure.exit_code
+                raise failure
+            log.warning("%s ended with code %d and is started again", child.name, code)
+            child.restarts.append(now)
+            child.start()
+
+    @property
+    def done(self) -> bool:
+        """Whether all children have ended well."""
+        return all(child.done for child in self.children)
+
+    def end(self) -> None:
+        """End all children: SIGTERM, and SIGKILL for who does not listen."""
+        processes = [c.process for c in self.children if c.process is not None]
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + _END_S
+        for process in processes:
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

@@ -1,0 +1,119 @@
+"""``udrl train``: all services on this machine, from the first episode to the last evaluation."""
+
+import logging
+import socket
+import threading
+from pathlib import Path
+
+from udrl.errors import Interrupted, Unreachable
+from udrl_launch.display import Display
+from udrl_launch.inspection import read_status
+from udrl_launch.local import Local, Processes, Threads
+from udrl_launch.settings import Settings
+from udrl_proto import keys
+from udrl_proto import session as sessions
+from udrl_proto.asking import Asker
+from udrl_proto.messages import Status, StatusRequest
+from udrl_replay.creation import create, exists, resume, write_config
+from udrl_replay.run import Run
+
+log = logging.getLogger("udrl")
+
+#: Seconds between two looks at the services.
+_POLL_S = 0.5
+#: Seconds that freshly started services get until the replay service answers.
+_START_S = 60.0
+
+
+def train(
+    settings: Settings,
+    run_dir: Path,
+    stop: threading.Event,
+    *,
+    go_on: bool = False,
+    in_process: bool = False,
+    allow_inexact: bool = False,
+    listen: str | None = None,
+    insecure: bool = False,
+    display: Display | None = None,
+) -> Status:
+    """Train an agent and return the final status of its run.
+
+    Args:
+        settings: what to train, how far, with how many actors.
+        run_dir: the run's directory.
+        stop: ends the training early; the run can be resumed.
+        go_on: go on with the run in ``run_dir`` if there is one.
+        in_process: all services in this process, as threads; else a process each.
+        allow_inexact: accept actors of other numerics classes.
+        listen: the endpoint of the run; None: a free port of the loopback interface.
+        insecure: allow ``listen`` to be beyond loopback.
+        display: shows the progress.
+
+    Raises:
+        UdrlError: the run cannot be started or cannot go on.
+        Interrupted: ``stop`` was set.
+    """
+    config, budget, _ = settings
+    endpoint = sessions.check_endpoint(listen) if listen else f"tcp/127.0.0.1:{_free_port()}"
+    if go_on and exists(run_dir):
+        store = resume(run_dir, config, allow_inexact=allow_inexact)
+    else:
+        store = create(run_dir, config, allow_inexact=allow_inexact)
+    write_config(run_dir, config, budget)
+    if Run(store, budget).progress.state == "ended":
+        store.close()
+        return read_status(run_dir)
+    kind = Threads if in_process else Processes
+    services: Local = kind(run_dir, store, settings, endpoint, insecure=insecure)
+    try:
+        _watch(services, endpoint, stop, display)
+    finally:
+        services.end()
+    if stop.is_set():
+        raise Interrupted(
+            f"stopped; go on with: udrl train {config.environment} --run-dir {run_dir} --resume"
+        )
+    return read_status(run_dir)
+
+
+def _watch(services: Local, endpoint: str, stop: threading.Event, display: Display | None) -> None:
+    """Show the status until the services are done or ``stop`` is set."""
+    give_up = _GiveUp(services, stop)
+    with sessions.connect(endpoint, _START_S, give_up) as session:
+        hello = sessions.find_run(session, None, _START_S, give_up)
+        asker = Asker(session, hello.run_id, "the display", give_up)
+        while not stop.wait(_POLL_S):
+            services.check()
+            if services.done:
+                return
+            try:
+                status = asker.ask(keys.STATUS, StatusRequest(), Status)
+            except (Unreachable, Interrupted) as error:
+                log.debug("no status: %s", error)
+                continue
+            if display is not None:
+                display.show(status)
+
+
+class _GiveUp(threading.Event):
+    """Set when the user stops the run or a service fails: ends waits for an answer."""
+
+    def __init__(self, services: Local, stop: threading.Event) -> None:
+        super().__init__()
+        self._services = services
+        self._stop_event = stop
+
+    def is_set(self) -> bool:
+        self._services.check()
+        return self._stop_event.is_set() or self._services.done
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self._stop_event.wait(timeout) or self.is_set()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

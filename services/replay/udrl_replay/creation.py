@@ -1,0 +1,123 @@
+"""Creating a run: settle once what every service of it will be told."""
+
+import logging
+import re
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import msgspec
+
+import udrl
+from udrl.acting import EpisodeGenerator
+from udrl.config import Budget, Config
+from udrl.errors import OtherConfiguration
+from udrl.numerics import environment_replays
+from udrl_proto import PROTOCOL
+from udrl_proto.messages import Hello
+from udrl_replay.run import Progress
+from udrl_replay.store import FILE, Store
+
+log = logging.getLogger("udrl")
+
+
+def directory_name(config: Config) -> str:
+    """Return a name for a new run's directory."""
+    now = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    return f"{_slug(config.environment)}-seed{config.seed}-{now}"
+
+
+def _run_id(run_dir: Path) -> str:
+    """Return a name that no other run has, on whatever router: the directory's, and some chance."""
+    return f"{_slug(run_dir.resolve().name)}-{uuid.uuid4().hex[:8]}"
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:50].rstrip("-") or "run"
+
+
+def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:
+    """Make a new run.
+
+    The environment is made once and asked to replay an episode after another one; if it cannot,
+    the run is marked inexact, and goes on.
+
+    Raises:
+        UnsupportedEnvironment: the environment does not exist or is not supported.
+        StoreError: the directory holds a run already, or cannot be written.
+    """
+    generator = EpisodeGenerator(config, 1)
+    exact = environment_replays(config, generator)
+    generator.close()
+    progress = Progress(exact=exact)
+    if not exact:
+        progress.inexact_reason = (
+            f"environment {config.environment} does not repeat an episode from its seed"
+        )
+        log.warning("the run is not exact: %s", progress.inexact_reason)
+    hello = Hello(
+        protocol=PROTOCOL,
+        software=udrl.__version__,
+        run_id=_run_id(run_dir),
+        config=config,
+        environment=generator.spec,
+        allow_inexact=allow_inexact,
+        exact=exact,
+    )
+    return Store.create(run_dir, hello=hello, progress=progress)
+
+
+def resume(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:
+    """Open a run to go on with it; ``allow_inexact`` from now on, if it was not before.
+
+    Raises:
+        StoreError: there is none, it is in use, or its configuration is another one.
+    """
+    store = Store(run_dir)
+    with _closed_on_error(store):
+        hello = store.fact("hello", Hello)
+        held = msgspec.to_builtins(hello.config)
+        asked = msgspec.to_builtins(config)
+        different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
+        if different:
+            raise OtherConfiguration(
+                f"{run_dir} belongs to a run with {'; '.join(different)}; use its "
+                f"configuration, or name another --run-dir"
+            )
+        if allow_inexact and not hello.allow_inexact:
+            with store.transaction():
+                store.set_fact("hello", msgspec.structs.replace(hello, allow_inexact=True))
+    return store
+
+
+@contextmanager
+def _closed_on_error(store: Store) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        store.close()
+        raise
+
+
+def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
+    """Write the effective configuration, as TOML that ``--config`` reads."""
+    lines = []
+    for settings in (config, budget):
+        for name, value in msgspec.to_builtins(settings).items():
+            if value is not None and value != {}:
+                lines.append(f"{name} = {_toml(value)}")
+    (run_dir / "config.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_toml(k)} = {_toml(v)}" for k, v in value.items()) + " }"
+    # JSON's booleans, numbers, strings and arrays are TOML's.
+    return msgspec.json.encode(value).decode()
+
+
+def exists(run_dir: Path) -> bool:
+    """Say whether a directory holds a run."""
+    return (run_dir / FILE).exists()

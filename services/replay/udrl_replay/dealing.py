@@ -1,0 +1,181 @@
+"""Who carries out which command: dealt evenly, dealt again when an actor is gone or too slow.
+
+All of this is memory. An actor says with every request what it holds, so that a replay service that
+was restarted knows after one round.
+"""
+
+import heapq
+import math
+import random
+from collections import Counter
+from collections.abc import Container, Iterable
+from dataclasses import dataclass, field
+
+from udrl.acting import MAX_FAILURES
+from udrl.commands import Command
+from udrl_proto.messages import CommandsRequest, JoinRequest
+
+#: A command is a straggler after so many times the expected duration of an episode.
+STRAGGLER = 3.0
+#: Commands in one answer: so many are a small message.
+MAX_DEALT = 4096
+#: Seconds after which an actor without a liveliness token that says nothing is forgotten.
+SILENCE_S = 30.0
+
+
+@dataclass
+class Outstanding:
+    """A command without an episode.
+
+    Attributes:
+        holders: actors that it was dealt to, and when.
+        failures: the actors that could not carry it out, one entry a failure.
+    """
+
+    command: Command
+    holders: dict[str, float] = field(default_factory=dict)
+    failures: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Actor:
+    """An actor as its last request described it."""
+
+    join: JoinRequest
+    last_seen: float
+    request: CommandsRequest
+    holds: set[int] = field(default_factory=set)
+
+
+class Dealer:
+    """Outstanding commands and the actors that carry them out."""
+
+    def __init__(self) -> None:
+        self.outstanding: dict[int, Outstanding] = {}
+        self.actors: dict[str, Actor] = {}
+        self._undealt: list[int] = []  # a heap; may hold ids that are no longer undealt
+        self._of_iteration: Counter[int] = Counter()
+        self._of_version: Counter[int] = Counter()
+        self._duration_s = 0.0
+
+    def add(self, commands: Iterable[Command]) -> None:
+        """Take in commands to be carried out."""
+        for command in commands:
+            self.outstanding[command.id] = Outstanding(command)
+            self._of_iteration[command.iteration] += 1
+            self._of_version[command.weights_version] += 1
+            heapq.heappush(self._undealt, command.id)
+
+    def remove(self, command_id: int, now: float | None = None) -> Command:
+        """Return a command that is no longer outstanding; with a time: because it is done."""
+        item = self.outstanding.pop(command_id)
+        command = item.command
+        for counter, key in (
+            (self._of_iteration, command.iteration),
+            (self._of_version, command.weights_version),
+        ):
+            counter[key] -= 1
+            if not counter[key]:
+                del counter[key]
+        for name in item.holders:
+            if name in self.actors:
+                self.actors[name].holds.discard(command_id)
+        if now is not None and item.holders:
+            took = now - min(item.holders.values())
+            self._duration_s += (took - self._duration_s) * (0.05 if self._duration_s else 1.0)
+        return command
+
+    def left(self, iteration: int) -> int:
+        """Return how many commands of an iteration are outstanding."""
+        return self._of_iteration[iteration]
+
+    def join(self, request: JoinRequest, now: float) -> None:
+        """Note a new actor; one of the same id that came back loses what it held."""
+        self.leave(request.id)
+        asked = CommandsRequest(actor=request.id, wanted=0)
+        self.actors[request.id] = Actor(request, now, asked)
+
+    def leave(self, name: str) -> None:
+        """Forget an actor; what it held goes to others."""
+        actor = self.actors.pop(name, None)
+        if actor is not None:
+            for command_id in actor.holds:
+                self._put_back(command_id, name)
+
+    def forget_silent(self, here: Container[str], now: float) -> None:
+        """Forget actors that have said nothing for long, except those that are ``here``."""
+        silent = [n for n, a in self.actors.items() if now - a.last_seen > SILENCE_S]
+        for name in silent:
+            if name not in here:
+                self.leave(name)
+
+    def _put_back(self, command_id: int, name: str) -> None:
+        item = self.outstanding.get(command_id)
+        if item is not None and item.holders.pop(name, None) is not None and not item.holders:
+            heapq.heappush(self._undealt, command_id)
+
+    def deal(self, request: CommandsRequest, latest_version: int, now: float) -> list[Command]:
+        """Return commands for an actor that has joined: no more than it wants or its fair share."""
+        actor = self.actors[request.actor]
+        actor.last_seen, actor.request = now, request
+        running = {i for i in request.running if i in self.outstanding}
+        for lost in actor.holds - running:
+            self._put_back(lost, request.actor)
+        for known in running - actor.holds:
+            self.outstanding[known].holders.setdefault(request.actor, now)
+        actor.holds = running
+
+        in_play = sum(n for v, n in self._of_version.items() if v <= latest_version)
+        share = math.ceil(in_play / len(self.actors)) - len(running)
+        dealt: list[Command] = []
+        while self._undealt and len(dealt) < min(request.wanted, share, MAX_DEALT):
+            item = self.outstanding.get(self._undealt[0])
+            if item is not None and item.command.weights_version > latest_version:
+                break
+            heapq.heappop(self._undealt)
+            if item is not None and not item.holders:
+                dealt.append(self._give(item, actor, now))
+        if not dealt and request.wanted and not running and request.spare_cores >= 1:
+            dealt.extend(self._straggler(actor, latest_version, now))
+        return dealt
+
+    def _give(self, item: Outstanding, actor: Actor, now: float) -> Command:
+        item.holders[actor.join.id] = now
+        actor.holds.add(item.command.id)
+        return item.command
+
+    def _straggler(self, actor: Actor, latest_version: int, now: float) -> Iterable[Command]:
+        """Yield the command that is most overdue elsewhere, for an actor that is idle."""
+        overdue = [
+            (min(item.holders.values()), i)
+            for i, item in self.outstanding.items()
+            if len(item.holders) == 1 and item.command.weights_version <= latest_version
+        ]
+        if overdue and self._duration_s:
+            since, command_id = min(overdue)
+            if now - since > STRAGGLER * self._duration_s:
+                yield self._give(self.outstanding[command_id], actor, now)
+
+    def holds(self, name: str, command_id: int) -> bool:
+        """Say whether a command was dealt to an actor, and is still its to carry out."""
+        item = self.outstanding.get(command_id)
+        return item is not None and name in item.holders
+
+    def hear(self, name: str, now: float) -> None:
+        """Note that an actor, if it has joined, said something."""
+        if name in self.actors:
+            self.actors[name].last_seen = now
+
+    def fail(self, command_id: int, name: str) -> bool:
+        """Note an actor's failure; say whether the command is hopeless and the run has to stop."""
+        item = self.outstanding[command_id]
+        item.failures.append(name)
+        if name in self.actors:
+            self.actors[name].holds.discard(command_id)
+        self._put_back(command_id, name)
+        on_two = len(set(item.failures)) >= min(2, len(self.actors))
+        return len(item.failures) >= MAX_FAILURES and on_two
+
+    def retry_after_s(self) -> float:
+        """Return when to ask again: later in a larger fleet, and not all at once."""
+        return (0.25 + 0.02 * len(self.actors)) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -1,0 +1,176 @@
+"""What a run tells about itself: its status, and the file ``metrics.csv``."""
+
+import csv
+import math
+from collections import deque
+from pathlib import Path
+
+from udrl.digests import replay_digest
+from udrl.errors import StoreError
+from udrl_proto.messages import (
+    ActorStatus,
+    BufferStatus,
+    CommandLedger,
+    EpisodeLedger,
+    EvaluationStatus,
+    Status,
+    Waiting,
+)
+from udrl_replay.run import Run
+from udrl_replay.store import EvaluationRow, Store
+
+COLUMNS = (
+    "iteration", "env_steps", "eval_env_steps", "wall_s", "eval_at_env_steps", "eval_mean",
+    "eval_std", "eval_ci95_low", "eval_ci95_high", "loss", "weights_version", "return_min",
+    "return_mean", "return_max", "explored_return", "eval_desired_return", "eval_desired_horizon",
+)  # fmt: skip
+
+_WINDOW_S = 10.0
+
+
+class MetricsFile:
+    """``metrics.csv``: one line per iteration, made anew from the store at every start."""
+
+    def __init__(self, run_dir: Path, store: Store) -> None:
+        self._path = run_dir / "metrics.csv"
+        self._store = store
+        self._written = -1
+        self._path.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
+
+    def update(self, iteration: int) -> None:
+        """Append the lines of all iterations up to one."""
+        if iteration <= self._written:
+            return
+        try:
+            with self._path.open("a", newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerows(self._store.metrics(self._written))
+        except OSError as error:
+            raise StoreError(
+                f"{self._path} cannot be written: {error}; free some disk space and start again "
+                f"with --resume; nothing is lost"
+            ) from error
+        self._written = iteration
+
+
+class Throughput:
+    """Env steps per second over the last ten seconds."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[tuple[float, int]] = deque()
+
+    def add(self, now: float, steps: int) -> None:
+        """Note steps that arrived."""
+        self._arrivals.append((now, steps))
+
+    def per_second(self, now: float) -> float:
+        """Return the mean rate."""
+        while self._arrivals and now - self._arrivals[0][0] > _WINDOW_S:
+            self._arrivals.popleft()
+        if not self._arrivals:
+            return 0.0
+        span = max(now - self._arrivals[0][0], 1.0)
+        return sum(steps for _, steps in self._arrivals) / span
+
+
+class Waits:
+    """Who waits for whom, since when, and why."""
+
+    def __init__(self) -> None:
+        self._waits: dict[str, tuple[str, str, float]] = {}
+
+    def begin(self, who: str, on: str, why: str, now: float) -> None:
+        """Note that somebody waits; it goes on waiting if it did so for the same."""
+        held = self._waits.get(who)
+        if held is None or held[:2] != (on, why):
+            self._waits[who] = on, why, now
+
+    def end(self, who: str) -> None:
+        """Note that somebody no longer waits."""
+        self._waits.pop(who, None)
+
+    def list(self, now: float) -> tuple[Waiting, ...]:
+        """Return all waits."""
+        return tuple(
+            Waiting(who=who, on=on, why=why, seconds=round(now - since, 3))
+            for who, (on, why, since) in sorted(self._waits.items())
+        )
+
+
+def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
+    """Return the status of a run."""
+    progress, dealer, config = run.progress, run.dealer, run.config
+    returns = [e.episode_return for e in run.buffer]
+    latest = run.store.version(progress.latest_version)
+    rate = throughput.per_second(now)
+    left = max(0, run.budget.max_env_steps - progress.env_steps)
+    spent = progress.env_steps / run.wall_s if run.wall_s > 0 else 0.0
+    actors = tuple(
+        ActorStatus(
+            id=name,
+            host=actor.join.host,
+            environments=actor.join.environments,
+            env_steps_per_s=round(actor.request.env_steps_per_s, 1),
+            weights_version=actor.request.weights_version,
+            weights_lag=max(0, progress.latest_version - actor.request.weights_version),
+            running=len(actor.holds),
+            last_seen_s=round(now - actor.last_seen, 3),
+        )
+        for name, actor in sorted(dealer.actors.items())
+    )
+    return Status(
+        run_id=run.hello.run_id,
+        state=progress.state,
+        environment=config.environment,
+        iteration=max(progress.iteration, 0),
+        env_steps=progress.env_steps,
+        eval_env_steps=progress.eval_env_steps,
+        env_steps_per_s=round(rate, 1),
+        wall_s=round(
+            run.wall_s if progress.state in ("running", "closing") else progress.wall_s, 3
+        ),
+        max_env_steps=run.budget.max_env_steps,
+        time_left_s=round(left / spent, 1) if spent and progress.state == "running" else None,
+        commands=CommandLedger(
+            issued=progress.issued,
+            accepted=progress.accepted,
+            cancelled=progress.cancelled,
+            outstanding=len(dealer.outstanding),
+        ),
+        episodes=EpisodeLedger(
+            delivered=progress.delivered,
+            accepted=progress.accepted,
+            duplicate=progress.duplicate,
+            rejected=progress.rejected,
+        ),
+        buffer=BufferStatus(
+            episodes=len(returns),
+            return_min=returns[0] if returns else None,
+            return_mean=math.fsum(returns) / len(returns) if returns else None,
+            return_max=returns[-1] if returns else None,
+        ),
+        weights_version=progress.latest_version,
+        weights_lag=max((a.weights_lag for a in actors), default=0),
+        weights_lag_s=round(lag_s, 4),
+        weights_sha256=latest.digest.hex() if latest else "",
+        replay_sha256=replay_digest(run.digests[e.id] for e in run.buffer).hex(),
+        loss=latest.loss if latest else None,
+        evaluation=_evaluation(run.store.last_evaluation(closing=False)),
+        closing_evaluation=_evaluation(run.store.last_evaluation(closing=True))
+        if progress.state == "ended"
+        else None,
+        exact=progress.exact,
+        inexact_reason=progress.inexact_reason,
+        useful_concurrency=config.n_episodes_per_iter * (config.lead + 1),
+        env_failures=progress.env_failures,
+        actors=actors,
+        waiting=waits.list(now),
+        problem=progress.problem,
+    )
+
+
+def _evaluation(row: EvaluationRow | None) -> EvaluationStatus | None:
+    if row is None:
+        return None
+    return EvaluationStatus(
+        iteration=row.iteration, env_steps=row.env_steps, **row.evaluation._asdict()
+    )

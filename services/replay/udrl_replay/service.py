@@ -1,0 +1,380 @@
+"""The replay service: Zenoh queries in, answers out, one thread that owns the run.
+
+Questions are taken from the inbox in groups. A group is handled inside one transaction, and its
+answers are sent when that is on disk: under load a sync is shared by many episodes, without load an
+episode waits for none but its own.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import zenoh
+
+from udrl.checkpoint import decode_state
+from udrl.config import Budget
+from udrl.digests import tensors_digest
+from udrl.errors import InvalidData, Refused
+from udrl_proto import keys
+from udrl_proto.answering import Question, Verb, serve
+from udrl_proto.codec import LARGEST, PAGE, encode
+from udrl_proto.messages import (
+    Acknowledged,
+    ChangesReply,
+    ChangesRequest,
+    CommandsReply,
+    CommandsRequest,
+    EpisodeMessage,
+    EpisodeReply,
+    EpisodesReply,
+    EpisodesRequest,
+    FailureMessage,
+    Hello,
+    HelloRequest,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Problem,
+    Progress,
+    StateReply,
+    StateRequest,
+    StatusRequest,
+    VersionMessage,
+    VersionReply,
+    Wait,
+    Weights,
+    WeightsRequest,
+)
+from udrl_replay.arrival import Arrival, inspect
+from udrl_replay.reporting import MetricsFile, Throughput, Waits, status
+from udrl_replay.run import Run
+from udrl_replay.store import Store, Version
+
+log = logging.getLogger("udrl")
+
+#: Questions that may wait; more are dropped and asked again.
+_INBOX = 4096
+#: Questions handled in one transaction.
+_GROUP = 64
+#: Seconds that the service of an ended run stays, so that all its peers learn of the end.
+_LINGER_S = 10.0
+#: Seconds that it stays when nobody is left.
+_FAREWELL_S = 0.3
+#: Bytes of an episode's message besides its arrays.
+_OVERHEAD = 4096
+
+
+class _Presence(NamedTuple):
+    """A liveliness token came or went."""
+
+    role: str
+    name: str
+    here: bool
+
+
+class _Delivery(NamedTuple):
+    """A weights version that has been checked."""
+
+    message: VersionMessage
+    version: Version
+
+
+class ReplayService:
+    """Serves one run over one Zenoh session.
+
+    Args:
+        session: the run's router, or a client of one.
+        store: the run.
+        budget: when it ends.
+        run_dir: where ``metrics.csv`` goes.
+    """
+
+    def __init__(self, session: zenoh.Session, store: Store, budget: Budget, run_dir: Path) -> None:
+        self.run = Run(store, budget)
+        self._session = session
+        self._store = store
+        self._metrics = MetricsFile(run_dir, store)
+        self._metrics.update(self.run.progress.iteration)
+        self._inbox: queue.Queue[Question | _Presence] = queue.Queue(_INBOX)
+        self._throughput = Throughput()
+        self._waits = Waits()
+        self._here: set[tuple[str, str]] = set()
+        self._version_at = 0.0
+        self._acting_with = self.run.progress.latest_version
+        self._lag_s = 0.0
+        self._handlers: dict[str, Callable[[Any, float], Message]] = {
+            keys.HELLO: self._hello,
+            keys.JOIN: self._join,
+            keys.COMMANDS: self._commands,
+            keys.EPISODE: self._episode,
+            keys.FAILURE: self._failure,
+            keys.CHANGES: self._changes,
+            keys.EPISODES: self._episodes,
+            keys.VERSION: self._version,
+            keys.STATE: self._state,
+            keys.WEIGHTS: self._weights,
+            keys.STATUS: self._status,
+        }
+
+    def serve(self, stop: threading.Event) -> None:
+        """Answer until the run has ended and its peers know, or ``stop`` is set.
+
+        Raises:
+            StoreError: the run's file cannot be written.
+        """
+        run_id = self.run.hello.run_id
+        declared: list[Any] = [
+            self._session.liveliness().declare_subscriber(
+                keys.alive(run_id, "*", "*"), self._presence, history=True
+            ),
+            *serve(self._session, run_id, self._verbs(), self._inbox),
+        ]
+        log.info("replay serves run %s", run_id)
+        ended_at: float | None = None
+        try:
+            while not stop.is_set():
+                self._answer(self._next_group())
+                now = time.monotonic()
+                if self.run.progress.state in ("ended", "failed"):
+                    ended_at = ended_at or now
+                    if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
+                        return
+        finally:
+            for declaration in declared:
+                declaration.undeclare()
+            with self._store.transaction():
+                self.run.save()
+
+    def _verbs(self) -> dict[str, Verb]:
+        config, spec = self.run.config, self.run.hello.environment
+
+        def check(message: VersionMessage) -> _Delivery:
+            state = decode_state(message.version, message.weights, message.optimizer, config, spec)
+            digest = tensors_digest(state.behavior.state_dict())
+            version = Version(
+                message.version, digest, message.loss, message.weights, message.optimizer
+            )
+            return _Delivery(message, version)
+
+        def arrive(message: EpisodeMessage) -> Arrival:
+            return inspect(message, spec)
+
+        steps = spec.max_episode_steps * (4 * spec.observation_size + 8)
+        return {
+            keys.HELLO: Verb(HelloRequest, _OVERHEAD),
+            keys.JOIN: Verb(JoinRequest, 1 << 16),
+            keys.COMMANDS: Verb(CommandsRequest, 1 << 20),
+            keys.EPISODE: Verb(EpisodeMessage, steps + _OVERHEAD, arrive),
+            keys.FAILURE: Verb(FailureMessage, 1 << 16),
+            keys.CHANGES: Verb(ChangesRequest, _OVERHEAD),
+            keys.EPISODES: Verb(EpisodesRequest, PAGE),
+            keys.VERSION: Verb(VersionMessage, LARGEST, check),
+            keys.STATE: Verb(StateRequest, _OVERHEAD),
+            keys.WEIGHTS: Verb(WeightsRequest, _OVERHEAD),
+            keys.STATUS: Verb(StatusRequest, _OVERHEAD),
+        }
+
+    def _presence(self, sample: zenoh.Sample) -> None:
+        _, _, token = keys.parse(str(sample.key_expr))
+        _, role, name = token.split("/", 2)
+        self._inbox.put(_Presence(role, name, sample.kind == zenoh.SampleKind.PUT))
+
+    def _next_group(self) -> list[Question | _Presence]:
+        """Return what waits in the inbox, after at most a quarter of a second."""
+        group: list[Question | _Presence] = []
+        try:
+            group.append(self._inbox.get(timeout=0.25))
+            while len(group) < _GROUP:
+                group.append(self._inbox.get_nowait())
+        except queue.Empty:
+            pass
+        return group
+
+    def _answer(self, group: list[Question | _Presence]) -> None:
+        now = time.monotonic()
+        run = self.run
+        before = run.progress.iteration
+        answers: list[tuple[Question, Message]] = []
+        run.dealer.forget_silent({name for _, name in self._here}, now)
+        if not group:
+            return
+        with self._store.transaction():
+            snapshot = msgspec.json.encode(run.progress)
+            for item in group:
+                if isinstance(item, _Presence):
+                    self._note_presence(item, now)
+                else:
+                    answers.append((item, self._reply(item, now)))
+            if msgspec.json.encode(run.progress) != snapshot:
+                run.save()
+        self._metrics.update(run.progress.iteration)
+        for question, reply in answers:
+            question.answer(reply)
+        if run.progress.iteration != before:
+            news = encode(Progress(iteration=run.progress.iteration))
+            self._session.put(keys.key(run.hello.run_id, keys.PROGRESS), news)
+
+    def _reply(self, question: Question, now: float) -> Message:
+        request = question.request
+        if isinstance(request, InvalidData):
+            if question.verb == keys.EPISODE:
+                self.run.progress.delivered += 1
+                self.run.progress.rejected += 1
+            log.warning("invalid %s: %s", question.verb, request)
+            return Problem(code="invalid", message=str(request)[:4000])
+        try:
+            return self._handlers[question.verb](request, now)
+        except Refused as error:
+            log.warning("refused %s: %s", question.verb, error)
+            return Problem(code=error.code, message=str(error)[:4000])
+
+    def _note_presence(self, presence: _Presence, now: float) -> None:
+        peer = presence.role, presence.name
+        if presence.here:
+            self._here.add(peer)
+        else:
+            self._here.discard(peer)
+            self._waits.end(f"{presence.role} {presence.name}")
+            if presence.role == "actor":
+                self.run.dealer.leave(presence.name)
+            log.info("%s %s left", *peer)
+
+    def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
+        self._waits.begin(who, on, why, now)
+        return Wait(on=f"{on}: {why}", retry_after_s=self.run.dealer.retry_after_s())
+
+    # One method per verb. Each returns the answer, or raises Refused.
+
+    def _hello(self, request: HelloRequest, now: float) -> Hello:
+        return msgspec.structs.replace(self.run.hello, exact=self.run.progress.exact)
+
+    def _join(self, request: JoinRequest, now: float) -> JoinReply:
+        hello = self.run.hello
+        if request.environment is not None and request.environment != hello.environment:
+            raise Refused(
+                "other_environment",
+                f"the run's environment is {hello.environment}, yours is {request.environment}; "
+                f"install the same version of the package that provides {hello.config.environment}",
+            )
+        field = "acting_class" if request.role == "actor" else "training_class"
+        known = getattr(hello, field)
+        if not known:
+            self.run.hello = msgspec.structs.replace(hello, **{field: request.numerics_class})
+            self._store.set_fact("hello", self.run.hello)
+        elif known != request.numerics_class:
+            if not hello.allow_inexact:
+                raise Refused(
+                    "other_numerics",
+                    f"the run's {request.role}s round like class {known}, this machine like "
+                    f"{request.numerics_class}, so results would depend on who computes them; use "
+                    f"a machine with the same kind of processor and the same versions of torch and "
+                    f"numpy, or create the run with --allow-inexact",
+                )
+            self.run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
+        if request.role == "actor":
+            self.run.dealer.join(request, now)
+        log.info("%s %s joined from %s", request.role, request.id, request.host)
+        return JoinReply()
+
+    def _commands(self, request: CommandsRequest, now: float) -> CommandsReply:
+        run, who = self.run, f"actor {request.actor}"
+        if run.progress.state in ("ended", "failed"):
+            return CommandsReply(ended=True)
+        if request.actor not in run.dealer.actors:
+            raise Refused("join_first", f"actor {request.actor} has not joined; send join first")
+        commands = run.dealer.deal(request, run.progress.latest_version, now)
+        if commands:
+            self._waits.end(who)
+            newest = max(c.weights_version for c in commands)
+            if newest > self._acting_with:
+                self._acting_with, self._lag_s = newest, now - self._version_at
+            return CommandsReply(commands=tuple(commands))
+        if request.running:
+            self._waits.end(who)
+            return CommandsReply(
+                wait=Wait(on="nothing: it has work", retry_after_s=run.dealer.retry_after_s())
+            )
+        return CommandsReply(wait=self._wait(who, *self._what_actors_wait_for(), now))
+
+    def _what_actors_wait_for(self) -> tuple[str, str]:
+        run = self.run
+        version = run.awaits_version()
+        if version is not None:
+            trains = any(role == "learner" for role, _ in self._here)
+            return "learner", f"weights version {version}" + (
+                "" if trains else ": no learner is here"
+            )
+        return "actors", f"the others' episodes of iteration {run.progress.iteration + 1}"
+
+    def _episode(self, arrival: Arrival, now: float) -> EpisodeReply:
+        result = self.run.accept(arrival, now)
+        if result == "accepted":
+            self._throughput.add(now, arrival.entry.length)
+        return EpisodeReply(result=result)
+
+    def _failure(self, request: FailureMessage, now: float) -> Acknowledged:
+        self.run.fail(request)
+        return Acknowledged()
+
+    def _changes(self, request: ChangesRequest, now: float) -> ChangesReply:
+        run, who = self.run, f"learner {request.learner}"
+        if run.progress.state in ("ended", "failed"):
+            return ChangesReply(ended=True)
+        following = run.progress.latest_version + 1
+        if request.version != following:
+            raise Refused(
+                "rewind", f"version {following} is next, not {request.version}; ask for the state"
+            )
+        if run.awaits_version() is None:
+            here = [n for r, n in self._here if r == "actor"]
+            why = f"iteration {request.version - 1}" + ("" if here else ": no actor is here")
+            if run.progress.state == "closing":
+                why = "the closing evaluation"
+            return ChangesReply(wait=self._wait(who, "actors", why, now))
+        self._waits.end(who)
+        iteration = request.version - 1
+        if iteration == run.progress.iteration:
+            return ChangesReply(ids=tuple(e.id for e in run.buffer))
+        return ChangesReply(ids=tuple(p.entry.id for p in self._store.buffer(iteration)))
+
+    def _episodes(self, request: EpisodesRequest, now: float) -> EpisodesReply:
+        bodies = self._store.episode_bodies(request.ids, PAGE)
+        if not bodies:
+            raise Refused(
+                "unknown_episode", f"episode {request.ids[0]} is not kept; ask for changes"
+            )
+        return EpisodesReply(episodes=tuple(bodies))
+
+    def _version(self, delivery: _Delivery, now: float) -> VersionReply:
+        result = self.run.add_version(delivery.version, delivery.message.train_s)
+        if result == "accepted":
+            self._version_at = now
+        return VersionReply(result=result)
+
+    def _state(self, request: StateRequest, now: float) -> StateReply:
+        version = self._store.version(self.run.progress.latest_version)
+        if version is None:
+            return StateReply(version=0)
+        return StateReply(
+            version=version.version, weights=version.weights, optimizer=version.optimizer
+        )
+
+    def _weights(self, request: WeightsRequest, now: float) -> Weights:
+        progress = self.run.progress
+        named = {"latest": progress.latest_version, "best": progress.best_version}
+        wanted = request.version if isinstance(request.version, int) else named[request.version]
+        version = self._store.version(wanted)
+        if version is None or not version.weights:
+            kept = self._store.versions_kept()
+            raise Refused(
+                "unknown_version", f"weights version {wanted} is not kept; kept are {kept}"
+            )
+        return Weights(version=version.version, weights=version.weights)
+
+    def _status(self, request: StatusRequest, now: float) -> Message:
+        return status(self.run, self._throughput, self._waits, self._lag_s, now)

@@ -1,0 +1,473 @@
+"""One SQLite file per run, the only thing in the system that is worth saving.
+
+Every change of a run is one transaction, synced before anything is acknowledged; what is on disk is
+consistent at every moment. Names of tables and columns are documented in ``docs/operations.md``.
+"""
+
+import fcntl
+import hashlib
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+
+from udrl.commands import Command
+from udrl.config import COMMANDS_PER_ITERATION
+from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
+from udrl.evaluation import Evaluation
+from udrl.replay import Entry
+
+SCHEMA = 1
+FILE = "run.sqlite"
+
+_TABLES = """
+CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE commands (id INTEGER PRIMARY KEY, cancelled INTEGER NOT NULL, body BLOB NOT NULL);
+CREATE TABLE episodes (
+    id INTEGER PRIMARY KEY, episode_return REAL NOT NULL, length INTEGER NOT NULL,
+    digest BLOB NOT NULL, admitted INTEGER, evicted INTEGER, body BLOB NOT NULL,
+    checksum BLOB NOT NULL);
+CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
+CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
+CREATE TABLE iterations (
+    iteration INTEGER PRIMARY KEY, commands INTEGER NOT NULL, env_steps INTEGER NOT NULL,
+    eval_env_steps INTEGER NOT NULL, wall_s REAL NOT NULL, return_min REAL NOT NULL,
+    return_mean REAL NOT NULL, return_max REAL NOT NULL, explored_return REAL,
+    weights_version INTEGER NOT NULL);
+CREATE TABLE evaluations (
+    iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
+    desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
+    mean REAL NOT NULL, std REAL NOT NULL, ci95_low REAL NOT NULL, ci95_high REAL NOT NULL,
+    episodes INTEGER NOT NULL, PRIMARY KEY (iteration, closing)) WITHOUT ROWID;
+CREATE TABLE versions (
+    version INTEGER PRIMARY KEY, digest BLOB NOT NULL, loss REAL NOT NULL, train_s REAL NOT NULL,
+    weights BLOB, optimizer BLOB, checksum BLOB);
+"""
+
+Fact = TypeVar("Fact")
+
+#: SQLite's codes for a file that is not what was written: malformed, no database, no such table.
+_DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR}
+
+
+class Pending(NamedTuple):
+    """An episode that arrived and is not admitted yet."""
+
+    entry: Entry
+    digest: bytes
+
+
+class Version(NamedTuple):
+    """A weights version; blobs are empty where they are no longer kept."""
+
+    version: int
+    digest: bytes
+    loss: float
+    weights: bytes
+    optimizer: bytes
+
+
+class EvaluationRow(NamedTuple):
+    """A row of the table ``evaluations``."""
+
+    iteration: int
+    closing: bool
+    env_steps: int
+    desired_return: float
+    desired_horizon: int
+    evaluation: Evaluation
+
+
+class Store:
+    """The file of one run.
+
+    Args:
+        run_dir: its directory.
+        read_only: look at it as it is now, beside a service that goes on writing.
+
+    Raises:
+        StoreError: there is no run, or its file cannot be read.
+        RunInUse: another service writes it.
+        DamagedStore: the file is not what was written.
+    """
+
+    def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
+        self._path = run_dir / FILE
+        if not self._path.exists():
+            raise StoreError(f"{run_dir} holds no run ({FILE} is missing); check the path")
+        self.read_only = read_only
+        self._lock = None if read_only else _lock(run_dir)
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        # As a URI, so that a mode can be named and the path may hold any character.
+        uri = f"{self._path.resolve().as_uri()}?mode={'ro' if self.read_only else 'rw'}"
+        try:
+            self._db = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+            if self.read_only:
+                self._db.execute("BEGIN")  # all that is read belongs to one moment
+            else:
+                self._db.execute("PRAGMA journal_mode = WAL")
+                self._db.execute("PRAGMA synchronous = FULL")
+        except sqlite3.Error as error:
+            raise self._fault(error) from error
+        if not self.read_only:
+            ((verdict,),) = self._rows("PRAGMA quick_check(1)")
+            if verdict != "ok":
+                raise self._damaged(verdict)
+        schema = self.fact("schema", int)
+        if schema != SCHEMA:
+            raise OtherConfiguration(
+                f"{self._path} has schema {schema}, this version of udrl reads {SCHEMA}; "
+                f"use the version that wrote it"
+            )
+
+    @classmethod
+    def create(cls, run_dir: Path, **facts: object) -> "Store":
+        """Make a new run's file, which holds some facts from the beginning.
+
+        Raises:
+            StoreError: there is a run already, or the directory cannot be written.
+            RunInUse: another service works in it.
+        """
+        path = run_dir / FILE
+        try:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            with _lock(run_dir):
+                if path.exists():
+                    raise StoreError(
+                        f"{run_dir} holds a run already; add --resume to go on with it, or name "
+                        f"another --run-dir"
+                    )
+                # Written aside and renamed, so that a run's file is there as a whole or not at all.
+                unfinished = path.with_suffix(".new")
+                unfinished.unlink(missing_ok=True)
+                with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
+                    db.executescript(_TABLES)
+                    for name, value in {"schema": SCHEMA, **facts}.items():
+                        encoded = msgspec.json.encode(value)
+                        db.execute("INSERT INTO facts VALUES (?, ?)", (name, encoded))
+                unfinished.rename(path)
+                _sync(run_dir)
+        except (OSError, sqlite3.Error) as error:
+            raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+        return cls(run_dir)
+
+    def close(self) -> None:
+        """Close the file and let others have it."""
+        if hasattr(self, "_db"):
+            self._db.close()
+        if self._lock is not None:
+            self._lock.close()
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Make all changes within durable together, or none of them.
+
+        Raises:
+            StoreError: they could not be written, e.g. because the disk is full.
+        """
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            finally:
+                # After some errors SQLite has rolled back by itself.
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+        except sqlite3.Error as error:
+            raise self._fault(error) from error
+
+    def _rows(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        try:
+            return self._db.execute(query, values).fetchall()
+        except sqlite3.Error as error:
+            raise self._fault(error) from error
+
+    def _fault(self, error: sqlite3.Error) -> StoreError:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
+            return self._damaged(error)
+        return StoreError(
+            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: free some disk "
+            f"space or repair the disk, and start again with --resume"
+        )
+
+    def _damaged(self, what: object) -> DamagedStore:
+        return DamagedStore(f"{self._path}: {what}; restore the run directory from a backup")
+
+    # Facts: named values, as JSON.
+
+    def fact(self, name: str, kind: type[Fact]) -> Fact:
+        """Return a named value.
+
+        Raises:
+            DamagedStore: it is missing or of another kind.
+        """
+        rows = self._rows("SELECT value FROM facts WHERE name = ?", (name,))
+        if not rows:
+            raise self._damaged(f"fact {name!r} is missing")
+        try:
+            return msgspec.json.decode(rows[0][0], type=kind)
+        except (msgspec.DecodeError, ConfigError) as error:
+            raise self._damaged(f"fact {name!r}: {error}") from error
+
+    def set_fact(self, name: str, value: object) -> None:
+        """Set a named value."""
+        self._db.execute(
+            "INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, msgspec.json.encode(value))
+        )
+
+    # Commands: those that are outstanding or cancelled.
+
+    def add_commands(self, commands: Iterable[Command]) -> None:
+        """Add outstanding commands."""
+        self._db.executemany(
+            "INSERT INTO commands VALUES (?, 0, ?)",
+            ((c.id, msgspec.msgpack.encode(c)) for c in commands),
+        )
+
+    def commands(self, *, cancelled: bool) -> list[Command]:
+        """Return the outstanding or the cancelled commands, by id."""
+        rows = self._rows(
+            "SELECT body FROM commands WHERE cancelled = ? ORDER BY id", (int(cancelled),)
+        )
+        try:
+            return [msgspec.msgpack.decode(body, type=Command) for (body,) in rows]
+        except msgspec.DecodeError as error:
+            raise self._damaged(f"a command: {error}") from error
+
+    def mark_commands(self, ids: Iterable[int], *, cancelled: bool) -> None:
+        """Cancel commands, or take that back."""
+        self._db.executemany(
+            "UPDATE commands SET cancelled = ? WHERE id = ?", ((int(cancelled), i) for i in ids)
+        )
+
+    def remove_commands(self, ids: Iterable[int]) -> None:
+        """Forget commands, whose episodes were accepted."""
+        self._db.executemany("DELETE FROM commands WHERE id = ?", ((i,) for i in ids))
+
+    # Episodes: pending, in the buffer, or needed for an earlier buffer.
+
+    def add_episode(self, entry: Entry, digest: bytes, body: bytes) -> None:
+        """Add an episode that arrived."""
+        self._db.execute(
+            "INSERT INTO episodes VALUES (?, ?, ?, ?, NULL, NULL, ?, ?)",
+            (entry.id, entry.episode_return, entry.length, digest, body, _checksum(body)),
+        )
+
+    def episode_digest(self, episode_id: int) -> bytes | None:
+        """Return an episode's digest if its row is still there."""
+        rows = self._rows("SELECT digest FROM episodes WHERE id = ?", (episode_id,))
+        return bytes(rows[0][0]) if rows else None
+
+    def pending(self, iteration: int) -> list[Pending]:
+        """Return an iteration's episodes that are not admitted yet, by id."""
+        first = iteration * COMMANDS_PER_ITERATION
+        rows = self._rows(
+            "SELECT episode_return, id, length, digest FROM episodes "
+            "WHERE admitted IS NULL AND id >= ? AND id < ? ORDER BY id",
+            (first, first + COMMANDS_PER_ITERATION),
+        )
+        return [Pending(Entry(*entry), digest) for *entry, digest in rows]
+
+    def pending_ids(self) -> set[int]:
+        """Return the ids of all episodes that are not admitted yet."""
+        rows = self._rows("SELECT id FROM episodes WHERE admitted IS NULL ORDER BY id")
+        return {i for (i,) in rows}
+
+    def admit(self, iteration: int, ids: Iterable[int], evicted: Iterable[int]) -> None:
+        """Note which episodes entered and left the buffer with an iteration."""
+        self._db.executemany(
+            "UPDATE episodes SET admitted = ? WHERE id = ?", ((iteration, i) for i in ids)
+        )
+        self._db.executemany(
+            "UPDATE episodes SET evicted = ? WHERE id = ?", ((iteration, i) for i in evicted)
+        )
+
+    def remove_episodes(self, ids: Iterable[int]) -> None:
+        """Forget episodes."""
+        self._db.executemany("DELETE FROM episodes WHERE id = ?", ((i,) for i in ids))
+
+    def remove_evicted(self, until: int) -> None:
+        """Forget episodes that no buffer after iteration ``until`` or later holds."""
+        self._db.execute("DELETE FROM episodes WHERE evicted <= ?", (until,))
+
+    def buffer(self, iteration: int) -> list[Pending]:
+        """Return the buffer as it was after an iteration, least return first."""
+        rows = self._rows(
+            "SELECT episode_return, id, length, digest FROM episodes "
+            "WHERE admitted <= ? AND (evicted IS NULL OR evicted > ?) ORDER BY episode_return, id",
+            (iteration, iteration),
+        )
+        return [Pending(Entry(*entry), digest) for *entry, digest in rows]
+
+    def episode_bodies(self, ids: Sequence[int], limit: int) -> list[bytes]:
+        """Return the first of the episodes asked for, up to ``limit`` bytes but at least one.
+
+        Raises:
+            DamagedStore: one is not what was written.
+        """
+        bodies: list[bytes] = []
+        for episode_id in ids:
+            rows = self._rows("SELECT body, checksum FROM episodes WHERE id = ?", (episode_id,))
+            if not rows:
+                break
+            ((body, checksum),) = rows
+            limit -= len(body)
+            if bodies and limit < 0:
+                break
+            if _checksum(body) != checksum:
+                raise self._damaged(f"episode {episode_id} is not what was written")
+            bodies.append(body)
+        return bodies
+
+    # Iterations and evaluations: one row each, kept for good.
+
+    def add_iteration(self, *values: float | None) -> None:
+        """Add a row to ``iterations``; values in the order of its columns."""
+        self._db.execute(f"INSERT INTO iterations VALUES ({_marks(values)})", values)  # noqa: S608
+
+    def issued_in(self, iteration: int) -> int:
+        """Return how many commands a completed iteration had."""
+        rows = self._rows("SELECT commands FROM iterations WHERE iteration = ?", (iteration,))
+        return int(rows[0][0]) if rows else 0
+
+    def env_steps_after(self, iteration: int) -> int:
+        """Return the env steps that a completed iteration ended with."""
+        rows = self._rows("SELECT env_steps FROM iterations WHERE iteration = ?", (iteration,))
+        return int(rows[0][0]) if rows else 0
+
+    def add_evaluation(self, row: EvaluationRow) -> None:
+        """Add or replace an evaluation."""
+        values = (*row[:-1], *row.evaluation)
+        self._db.execute(f"INSERT OR REPLACE INTO evaluations VALUES ({_marks(values)})", values)  # noqa: S608
+
+    def last_evaluation(self, *, closing: bool) -> EvaluationRow | None:
+        """Return the newest evaluation, of those that close a run or of the others."""
+        rows = self._rows(
+            "SELECT * FROM evaluations WHERE closing = ? ORDER BY iteration DESC LIMIT 1",
+            (int(closing),),
+        )
+        if not rows:
+            return None
+        iteration, is_closing, env_steps, desired_return, desired_horizon, *found = rows[0]
+        return EvaluationRow(
+            iteration,
+            bool(is_closing),
+            env_steps,
+            desired_return,
+            desired_horizon,
+            Evaluation(*found),
+        )
+
+    def metrics(self, after: int) -> list[tuple[Any, ...]]:
+        """Return the rows of ``metrics.csv`` of iterations after ``after``."""
+        return self._rows(
+            "SELECT i.iteration, i.env_steps, i.eval_env_steps, round(i.wall_s, 3), "
+            "e.env_steps, e.mean, e.std, e.ci95_low, e.ci95_high, v.loss, i.weights_version, "
+            "i.return_min, i.return_mean, i.return_max, i.explored_return, "
+            "e.desired_return, e.desired_horizon "
+            "FROM iterations i "
+            "LEFT JOIN evaluations e ON e.iteration = i.iteration AND NOT e.closing "
+            "LEFT JOIN versions v ON v.version = i.weights_version "
+            "WHERE i.iteration > ? ORDER BY i.iteration",
+            (after,),
+        )
+
+    # Weights versions: digest and loss of all, blobs of those that somebody may need.
+
+    def add_version(self, version: Version, train_s: float) -> None:
+        """Add a version, or bring back one whose blobs had gone."""
+        self._db.execute(
+            "INSERT OR REPLACE INTO versions VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (
+                version.version, version.digest, version.loss, train_s,
+                version.weights, version.optimizer,
+                _checksum(version.weights) + _checksum(version.optimizer),
+            ),
+        )  # fmt: skip
+
+    def version(self, version: int) -> Version | None:
+        """Return a version; its optimizer is empty unless it is the newest.
+
+        Raises:
+            DamagedStore: the blobs are not those that were written.
+        """
+        rows = self._rows(
+            "SELECT version, digest, loss, ifnull(weights, x''), ifnull(optimizer, x''), checksum "
+            "FROM versions WHERE version = ?",
+            (version,),
+        )
+        if not rows:
+            return None
+        *values, checksum = rows[0]
+        found = Version(*values)
+        for blob, expected in ((found.weights, checksum[:32]), (found.optimizer, checksum[32:])):
+            if blob and _checksum(blob) != expected:
+                raise self._damaged(f"weights version {version} is not what was written")
+        return found
+
+    def versions_kept(self) -> list[int]:
+        """Return the versions whose weights are there."""
+        rows = self._rows("SELECT version FROM versions WHERE weights IS NOT NULL ORDER BY version")
+        return [v for (v,) in rows]
+
+    def drop_weights(self, versions: Iterable[int]) -> None:
+        """Forget the blobs of some versions."""
+        self._db.executemany(
+            "UPDATE versions SET weights = NULL, optimizer = NULL WHERE version = ?",
+            ((v,) for v in versions),
+        )
+
+    def drop_optimizers(self, before: int) -> None:
+        """Forget the optimizer state of versions before one."""
+        self._db.execute(
+            "UPDATE versions SET optimizer = NULL WHERE version < ? AND optimizer IS NOT NULL",
+            (before,),
+        )
+
+    def remove_versions(self, after: int) -> None:
+        """Forget versions that were trained beyond the end of the run."""
+        self._db.execute("DELETE FROM versions WHERE version > ?", (after,))
+
+
+def _marks(values: Sequence[object]) -> str:
+    return ", ".join("?" * len(values))
+
+
+def _checksum(blob: bytes) -> bytes:
+    return hashlib.sha256(blob).digest()
+
+
+def _sync(folder: Path) -> None:
+    """Make a renamed file's new name durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(run_dir: Path) -> Any:
+    """Return the open lock file of a run directory; it is free again when it is closed."""
+    try:
+        file = (run_dir / "lock").open("a")
+    except OSError as error:
+        raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise RunInUse(
+            f"{run_dir} is in use by another replay service; stop it, or name another --run-dir"
+        ) from error
+    return file

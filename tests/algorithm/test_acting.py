@@ -1,0 +1,558 @@
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from torch import Tensor
+
+from udrl import acting
+from udrl.acting import EpisodeGenerator, Failure, generate_episodes
+from udrl.behavior import BehaviorFunction, initialise
+from udrl.commands import Command, CommandSampler
+from udrl.config import Config, build
+from udrl.digests import episode_digest
+from udrl.environments import Environment, limit_steps, make_environment, specify
+from udrl.episode import Episode, action_dtype
+from udrl.errors import EnvironmentFault
+from udrl.replay import Entry, ReplayBuffer
+from udrl.streams import Purpose, Stream, stream_key
+
+Make = Callable[[Config], Environment]
+Order = tuple[Command, BehaviorFunction | None]
+
+
+def settings(environment: str = "Scripted-v0", **values: Any) -> Config:
+    small = {"environment": environment, "hidden": [16, 16]}
+    return build(Config, small | values)
+
+
+def order(number: int, **values: Any) -> Command:
+    """A command of a run that acts with weights version 1; it stands for any."""
+    usual: dict[str, Any] = {
+        "id": number,
+        "kind": "explore",
+        "desired_return": 3.0,
+        "desired_horizon": 5,
+        "environment_seed": number,
+        "stream_key": stream_key(1, Purpose.EPISODE, 1, number),
+        "weights_version": 1,
+        "max_steps": 5000,
+    }
+    return Command(**(usual | values))
+
+
+def algorithm2(
+    config: Config,
+    command: Command,
+    behavior: BehaviorFunction | None,
+    make: Make = make_environment,
+) -> Episode:
+    """Algorithm 2 as the paper prints it: one environment, one episode, one action at a time."""
+    env = make(config)
+    spec = specify(env, config)
+    limit_steps(env, command.max_steps)
+    stream = Stream(command.stream_key)
+    capped = command.kind == "evaluate" and spec.max_return is not None
+    dr, dh = command.desired_return, command.desired_horizon
+    s, _ = env.reset(seed=command.environment_seed)
+    s = np.asarray(s, np.float32)
+
+    episode: list[tuple[Any, int, np.float32]] = []  # 1: E <- {}
+    over = terminated = truncated = False
+    while not over:  # 3
+        if capped:
+            dr = min(dr, spec.max_return or 0.0)
+        # 4: compute P(a_t | s_t, c_t) = B(s_t, c_t; theta)
+        if behavior is None:
+            logits = [0.0] * spec.n_actions
+        else:
+            c = [dr * config.return_scale, max(dh, 1) * config.horizon_scale]
+            states = torch.tensor(np.tile(s, (config.inference_rows, 1)))
+            commands = torch.tensor([c] * config.inference_rows, dtype=torch.float32)
+            with torch.inference_mode():
+                logits = behavior(states, commands)[0].tolist()
+        # 5: execute a_t ~ P(a_t | s_t, c_t)
+        u = float(stream.uniforms(1)[0])
+        if command.greedy:
+            a = logits.index(max(logits))
+        else:
+            weights = np.exp(np.array(logits) - max(logits)).tolist()
+            cumulative = [weights[0]]
+            for weight in weights[1:]:
+                cumulative.append(cumulative[-1] + weight)
+            a = next((a for a, p in enumerate(cumulative) if u * cumulative[-1] < p))
+        next_s, reward, terminated, truncated, _ = env.step(a)
+        r = np.float32(reward)
+        episode.append((s, a, r))  # 6: append (s_t, a_t, r_t) to E
+        s = np.asarray(next_s, np.float32)  # 7: update state
+        dr -= float(r)  # 8: update desired reward
+        dh -= 1  # 9: update desired horizon
+        over = terminated or truncated
+    env.close()
+    observations, actions, rewards = zip(*episode, strict=True)
+    return Episode(
+        command_id=command.id,
+        observations=np.array(observations, np.float32),
+        actions=np.array(actions, action_dtype(spec.n_actions)),
+        rewards=np.array(rewards, np.float32),
+        terminated=terminated,
+        truncated=truncated,
+    )
+
+
+def carry_out(generator: EpisodeGenerator, orders: Sequence[Order]) -> list[Episode | Failure]:
+    """What an actor does: keep all environments busy; return the outcomes as they come."""
+    waiting = list(orders)[::-1]
+    outcomes: list[Episode | Failure] = []
+    while waiting or generator.running:
+        while waiting and generator.free:
+            failure = generator.start(*waiting.pop())
+            if failure is not None:
+                outcomes.append(failure)
+        outcomes += generator.step()
+    return outcomes
+
+
+def digests(outcomes: Sequence[Episode | Failure]) -> dict[int, bytes]:
+    return {e.command_id: episode_digest(e) for e in outcomes if isinstance(e, Episode)}
+
+
+# --- Equal to the paper's loop, whatever the company ----------------------------------------------
+
+
+@cache
+def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[bytes]]:
+    """Commands of all kinds, for two weights versions, and their episodes' digests."""
+    config = settings(
+        environment,
+        n_warm_up_episodes=3,
+        n_episodes_per_iter=5,
+        eval_episodes=4,
+        max_train_steps=60,
+        max_return=12.0,
+    )
+    env = make_environment(config)
+    spec = specify(env, config)
+    one, other = (initialise(settings(environment, seed=seed), spec) for seed in (1, 2))
+    buffer = ReplayBuffer(2, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
+    sample = CommandSampler(config, spec.max_episode_steps)
+    evaluation = sample.evaluate(2, buffer)
+    orders: list[Order] = []
+    orders += [(command, None) for command in sample.warm_up()]
+    orders += [(command, one) for command in sample.explore(1, buffer)]
+    orders += [(command, other) for command in sample.explore(2, buffer) + evaluation]
+    orders += [
+        (msgspec.structs.replace(command, id=command.id + 100, greedy=True), other)
+        for command in evaluation
+    ]
+    return config, orders, [episode_digest(algorithm2(config, *each)) for each in orders]
+
+
+@pytest.mark.parametrize("n_environments", [1, 3, 16, 20])
+@pytest.mark.parametrize("environment", ["CartPole-v1", "Figure2-v0", "LunarLander-v3"])
+def test_episodes_are_those_of_algorithm_2_whatever_the_company(
+    environment: str, n_environments: int
+) -> None:
+    config, orders, expected = a_bit_of_everything(environment)
+    generator = EpisodeGenerator(config, n_environments)
+    # Taking every fifth mixes long and short ones, versions and kinds.
+    mixed = [orders[5 * i % len(orders)] for i in range(len(orders))]
+    outcomes = carry_out(generator, mixed)
+    assert digests(outcomes) == {
+        command.id: digest for (command, _), digest in zip(orders, expected, strict=True)
+    }
+
+
+def test_an_episode_is_the_same_again_after_others() -> None:
+    config, orders, _ = a_bit_of_everything("LunarLander-v3")
+    generator = EpisodeGenerator(config, n_environments=2)
+    assert digests(carry_out(generator, orders)) == digests(carry_out(generator, orders[::-1]))
+
+
+# --- Environments that follow a script, or fail to ------------------------------------------------
+
+
+def four_steps(seed: int) -> list[float]:
+    return [1.0, -2.0, 4.0, 0.5]
+
+
+@dataclass
+class World:
+    """What scripted environments do, and what was done to them.
+
+    Attributes:
+        script: the rewards of an episode, by seed.
+        ends: ``terminated`` and ``truncated`` of the last step.
+        faults: what goes wrong in the episodes of a seed, with the third step (or the reset).
+    """
+
+    script: Callable[[int], list[float]] = four_steps
+    ends: tuple[bool, bool] = (True, False)
+    faults: dict[int, str] = field(default_factory=dict)
+    instances: list["Scripted"] = field(default_factory=list)
+
+    def make(self, config: Config) -> Environment:
+        spec = EnvSpec("Scripted-v0", entry_point=self._instance, max_episode_steps=5000)
+        return gym.make(spec, disable_env_checker=True)
+
+    def _instance(self, **_: Any) -> "Scripted":
+        self.instances.append(Scripted(self))
+        return self.instances[-1]
+
+
+class Scripted(gym.Env[Any, Any]):
+    """Observes (seed, steps taken, last action); refuses to be stepped beyond an episode's end."""
+
+    def __init__(self, world: World) -> None:
+        self.metadata = {"render_modes": []}
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self.action_space = gym.spaces.Discrete(3)
+        self.world = world
+        self.seeds: list[int] = []
+        self.left: list[float] = []
+        self.closed = False
+        self.broken = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        assert seed is not None
+        assert not self.broken
+        self.fault = self.world.faults.get(seed)
+        self.broken = self.fault is not None
+        if self.fault == "raises in reset":
+            raise RuntimeError("no more worlds")
+        self.seeds.append(seed)
+        self.left = list(self.world.script(seed))
+        self.t = 0
+        return np.array([seed, 0, 0], np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        reward = self.left.pop(0)
+        observation = np.array([self.seeds[-1], self.t, action], np.float32)
+        terminated, truncated = self.world.ends if not self.left else (False, False)
+        if self.fault is not None and self.t == 3:
+            if self.fault == "raises in step":
+                raise RuntimeError("the world has ended")
+            if self.fault == "returns four values":
+                return observation, reward, terminated, {}
+            if self.fault == "observes a matrix":
+                observation = np.zeros((2, 2), np.float32)
+            if self.fault == "observes NaN":
+                observation[1] = np.nan
+            if self.fault == "observes infinity":
+                observation[1] = np.inf
+            if self.fault.startswith("rewards "):
+                reward = float(self.fault.removeprefix("rewards "))
+        return observation, reward, terminated, truncated, {}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Spy(BehaviorFunction):
+    """Gives the same logits for whatever it is asked, and remembers what it was asked."""
+
+    def __init__(self, generator: EpisodeGenerator, config: Config, logits: list[float]) -> None:
+        super().__init__(generator.spec, config)
+        self.logits = torch.tensor(logits)
+        self.commands: list[list[float]] = []  # of the first row
+        self.rows: list[int] = []
+
+    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
+        self.commands.append(command[0].tolist())
+        self.rows.append(len(observation))
+        return self.logits.expand(len(observation), -1)
+
+
+def act(world: World, commands: list[Command], n_environments: int = 1) -> list[Episode | Failure]:
+    """Carry out commands with random actions."""
+    generator = EpisodeGenerator(settings(), n_environments, world.make)
+    return carry_out(generator, [(command, None) for command in commands])
+
+
+@pytest.mark.parametrize(
+    ("kind", "max_return", "seen"),
+    [
+        ("explore", None, [[3, 2], [2, 1], [4, 1], [0, 1]]),
+        ("explore", 2.5, [[3, 2], [2, 1], [4, 1], [0, 1]]),
+        ("evaluate", None, [[3, 2], [2, 1], [4, 1], [0, 1]]),
+        ("evaluate", 2.5, [[2.5, 2], [1.5, 1], [2.5, 1], [-1.5, 1]]),
+    ],
+)
+def test_the_network_is_given_what_is_left_of_the_command(
+    kind: str, max_return: float | None, seen: list[list[float]]
+) -> None:
+    config = settings(return_scale=1, horizon_scale=1, max_return=max_return)
+    generator = EpisodeGenerator(config, 1, World().make)
+    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    generate_episodes(generator, [order(1, kind=kind, desired_horizon=2)], spy)
+    assert spy.commands == seen
+
+
+def test_commands_are_scaled_for_the_network() -> None:
+    config = settings(return_scale=0.5, horizon_scale=0.25)
+    generator = EpisodeGenerator(config, 1, World().make)
+    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    generate_episodes(generator, [order(1, desired_return=3.0, desired_horizon=5)], spy)
+    assert spy.commands[0] == [1.5, 1.25]
+
+
+@pytest.mark.parametrize(
+    ("n_environments", "rows", "calls"), [(1, 16, 1), (16, 16, 1), (17, 16, 2), (40, 24, 2)]
+)
+def test_every_call_has_the_number_of_rows_in_the_settings(
+    n_environments: int, rows: int, calls: int
+) -> None:
+    config = settings(inference_rows=rows)
+    generator = EpisodeGenerator(config, n_environments, World().make)
+    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    generate_episodes(generator, [order(i) for i in range(n_environments)], spy)
+    assert spy.rows == [rows] * calls * 4
+
+
+@pytest.mark.parametrize(
+    ("logits", "probabilities"),
+    [(None, [1 / 3, 1 / 3, 1 / 3]), ([5 + math.log(p) for p in (0.5, 0.3, 0.2)], [0.5, 0.3, 0.2])],
+)
+def test_actions_have_the_networks_probabilities_and_are_uniform_in_the_warm_up(
+    logits: list[float] | None, probabilities: list[float]
+) -> None:
+    n, config = 4000, settings()
+    generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * n).make)
+    behavior = None if logits is None else Spy(generator, config, logits)
+    (episode,) = generate_episodes(generator, [order(1)], behavior)
+    expected = n * np.array(probabilities)
+    counts = np.bincount(episode.actions, minlength=3)
+    # Chi-square with 2 degrees of freedom is above 13.8 once in a thousand.
+    assert ((counts - expected) ** 2 / expected).sum() < 13.8
+
+
+class Edges:
+    """A stream that has the least and the greatest number, and one between."""
+
+    def __init__(self, key: bytes) -> None:
+        pass
+
+    def uniforms(self, n: int) -> npt.NDArray[np.float64]:
+        return np.resize([0.0, 0.5, 1 - 2**-53], n)
+
+
+@pytest.mark.parametrize(
+    ("logits", "actions"),
+    [
+        ([0.0, 0.0, -math.inf], [0, 1, 1]),
+        ([-math.inf, 0.0, 0.0], [1, 2, 2]),
+        ([0.0, -math.inf, 0.0], [0, 2, 2]),
+        ([-math.inf, 0.0, -math.inf], [1, 1, 1]),
+    ],
+)
+def test_an_action_of_probability_zero_is_never_taken(
+    logits: list[float], actions: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acting, "Stream", Edges)
+    config = settings()
+    generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 3).make)
+    (episode,) = generate_episodes(generator, [order(1)], Spy(generator, config, logits))
+    assert episode.actions.tolist() == actions
+
+
+def test_greedy_actions_are_the_mode() -> None:
+    config = settings()
+    generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 100).make)
+    spy = Spy(generator, config, [0.1, 0.3, 0.2])
+    greedy, sampled = generate_episodes(generator, [order(1, greedy=True), order(2)], spy)
+    assert set(greedy.actions.tolist()) == {1}
+    assert set(sampled.actions.tolist()) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("ends", [(True, False), (False, True), (True, True)])
+def test_an_episode_is_whole_and_says_how_it_ended(ends: tuple[bool, bool]) -> None:
+    (episode,) = act(World(ends=ends), [order(7)])
+    assert isinstance(episode, Episode)
+    assert (episode.command_id, episode.length) == (7, 4)
+    assert (episode.terminated, episode.truncated) == ends
+    assert episode.rewards.tolist() == [1.0, -2.0, 4.0, 0.5]
+    assert episode.episode_return == 3.5
+
+
+def test_observations_are_those_that_the_actions_were_chosen_in() -> None:
+    for episode in act(World(), [order(i) for i in range(1, 6)], n_environments=2):
+        assert isinstance(episode, Episode)
+        before = [0, *episode.actions.tolist()[:-1]]
+        assert episode.observations.tolist() == [
+            [episode.command_id, t, action] for t, action in enumerate(before)
+        ]
+
+
+def test_an_environment_is_reset_once_for_every_episode_with_the_commands_seed() -> None:
+    world = World()
+    act(world, [order(i, environment_seed=i + 50) for i in range(6)], n_environments=2)
+    first, second = (instance.seeds for instance in world.instances)
+    assert (first, second) == ([50, 52, 54], [51, 53, 55])
+
+
+def test_a_command_truncates_its_episode_and_no_other() -> None:
+    steps = {1: 2, 2: 4, 3: 3, 4: 5000}
+    episodes = act(World(), [order(i, max_steps=n) for i, n in steps.items()])
+    ends = {
+        e.command_id: (e.length, e.terminated, e.truncated)
+        for e in episodes
+        if isinstance(e, Episode)
+    }
+    assert ends == {
+        1: (2, False, True),
+        2: (4, True, True),
+        3: (3, False, True),
+        4: (4, True, False),
+    }
+
+
+def test_rewards_are_rounded_to_float32_before_they_are_counted() -> None:
+    config = settings(return_scale=1, horizon_scale=1)
+    generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.1, 0.0]).make)
+    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    generate_episodes(generator, [order(1, desired_return=0.1)], spy)
+    assert spy.commands[1][0] == np.float32(0.1 - float(np.float32(0.1)))
+
+
+def long_ones(seed: int) -> list[float]:
+    return [float((seed * t) % 7 - 3) for t in range(1100 * seed)]
+
+
+@pytest.mark.parametrize("n_environments", [1, 2, 4])
+def test_episodes_longer_than_the_first_storage_are_whole(n_environments: int) -> None:
+    # 1024 steps are provided for at first; these have 1100, 2200 and 3300.
+    config, world = settings(), World(script=long_ones)
+    generator = EpisodeGenerator(config, n_environments, world.make)
+    behavior = initialise(config, generator.spec)
+    orders: list[Order] = [(order(1), behavior), (order(3), None), (order(2), behavior)]
+    outcomes = carry_out(generator, orders)
+    assert digests(outcomes) == {
+        command.id: episode_digest(algorithm2(config, command, behavior, World(long_ones).make))
+        for command, behavior in orders
+    }
+
+
+# --- Faults ---------------------------------------------------------------------------------------
+
+NOT_FINITE = "ValueError: an observation or reward is NaN, infinite, or beyond float32"
+FAULTS = {
+    "raises in reset": "RuntimeError: no more worlds",
+    "raises in step": "RuntimeError: the world has ended",
+    "returns four values": "ValueError: not enough values to unpack",
+    "observes a matrix": "ValueError: could not broadcast",
+    "observes NaN": NOT_FINITE,
+    "observes infinity": NOT_FINITE,
+    "rewards nan": NOT_FINITE,
+    "rewards inf": NOT_FINITE,
+    "rewards 1e300": NOT_FINITE,
+}
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+@pytest.mark.parametrize("random", [True, False])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_costs_one_episode_and_its_environment_and_nothing_else(
+    fault: str, random: bool
+) -> None:
+    config, world = settings(), World(faults={4: fault})
+    generator = EpisodeGenerator(config, 3, world.make)
+    behavior = None if random else initialise(config, generator.spec)
+    commands = [order(i) for i in range(9)]
+    outcomes = carry_out(generator, [(command, behavior) for command in commands])
+
+    (failure,) = (outcome for outcome in outcomes if isinstance(outcome, Failure))
+    assert failure.command == commands[4]
+    assert isinstance(failure.error, EnvironmentFault)
+    where = "reset" if fault == "raises in reset" else "step"
+    assert str(failure.error).startswith(
+        f"the environment failed in {where}() under command 4 (seed 4): {FAULTS[fault]}"
+    )
+    assert digests(outcomes) == {
+        c.id: episode_digest(algorithm2(config, c, behavior, World().make))
+        for c in commands
+        if c.id != 4
+    }
+    assert [instance.broken for instance in world.instances].count(True) == 1
+    assert all(instance.closed == instance.broken for instance in world.instances)
+    assert len(world.instances) == 3 + 1
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+def test_faults_one_after_the_other_leave_the_generator_usable() -> None:
+    world = World(faults=dict(zip(range(1, 10), FAULTS, strict=True)))
+    outcomes = act(world, [order(i) for i in range(11)], n_environments=2)
+    assert sum(isinstance(outcome, Failure) for outcome in outcomes) == 9
+    assert set(digests(outcomes)) == {0, 10}
+
+
+def test_a_rebuilt_environment_is_given_the_next_commands_limit() -> None:
+    world = World(faults={1: "raises in reset"})
+    _, episode = act(world, [order(1, max_steps=2), order(2, max_steps=2)])
+    assert isinstance(episode, Episode)
+    assert (episode.length, episode.truncated) == (2, True)
+
+
+def test_free_and_running_count_environments() -> None:
+    generator = EpisodeGenerator(settings(), 2, World(faults={3: "raises in reset"}).make)
+    assert (generator.free, generator.running) == (2, [])
+    assert isinstance(generator.start(order(3), None), Failure)
+    assert (generator.free, generator.running) == (2, [])
+    assert generator.start(order(1), None) is None
+    assert (generator.free, generator.running) == (1, [order(1)])
+    for _ in range(3):
+        assert generator.step() == []
+    assert len(generator.step()) == 1
+    assert (generator.free, generator.running) == (2, [])
+
+
+def test_episodes_are_returned_by_command_id() -> None:
+    lengths = {1: 9, 2: 3, 3: 6}
+    world = World(script=lambda seed: [0.0] * lengths[seed])
+    generator = EpisodeGenerator(settings(), 2, world.make)
+    episodes = generate_episodes(generator, [order(i) for i in (3, 1, 2)], None)
+    assert [(e.command_id, e.length) for e in episodes] == list(lengths.items())
+
+
+def fails(times: int) -> Callable[[int], list[float]]:
+    """A script that cannot be had for seed 2 at first."""
+    failures = iter([True] * times)
+
+    def script(seed: int) -> list[float]:
+        if seed == 2 and next(failures, False):
+            raise RuntimeError("not yet")
+        return four_steps(seed)
+
+    return script
+
+
+def test_generating_episodes_tries_again_after_a_fault_which_changes_nothing() -> None:
+    commands = [order(i) for i in range(5)]
+    smooth, rough = (
+        generate_episodes(EpisodeGenerator(settings(), 2, world.make), commands, None)
+        for world in (World(), World(script=fails(times=2)))
+    )
+    assert digests(rough) == digests(smooth)
+    assert [episode.command_id for episode in rough] == [0, 1, 2, 3, 4]
+
+
+def test_generating_episodes_raises_the_fault_of_a_command_that_keeps_failing() -> None:
+    generator = EpisodeGenerator(settings(), 2, World(script=fails(times=3)).make)
+    with pytest.raises(EnvironmentFault, match=r"in reset\(\) under command 2 .* not yet"):
+        generate_episodes(generator, [order(i) for i in range(5)], None)
+
+
+def test_closing_closes_all_environments() -> None:
+    world = World()
+    EpisodeGenerator(settings(), 3, world.make).close()
+    assert [instance.closed for instance in world.instances] == [True] * 3

@@ -1,0 +1,197 @@
+from functools import cache
+from typing import Any
+
+import pytest
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.algorithm1 import Run, algorithm1
+from udrl.commands import CommandSampler
+from udrl.config import Budget, Config, build
+from udrl.errors import ConfigError
+from udrl.evaluation import summarise
+from udrl.replay import Entry, ReplayBuffer
+from udrl.segments import Experience
+from udrl.training import train, untrained
+
+BUDGET = Budget(max_env_steps=400)
+
+
+def settings(**values: Any) -> Config:
+    small = {
+        "environment": "CartPole-v1",
+        "lead": 0,
+        "hidden": [16, 16],
+        "batch_size": 32,
+        "n_updates_per_iter": 5,
+        "n_warm_up_episodes": 4,
+        "n_episodes_per_iter": 3,
+        "replay_size": 6,
+        "last_few": 3,
+        "eval_every": 150,
+        "eval_episodes": 2,
+    }
+    return build(Config, small | values)
+
+
+def obedience(**values: Any) -> Config:
+    """Episodes of 8 steps: 32 in the warm-up, 24 in every iteration."""
+    return settings(environment="Obedience-v0", **values)
+
+
+def history(
+    config: Config, budget: Budget = BUDGET, n_environments: int = 4
+) -> list[tuple[Any, ...]]:
+    """What a run looks like after every iteration."""
+    rows: list[tuple[Any, ...]] = []
+
+    def report(run: Run) -> None:
+        rows.append(
+            (
+                run.iteration,
+                run.env_steps,
+                run.weights_sha256,
+                run.replay_sha256,
+                run.evaluations.get(run.iteration),
+            )
+        )
+
+    algorithm1(config, budget, n_environments, report)
+    return rows
+
+
+@cache
+def usual_history() -> list[tuple[Any, ...]]:
+    return history(settings())
+
+
+@pytest.mark.parametrize("n_environments", [1, 3, 20])
+def test_a_run_does_not_depend_on_the_number_of_environments(n_environments: int) -> None:
+    assert history(settings(), n_environments=n_environments) == usual_history()
+
+
+def test_a_run_is_the_same_again() -> None:
+    assert history(settings()) == usual_history()
+
+
+def test_another_seed_is_another_run_from_the_start() -> None:
+    other = history(settings(seed=2))
+    assert other[0][2] != usual_history()[0][2]
+    assert other[0][3] != usual_history()[0][3]
+
+
+def test_a_larger_budget_goes_on_where_a_smaller_one_stopped() -> None:
+    longer = history(settings(), Budget(max_env_steps=600))
+    assert len(longer) > len(usual_history())
+    assert longer[: len(usual_history())] == usual_history()
+
+
+def test_the_run_is_the_papers_pseudo_code() -> None:
+    config = settings()
+    generator = EpisodeGenerator(config, n_environments=1)
+    sample = CommandSampler(config, generator.spec.max_episode_steps)
+    # 1, 2: warm-up episodes; a behavior function
+    seen = generate_episodes(generator, sample.warm_up(), None)
+    env_steps, evaluations = sum(e.length for e in seen), {}
+    state = untrained(config, generator.spec)
+    iteration, crossed = 0, env_steps // config.eval_every > 0
+    while env_steps < BUDGET.max_env_steps:  # 3
+        iteration += 1
+        # The best of all episodes ever seen, of which equals rank by age.
+        best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+        buffer = ReplayBuffer(
+            config.replay_size, [Entry(e.episode_return, e.command_id, e.length) for e in best]
+        )
+        experience = Experience(config, generator.spec)
+        for episode in best:
+            experience.add(episode)
+        train(state, experience.by_rank([e.command_id for e in best]), config)  # 4
+        exploratory = sample.explore(iteration, buffer)  # 5
+        new = generate_episodes(generator, exploratory, state.behavior)  # 6
+        seen += new
+        if crossed:  # 7, 8
+            evaluated = generate_episodes(
+                generator, sample.evaluate(iteration, buffer), state.behavior
+            )
+            evaluations[iteration] = summarise([e.episode_return for e in evaluated])
+        before, env_steps = env_steps, env_steps + sum(e.length for e in new)
+        crossed = env_steps // config.eval_every > before // config.eval_every
+
+    run = algorithm1(config, BUDGET, 4)
+    best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+    assert (run.iteration, run.env_steps) == (iteration, env_steps)
+    assert run.evaluations == evaluations
+    assert evaluations
+    assert [entry.id for entry in run.buffer] == [e.command_id for e in best]
+    assert run.experience.ids() == {e.command_id for e in best}
+    assert set(run.digests) == {e.command_id for e in best}
+    ours, theirs = state.behavior.state_dict(), run.state.behavior.state_dict()
+    assert all(bool((ours[name] == theirs[name]).all()) for name in ours)
+
+
+def test_the_warm_up_of_obedience_is_pinned() -> None:
+    # No network, no platform's arithmetic: the streams, the commands, the sampling of actions.
+    run = algorithm1(obedience(), Budget(max_env_steps=1))
+    assert run.iteration == 0
+    assert run.replay_sha256 == ("ef04b52c5d6cd5d99de144baef6aaf10bc138ea77acadd81cf6330adb7e44ed6")
+
+
+def test_a_run_ends_with_the_iteration_that_reaches_the_budget() -> None:
+    steps = [row[:2] for row in history(obedience(), Budget(max_env_steps=32 + 24 * 2))]
+    assert steps == [(0, 32), (1, 56), (2, 80)]
+    steps = [row[:2] for row in history(obedience(), Budget(max_env_steps=32 + 24 * 2 + 1))]
+    assert steps == [(0, 32), (1, 56), (2, 80), (3, 104)]
+
+
+def test_a_budget_spent_in_the_warm_up_leaves_the_weights_untrained() -> None:
+    run = algorithm1(obedience(), Budget(max_env_steps=32))
+    assert (run.iteration, run.state.version, run.env_steps) == (0, 0, 32)
+
+
+def test_every_iteration_trains_one_version() -> None:
+    versions: list[tuple[int, int]] = []
+    algorithm1(
+        obedience(),
+        Budget(max_env_steps=104),
+        4,
+        lambda run: versions.append((run.iteration, run.state.version)),
+    )
+    assert versions == [(0, 0), (1, 1), (2, 2), (3, 3)]
+
+
+def test_evaluations_follow_the_multiples_that_env_steps_pass_and_are_not_counted() -> None:
+    # After iterations 0, 1, 2 ... there are 32, 56, 80, 104, 128, 152 steps.
+    run = algorithm1(obedience(eval_every=50, eval_episodes=5), Budget(max_env_steps=152))
+    assert run.env_steps == 152
+    assert sorted(run.evaluations) == [2, 4]
+    assert {evaluation.episodes for evaluation in run.evaluations.values()} == {5}
+
+
+def test_evaluations_change_nothing_else() -> None:
+    often = history(settings(eval_every=1, eval_episodes=5))
+    never = history(settings(eval_every=10**9))
+    assert [row[:4] for row in often] == [row[:4] for row in never]
+    assert all(row[4] is not None for row in often[1:])
+    assert all(row[4] is None for row in never)
+
+
+def test_a_run_stops_when_an_evaluation_reaches_the_stop_return() -> None:
+    means = {i: e.mean for i, _, _, _, e in usual_history() if e is not None}
+    first, mean = next(iter(means.items()))
+    assert len(usual_history()) > first + 1
+    stopped = history(settings(), Budget(max_env_steps=400, stop_return=mean))
+    assert stopped == usual_history()[: first + 1]
+
+
+def test_a_stop_return_that_is_never_reached_stops_nothing() -> None:
+    assert history(settings(), Budget(max_env_steps=400, stop_return=1e9)) == usual_history()
+
+
+def test_the_buffer_keeps_the_best_and_nothing_of_the_others() -> None:
+    run = algorithm1(settings(), BUDGET)
+    assert len(run.buffer) == 6
+    assert run.experience.ids() == set(run.digests) == {entry.id for entry in run.buffer}
+
+
+def test_a_lead_is_refused_with_the_remedy() -> None:
+    with pytest.raises(ConfigError, match=r"lead = 2: .*set lead=0"):
+        algorithm1(settings(lead=2), BUDGET)

@@ -1,0 +1,199 @@
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from udrl.checkpoint import decode_state, decode_weights, encode_optimizer, encode_weights
+from udrl.config import Config, build
+from udrl.digests import tensors_digest
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import InvalidWeights
+from udrl.segments import Experience, RankedExperience
+from udrl.training import TrainingState, train, untrained
+
+CONFIG = build(
+    Config,
+    {
+        "environment": "CartPole-v1",
+        "hidden": [8, 8],
+        "batch_size": 16,
+        "n_updates_per_iter": 5,
+        "learning_rate": 1e-2,
+    },
+)
+SPEC = EnvironmentSpec(observation_size=3, n_actions=2, max_episode_steps=20)
+
+
+def experience() -> RankedExperience:
+    rng = np.random.default_rng(1)
+    held = Experience(CONFIG, SPEC)
+    held.add(
+        Episode(
+            command_id=0,
+            observations=rng.standard_normal((20, 3), np.float32),
+            actions=rng.integers(2, size=20, dtype=np.uint8),
+            rewards=rng.standard_normal(20, np.float32),
+            terminated=True,
+            truncated=False,
+        )
+    )
+    return held.by_rank([0])
+
+
+def trained(versions: int) -> TrainingState:
+    state = untrained(CONFIG, SPEC)
+    for _ in range(versions):
+        train(state, experience(), CONFIG)
+    return state
+
+
+def digest(state: TrainingState) -> bytes:
+    return tensors_digest(state.behavior.state_dict())
+
+
+def restored(state: TrainingState) -> TrainingState:
+    weights, optimizer = encode_weights(state.behavior), encode_optimizer(state)
+    return decode_state(state.version, weights, optimizer, CONFIG, SPEC)
+
+
+def test_weights_come_back_bit_by_bit() -> None:
+    state = trained(1)
+    behavior = decode_weights(encode_weights(state.behavior), CONFIG, SPEC)
+    assert tensors_digest(behavior.state_dict()) == digest(state)
+
+
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped() -> None:
+    straight, resumed = trained(3), restored(trained(1))
+    assert resumed.version == 1
+    for _ in range(2):
+        train(resumed, experience(), CONFIG)
+        resumed = restored(resumed)
+    assert resumed.version == straight.version
+    assert digest(resumed) == digest(straight)
+    assert encode_optimizer(resumed) == encode_optimizer(straight)
+
+
+def test_the_optimizers_state_matters_to_what_follows() -> None:
+    straight, forgetful = trained(2), untrained(CONFIG, SPEC)
+    forgetful.behavior.load_state_dict(trained(1).behavior.state_dict())
+    forgetful.version = 1
+    train(forgetful, experience(), CONFIG)
+    assert digest(forgetful) != digest(straight)
+
+
+def test_a_checkpoint_is_a_copy() -> None:
+    state = trained(1)
+    copy = restored(state)
+    before = digest(copy)
+    train(state, experience(), CONFIG)
+    assert digest(copy) == before
+
+
+def test_equal_states_have_equal_encodings() -> None:
+    assert encode_weights(trained(1).behavior) == encode_weights(trained(1).behavior)
+    assert encode_optimizer(trained(1)) == encode_optimizer(trained(1))
+
+
+def test_version_0_has_no_optimizer_state_and_cannot_be_restored_as_trained() -> None:
+    state = untrained(CONFIG, SPEC)
+    assert safetensors.torch.load(encode_optimizer(state)) == {}
+    with pytest.raises(InvalidWeights, match="missing or surplus"):
+        restored(state)
+
+
+Change = Callable[[dict[str, Tensor]], Any]
+
+CHANGES: dict[str, tuple[Change, str]] = {
+    "a tensor is missing": (
+        lambda t: t.pop("command.bias"),
+        r"tensors \['command.bias'\] are missing or surplus",
+    ),
+    "a tensor is surplus": (
+        lambda t: t.update(extra=torch.zeros(1)),
+        r"tensors \['extra'\] are missing or surplus",
+    ),
+    "a shape is wrong": (
+        lambda t: t.update({"command.bias": torch.zeros(9)}),
+        r"'command.bias' is torch.float32 \(9,\), expected torch.float32 \(8,\)",
+    ),
+    "a tensor is transposed": (
+        lambda t: t.update({"command.weight": torch.zeros(2, 8)}),
+        r"\(2, 8\), expected torch.float32 \(8, 2\)",
+    ),
+    "a type is wrong": (
+        lambda t: t.update({"command.bias": torch.zeros(8, dtype=torch.float64)}),
+        r"'command.bias' is torch.float64 \(8,\), expected torch.float32",
+    ),
+    "a value is NaN": (
+        lambda t: t["action.weight"].fill_(torch.nan),
+        "'action.weight' has values that are not finite",
+    ),
+    "a value is infinite": (
+        lambda t: t["action.bias"][0].fill_(-torch.inf),
+        "'action.bias' has values that are not finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_weights_that_do_not_fit_are_refused(what: str) -> None:
+    change, complaint = CHANGES[what]
+    tensors = {n: t.clone() for n, t in untrained(CONFIG, SPEC).behavior.state_dict().items()}
+    change(tensors)
+    with pytest.raises(InvalidWeights, match=complaint):
+        decode_weights(safetensors.torch.save(tensors), CONFIG, SPEC)
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_optimizer_state_that_does_not_fit_is_refused(what: str) -> None:
+    state = trained(1)
+    tensors = safetensors.torch.load(encode_optimizer(state))
+    moments = {n[8:]: t for n, t in tensors.items() if n.startswith("exp_avg.")}
+    rest = {n: t for n, t in tensors.items() if not n.startswith("exp_avg.")}
+    change, complaint = CHANGES[what]
+    change(moments)
+    optimizer = safetensors.torch.save(rest | {f"exp_avg.{n}": t for n, t in moments.items()})
+    with pytest.raises(InvalidWeights, match=re.sub("'(?=[a-z])", "'exp_avg.", complaint)):
+        decode_state(1, encode_weights(state.behavior), optimizer, CONFIG, SPEC)
+
+
+def test_weights_of_another_architecture_are_refused() -> None:
+    other = untrained(build(Config, {"environment": "CartPole-v1", "hidden": [8]}), SPEC)
+    with pytest.raises(InvalidWeights, match="they belong to another architecture"):
+        decode_weights(encode_weights(other.behavior), CONFIG, SPEC)
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_refused(garbage: bytes) -> None:
+    with pytest.raises(InvalidWeights, match=r"not safetensors|missing or surplus"):
+        decode_weights(garbage, CONFIG, SPEC)
+
+
+GOOD = encode_weights(untrained(CONFIG, SPEC).behavior)
+
+
+@given(st.integers(0, len(GOOD) - 1))
+def test_a_cut_is_refused(length: int) -> None:
+    with pytest.raises(InvalidWeights):
+        decode_weights(GOOD[:length], CONFIG, SPEC)
+
+
+@given(st.integers(0, len(GOOD) - 1), st.integers(0, 255))
+def test_a_changed_byte_is_refused_or_decoded_and_never_anything_else(
+    place: int, value: int
+) -> None:
+    damaged = bytearray(GOOD)
+    damaged[place] = value
+    try:
+        behavior = decode_weights(bytes(damaged), CONFIG, SPEC)
+    except InvalidWeights:
+        return
+    assert all(bool(tensor.isfinite().all()) for tensor in behavior.state_dict().values())

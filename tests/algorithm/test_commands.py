@@ -1,0 +1,213 @@
+from collections.abc import Sequence
+from math import sqrt
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.commands import (
+    EVALUATION_SEEDS,
+    SEARCH_SEEDS,
+    TRAINING_SEEDS,
+    Command,
+    CommandSampler,
+)
+from udrl.config import Config, build
+from udrl.replay import Entry, ReplayBuffer
+from udrl.streams import Purpose, Stream, stream_key
+
+
+def settings(**values: Any) -> Config:
+    return build(Config, {"environment": "CartPole-v1", **values})
+
+
+def sampler(**values: Any) -> CommandSampler:
+    return CommandSampler(settings(**values), max_episode_steps=500)
+
+
+def buffer_of(returns: Sequence[float], lengths: Sequence[int] = ()) -> ReplayBuffer:
+    lengths = lengths or [1] * len(returns)
+    entries = zip(returns, range(len(returns)), lengths, strict=True)
+    return ReplayBuffer(len(returns), [Entry(*entry) for entry in entries])
+
+
+def desired_returns(commands: list[Command]) -> list[float]:
+    return [command.desired_return for command in commands]
+
+
+def desired_horizons(commands: list[Command]) -> set[int]:
+    return {command.desired_horizon for command in commands}
+
+
+@given(
+    st.lists(st.tuples(st.floats(-300, 300, width=32), st.integers(1, 500)), min_size=1),
+    st.integers(1, 20),
+    st.integers(0, 3),
+)
+def test_exploratory_commands_follow_section_2_3_4(
+    episodes: list[tuple[float, int]], last_few: int, seed: int
+) -> None:
+    config = settings(seed=seed, last_few=last_few, n_episodes_per_iter=5)
+    episodes.sort()
+    buffer = buffer_of(*zip(*episodes, strict=True))
+    commands = CommandSampler(config, 500).explore(3, buffer)
+
+    # 1: a number of episodes from the end of the replay buffer are selected
+    selected = episodes[-last_few:]
+    # 2: the horizon is the mean of their lengths, rounded to the nearest integer
+    steps, n = sum(length for _, length in selected), len(selected)
+    # 3: the returns are drawn from U[M, M + S]
+    m = np.mean([episode_return for episode_return, _ in selected])
+    s = sqrt(np.mean([(episode_return - m) ** 2 for episode_return, _ in selected]))
+    u = Stream(stream_key(seed, Purpose.COMMANDS, 3, -1)).uniforms(5)
+
+    assert desired_returns(commands) == pytest.approx((m + s * u).tolist(), rel=1e-12, abs=1e-9)
+    assert desired_horizons(commands) == {(2 * steps + n) // (2 * n)}
+    assert {command.kind for command in commands} == {"explore"}
+
+
+def test_only_the_last_few_count_and_all_when_there_are_fewer() -> None:
+    best_two = sampler(last_few=2).evaluate(1, buffer_of([-100.0, 10.0, 20.0], [9, 1, 3]))
+    assert set(desired_returns(best_two)) == {15.0}
+    assert desired_horizons(best_two) == {2}
+    all_three = sampler(last_few=50).evaluate(1, buffer_of([-30.0, 10.0, 20.0], [8, 1, 3]))
+    assert set(desired_returns(all_three)) == {0.0}
+    assert desired_horizons(all_three) == {4}
+
+
+@pytest.mark.parametrize(
+    ("lengths", "horizon"), [([1, 1, 2], 1), ([1, 2], 2), ([2, 3], 3), ([2, 3, 3], 3), ([7], 7)]
+)
+def test_the_mean_length_is_rounded_to_the_nearest_integer(
+    lengths: list[int], horizon: int
+) -> None:
+    commands = sampler().explore(1, buffer_of([0.0] * len(lengths), lengths))
+    assert desired_horizons(commands) == {horizon}
+
+
+def test_the_deviation_is_the_populations() -> None:
+    commands = sampler(n_episodes_per_iter=10_000).explore(1, buffer_of([0.0, 4.0]))
+    assert 2.0 <= min(desired_returns(commands)) < 2.01
+    assert 3.99 < max(desired_returns(commands)) < 4.0
+
+
+def test_exploratory_returns_are_uniform() -> None:
+    commands = sampler(n_episodes_per_iter=10_000).explore(1, buffer_of([0.0, 2.0]))
+    empirical = np.sort(desired_returns(commands)) - 1.0
+    # Kolmogorov's distance: 1.95 / sqrt(n) is exceeded by one sample in a thousand.
+    assert np.abs(empirical - np.linspace(0, 1, 10_000)).max() < 1.95 / sqrt(10_000)
+
+
+def test_without_spread_every_exploratory_return_is_the_mean() -> None:
+    commands = sampler().explore(1, buffer_of([500.0] * 10))
+    assert set(desired_returns(commands)) == {500.0}
+
+
+def test_evaluation_commands_take_the_lower_bound_and_the_same_horizon() -> None:
+    buffer = buffer_of([1.0, 2.0, 6.0], [10, 20, 31])
+    sample = sampler(eval_episodes=7)
+    evaluation = sample.evaluate(2, buffer)
+    assert desired_returns(evaluation) == [3.0] * 7
+    assert desired_horizons(evaluation) == desired_horizons(sample.explore(2, buffer)) == {20}
+    assert {command.kind for command in evaluation} == {"evaluate"}
+
+
+def test_warm_up_commands_name_no_weights() -> None:
+    commands = sampler(n_warm_up_episodes=3, lead=2).warm_up()
+    assert [(c.id, c.kind, c.weights_version) for c in commands] == [
+        (0, "warm_up", 0),
+        (1, "warm_up", 0),
+        (2, "warm_up", 0),
+    ]
+
+
+@pytest.mark.parametrize(("lead", "version"), [(0, 5), (1, 4), (3, 2), (7, 1)])
+def test_commands_name_the_weights_of_the_schedule(lead: int, version: int) -> None:
+    sample, buffer = sampler(lead=lead), buffer_of([1.0])
+    commands = sample.explore(5, buffer) + sample.evaluate(5, buffer)
+    assert {command.weights_version for command in commands} == {version}
+
+
+def test_a_closing_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
+    sample, buffer = sampler(lead=3, eval_episodes=50), buffer_of([1.0, 3.0])
+    closing, usual = sample.close(9, buffer), sample.evaluate(9, buffer)
+    assert {command.weights_version for command in closing} == {9}
+    assert desired_returns(closing) == [2.0] * 50
+    assert {c.environment_seed for c in closing}.isdisjoint(c.environment_seed for c in usual)
+    assert {c.stream_key for c in closing}.isdisjoint(c.stream_key for c in usual)
+
+
+def test_only_training_episodes_may_be_shortened() -> None:
+    sample, buffer = sampler(max_train_steps=100), buffer_of([1.0])
+    training = sample.warm_up() + sample.explore(1, buffer)
+    evaluation = sample.evaluate(1, buffer) + sample.close(1, buffer)
+    assert {command.max_steps for command in training} == {100}
+    assert {command.max_steps for command in evaluation} == {500}
+
+
+def test_a_training_limit_above_the_environments_changes_nothing() -> None:
+    assert {command.max_steps for command in sampler(max_train_steps=900).warm_up()} == {500}
+
+
+def test_only_evaluations_are_greedy_and_only_on_request() -> None:
+    buffer = buffer_of([1.0])
+    for request in (False, True):
+        sample = sampler(eval_greedy=request)
+        training = sample.warm_up() + sample.explore(1, buffer)
+        evaluation = sample.evaluate(1, buffer) + sample.close(1, buffer)
+        assert {command.greedy for command in training} == {False}
+        assert {command.greedy for command in evaluation} == {request}
+
+
+def test_seed_ranges_are_the_papers_and_do_not_meet() -> None:
+    assert TRAINING_SEEDS == (1_000_000, 10_000_000)
+    assert SEARCH_SEEDS == (500_000, 1_000_000)
+    assert EVALUATION_SEEDS == (1, 500_000)
+
+
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    lead=st.integers(0, 4),
+    n=st.integers(1, 8),
+    iterations=st.integers(1, 5),
+)
+def test_commands_of_a_run_are_distinct_and_keep_to_their_seeds(
+    seed: int, lead: int, n: int, iterations: int
+) -> None:
+    sample = sampler(
+        seed=seed, lead=lead, n_warm_up_episodes=n, n_episodes_per_iter=n, eval_episodes=n
+    )
+    buffer = buffer_of([1.0, 2.0])
+    commands = sample.warm_up()
+    for i in range(1, iterations + 1):
+        commands += sample.explore(i, buffer) + sample.evaluate(i, buffer)
+        commands += sample.close(i, buffer)
+
+    assert len({command.id for command in commands}) == len(commands)
+    assert [command.id for command in commands] == sorted(command.id for command in commands)
+    assert len({command.stream_key for command in commands}) == len(commands)
+    for command in commands:
+        low, high = EVALUATION_SEEDS if command.kind == "evaluate" else TRAINING_SEEDS
+        assert low <= command.environment_seed < high
+        assert command.stream_key == stream_key(
+            seed, Purpose.EPISODE, command.iteration, command.index
+        )
+        # What one process may send, another accepts.
+        assert msgspec.convert(msgspec.to_builtins(command), Command) == command
+
+
+def test_an_iterations_commands_depend_on_nothing_but_seed_iteration_and_buffer() -> None:
+    buffer = buffer_of([1.0, 2.0])
+    fresh, used = sampler(), sampler()
+    used.warm_up()
+    used.explore(1, buffer)
+    assert used.explore(2, buffer) == fresh.explore(2, buffer)
+    assert sampler(seed=2).explore(2, buffer) != fresh.explore(2, buffer)
+
+
+def test_iteration_and_index_are_read_from_the_id() -> None:
+    command = sampler(n_episodes_per_iter=3).evaluate(12, buffer_of([1.0]))[0]
+    assert (command.id, command.iteration, command.index) == (12_000_003, 12, 3)

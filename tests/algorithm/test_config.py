@@ -1,0 +1,182 @@
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from udrl.config import (
+    Budget,
+    Config,
+    build,
+    parse_assignment,
+    preset,
+    preset_names,
+    read_toml,
+    refuse_unknown,
+)
+from udrl.errors import ConfigError
+
+TABLE_2 = {
+    "batch_size",
+    "horizon_scale",
+    "last_few",
+    "learning_rate",
+    "n_episodes_per_iter",
+    "n_updates_per_iter",
+    "n_warm_up_episodes",
+    "replay_size",
+    "return_scale",
+}
+
+
+def test_hyperparameters_keep_the_names_of_table_2() -> None:
+    assert set(Config.__struct_fields__) >= TABLE_2
+
+
+def test_values_are_taken_as_given() -> None:
+    config = build(Config, {"environment": "CartPole-v1", "hidden": [8, 16], "learning_rate": 1})
+    assert config.hidden == (8, 16)
+    assert config.learning_rate == 1.0
+
+
+def test_the_environment_must_be_named() -> None:
+    with pytest.raises(ConfigError, match="environment"):
+        build(Config, {"seed": 1})
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_known_one() -> None:
+    with pytest.raises(ConfigError, match=r"'bach_size': did you mean 'batch_size'\?"):
+        build(Config, {"environment": "CartPole-v1", "bach_size": 512})
+
+
+def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"'xyzzy': there are one, two"):
+        refuse_unknown({"xyzzy": 1}, ("one", "two"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("batch_size", 0),
+        ("batch_size", -1),
+        ("batch_size", 1.5),
+        ("batch_size", "many"),
+        ("batch_size", True),
+        ("environment", ""),
+        ("environment_kwargs", {"gravity": math.nan}),
+        ("environment_kwargs", {"wind": [1.0]}),
+        ("eval_episodes", 0),
+        ("eval_every", 0),
+        ("eval_greedy", "yes"),
+        ("hidden", []),
+        ("hidden", [32, 0]),
+        ("hidden", 32),
+        ("horizon_scale", 0.0),
+        ("inference_rows", 8),
+        ("initialisation", "zeros"),
+        ("lead", -1),
+        ("learning_rate", 0.0),
+        ("learning_rate", math.inf),
+        ("learning_rate", math.nan),
+        ("max_episode_steps", 0),
+        ("max_return", -math.inf),
+        ("max_return", math.nan),
+        ("n_warm_up_episodes", 0),
+        ("replay_size", 0),
+        ("return_scale", math.inf),
+        ("return_scale", math.nan),
+        ("seed", -1),
+        ("segments", "some"),
+    ],
+)
+def test_an_impossible_value_is_refused_by_name_and_value(name: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=f"^{name} = {re.escape(repr(value))}: "):
+        build(Config, {"environment": "CartPole-v1", name: value})
+
+
+def test_last_few_above_replay_size_is_refused_with_both_values_and_the_remedy() -> None:
+    with pytest.raises(ConfigError, match=r"last_few = 11.*replay_size = 10.*lower last_few"):
+        build(Config, {"environment": "CartPole-v1", "last_few": 11, "replay_size": 10})
+
+
+def test_last_few_may_be_the_whole_buffer() -> None:
+    config = build(Config, {"environment": "CartPole-v1", "last_few": 10, "replay_size": 10})
+    assert config.last_few == config.replay_size
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("max_env_steps", 0), ("stop_return", math.nan), ("stop_return", math.inf)],
+)
+def test_an_impossible_budget_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"^{name} = {value}: "):
+        build(Budget, {name: value})
+
+
+def test_presets_of_the_three_environments_ship() -> None:
+    assert {"CartPole-v1", "LunarLander-v3", "LunarLanderSparse-v3"} <= set(preset_names())
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str) -> None:
+    values = preset(name)
+    budget = {key: values.pop(key) for key in Budget.__struct_fields__ if key in values}
+    build(Budget, budget)
+    assert build(Config, values).environment == name
+
+
+def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(ConfigError, match=r"'Pong': there are CartPole-v1, LunarLander-v3"):
+        preset("Pong")
+
+
+def test_settings_survive_plain_data() -> None:
+    config = build(Config, {"environment": "Obedience-v0", "environment_kwargs": {"steps": 4}})
+    assert build(Config, msgspec.json.decode(msgspec.json.encode(config))) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ("batch_size=512", "batch_size", 512),
+        ("learning_rate = 1e-3", "learning_rate", 1e-3),
+        ("hidden=[64, 128]", "hidden", [64, 128]),
+        ("eval_greedy=true", "eval_greedy", True),
+        ("segments=all", "segments", "all"),
+        ('segments="all"', "segments", "all"),
+        ("environment_kwargs={steps = 4}", "environment_kwargs", {"steps": 4}),
+        ("environment=module:Env-v0", "environment", "module:Env-v0"),
+        ("return_scale=inf", "return_scale", math.inf),
+    ],
+)
+def test_an_assignment_is_a_name_and_a_toml_value_or_a_bare_word(
+    text: str, name: str, value: Any
+) -> None:
+    assert parse_assignment(text) == (name, value)
+
+
+@pytest.mark.parametrize("text", ["batch_size", "=512", " =512", ""])
+def test_an_assignment_without_name_or_equals_sign_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="expected HYPERPARAMETER=VALUE"):
+        parse_assignment(text)
+
+
+def test_a_toml_file_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text('environment = "CartPole-v1"\nhidden = [8]\n')
+    assert read_toml(file) == {"environment": "CartPole-v1", "hidden": [8]}
+
+
+def test_a_file_that_is_missing_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"absent\.toml.*name a readable TOML file"):
+        read_toml(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize("content", [b"batch_size 512", b"\xff\xfe"])
+def test_a_file_that_is_not_toml_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "broken.toml"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"broken\.toml"):
+        read_toml(file)

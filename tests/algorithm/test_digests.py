@@ -1,0 +1,89 @@
+import hashlib
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from udrl.digests import arrays_digest, episode_digest, replay_digest, tensors_digest
+from udrl.episode import Episode
+
+
+def episode(**values: Any) -> Episode:
+    usual: dict[str, Any] = {
+        "command_id": 5,
+        "observations": np.array([[0.5, -1.0], [2.0, 0.0]], np.float32),
+        "actions": np.array([1, 0], np.uint8),
+        "rewards": np.array([1.0, -0.25], np.float32),
+        "terminated": True,
+        "truncated": False,
+    }
+    return Episode(**(usual | values))
+
+
+def test_digests_are_pinned() -> None:
+    assert episode_digest(episode()).hex() == (
+        "66d2f4483f3a58ff5e178c7eb2afd30dd6a95f1004c43f197e60b81bff50cfb9"
+    )
+    assert replay_digest([b"a" * 32, b"b" * 32]).hex() == (
+        "fdd2a64d014f2c406d2ece67c23212a92b356314f4deb42b24c395296ee304d2"
+    )
+
+
+def test_arrays_count_with_name_type_shape_and_bytes() -> None:
+    array = np.array([[1, 2, 3], [4, 5, 6]], np.int16)
+    expected = hashlib.sha256(b"x|<i2|(2, 3)|" + bytes([1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0]))
+    assert arrays_digest({"x": array}) == expected.digest()
+
+
+def test_the_order_of_names_and_the_layout_in_memory_do_not_count() -> None:
+    a, b = np.arange(6, dtype=np.float32).reshape(2, 3), np.zeros(2)
+    expected = arrays_digest({"a": a, "b": b})
+    assert arrays_digest({"b": b, "a": a}) == expected
+    assert arrays_digest({"a": np.asfortranarray(a), "b": b}) == expected
+    assert arrays_digest({"a": a.astype(">f4"), "b": b}) == expected
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"y": np.zeros(4, np.float32)},
+        {"x": np.zeros(4, np.int32)},
+        {"x": np.zeros((2, 2), np.float32)},
+        {"x": np.zeros(3, np.float32)},
+        {"x": np.array([0, 0, 0, 1e-45], np.float32)},
+        {"x": np.zeros(4, np.float32), "y": np.zeros(0, np.float32)},
+        {},
+    ],
+)
+def test_other_arrays_have_another_digest(other: dict[str, Any]) -> None:
+    assert arrays_digest(other) != arrays_digest({"x": np.zeros(4, np.float32)})
+
+
+def test_tensors_count_as_arrays() -> None:
+    tensors = {"w": torch.ones(2, 3, requires_grad=True), "b": torch.zeros(3)}
+    arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
+    assert tensors_digest(tensors) == arrays_digest(arrays)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"command_id": 6},
+        {"terminated": False},
+        {"truncated": True},
+        {"terminated": False, "truncated": True},
+        {"observations": np.array([[0.5, -1.0], [2.0, -0.0]], np.float32)},
+        {"actions": np.array([1, 1], np.uint8)},
+        {"actions": np.array([1, 0], np.int32)},
+        {"rewards": np.array([1.0, -0.5], np.float32)},
+    ],
+)
+def test_another_episode_has_another_digest(change: dict[str, Any]) -> None:
+    assert episode_digest(episode(**change)) != episode_digest(episode())
+
+
+def test_a_buffers_digest_depends_on_its_episodes_order() -> None:
+    first, second = episode_digest(episode()), episode_digest(episode(command_id=6))
+    assert replay_digest([first, second]) != replay_digest([second, first])
+    assert replay_digest(iter([first, second])) == replay_digest([first, second])

@@ -1,0 +1,359 @@
+import sys
+from collections.abc import Callable, Iterator
+from functools import reduce
+from itertools import count
+from operator import add
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from udrl.config import Config, build
+from udrl.environments import Environment, limit_steps, make_environment, specify
+from udrl.environments.figure2 import A1, A2, A3, Figure2
+from udrl.environments.sparse import RewardAtEnd
+from udrl.errors import UnsupportedEnvironment
+
+
+class Blank(gym.Env[Any, Any]):
+    """Has the spaces it is told to have, never ends, and remembers what it was given."""
+
+    def __init__(self, observation: spaces.Space[Any], action: spaces.Space[Any]) -> None:
+        self.metadata = {"render_modes": [], "max_return": 7.0}
+        self.observation_space = observation
+        self.action_space = action
+        self.actions: list[Any] = []
+        self.closed = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.actions.append(action)
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+VECTOR = spaces.Box(-1, 1, (3,), np.float32)
+Register = Callable[..., str]
+
+
+@pytest.fixture
+def register() -> Iterator[Register]:
+    """Registers a :class:`Blank` (or whatever makes an environment) for the time of the test."""
+    names = (f"Blank{i}-v0" for i in count())
+    registered = []
+
+    def register_one(entry_point: Callable[..., Environment], max_steps: int | None = 10) -> str:
+        name = next(names)
+        gym.register(name, entry_point=entry_point, max_episode_steps=max_steps)
+        registered.append(name)
+        return name
+
+    yield register_one
+    for name in registered:
+        del gym.registry[name]
+
+
+def settings(environment: str, **others: Any) -> Config:
+    return build(Config, {"environment": environment, **others})
+
+
+def make(environment: str, **others: Any) -> Environment:
+    return make_environment(settings(environment, **others))
+
+
+def play(
+    env: Environment, seed: int, actions: list[int]
+) -> tuple[list[list[float]], list[float], list[bool]]:
+    """Act until the episode ends; return observations, rewards and, per step, if it ended."""
+    observation, _ = env.reset(seed=seed)
+    observations, rewards, ends = [observation.tolist()], [], []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        observations.append(observation.tolist())
+        rewards.append(float(reward))
+        ends.append(terminated or truncated)
+        if ends[-1]:
+            break
+    return observations, rewards, ends
+
+
+def random_actions(seed: int) -> list[int]:
+    return [int(a) for a in np.random.default_rng(seed).integers(4, size=1000)]
+
+
+@pytest.mark.parametrize("name", ["Figure2-v0", "Obedience-v0"])
+def test_toys_pass_gymnasiums_checker(name: str) -> None:
+    check_env(gym.make(name).unwrapped)
+
+
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
+def test_sparse_lander_passes_gymnasiums_checker() -> None:
+    # The wrapper is what is ours, hence the warning. Rendering is Gymnasium's, and needs a screen.
+    check_env(gym.make("LunarLanderSparse-v3"), skip_render_check=True)
+
+
+@pytest.mark.parametrize("seed", [1_000_000, 1_000_001, 1_000_002])
+def test_sparse_lander_gives_the_landers_return_at_the_last_step(seed: int) -> None:
+    actions = random_actions(seed)
+    dense = play(make("LunarLander-v3"), seed, actions)
+    sparse = play(make("LunarLanderSparse-v3"), seed, actions)
+    assert sparse[0] == dense[0]
+    assert sparse[1] == [0.0] * (len(dense[1]) - 1) + [reduce(add, dense[1])]
+    assert sparse[2] == dense[2]
+    assert dense[2][-1]
+
+
+def test_sparse_lander_gives_its_reward_also_when_the_episode_is_cut() -> None:
+    dense, sparse = make("LunarLander-v3"), make("LunarLanderSparse-v3")
+    limit_steps(sparse, 20)
+    _, rewards, _ = play(dense, 5, [0] * 20)
+    _, (*withheld, last), ends = play(sparse, 5, [0] * 1000)
+    assert ends == [False] * 19 + [True]
+    assert not any(withheld)
+    assert last == reduce(add, rewards)
+
+
+def test_sparse_lander_forgets_what_an_abandoned_episode_earned() -> None:
+    env = make("LunarLanderSparse-v3", max_episode_steps=20)
+    expected = play(env, 5, [0] * 20)
+    play(env, 6, [2] * 10)
+    assert play(env, 5, [0] * 20) == expected
+
+
+def test_reward_at_end_records_how_it_is_made() -> None:
+    spec = gym.make("LunarLanderSparse-v3").spec
+    assert spec is not None
+    assert spec.additional_wrappers == (RewardAtEnd.wrapper_spec(),)
+
+
+@pytest.mark.parametrize("name", ["LunarLander-v3", "LunarLanderSparse-v3"])
+def test_lander_replays_exactly_whatever_ran_before_in_the_instance(name: str) -> None:
+    env = make(name)
+    first = play(env, 1_000_000, random_actions(1))
+    play(env, 1_000_001, random_actions(2))
+    assert play(env, 1_000_000, random_actions(1)) == first
+
+
+def test_figure_2_has_the_arrows_of_the_figure() -> None:
+    env = Figure2()
+    arrows = set()
+    for seed in range(10):
+        for action in (A1, A2, A3):
+            start, _ = env.reset(seed=seed)
+            state, reward, terminated, _, _ = env.step(np.int64(action))
+            arrows.add((int(start), action, reward, int(state), terminated))
+    in_s0 = {(0, A1, 2.0, 1, False), (0, A2, 1.0, 2, True), (0, A3, 1.0, 2, True)}
+    in_s1 = {(1, action, -1.0, 3, True) for action in (A1, A2, A3)}
+    assert arrows == in_s0 | in_s1
+
+
+def test_figure_2_is_seen_as_one_of_four_states() -> None:
+    env = make("Figure2-v0")
+    assert specify(env, settings("Figure2-v0")).observation_size == 4
+    observations = {tuple(env.reset(seed=seed)[0].tolist()) for seed in range(10)}
+    assert observations == {(1, 0, 0, 0), (0, 1, 0, 0)}
+
+
+def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
+    env = make("Obedience-v0", environment_kwargs={"steps": 4})
+    observations, rewards, ends = play(env, 1, [1, 0, 1, 1, 1])
+    assert observations == [[1.0], [0.75], [0.5], [0.25], [0.0]]
+    assert rewards == [1.0, 0.0, 1.0, 1.0]
+    assert ends == [False, False, False, True]
+
+
+def test_a_spec_says_what_the_algorithm_needs_to_know() -> None:
+    spec = specify(make("LunarLander-v3"), settings("LunarLander-v3"))
+    assert spec.observation_size == 8
+    assert spec.n_actions == 4
+    assert spec.max_episode_steps == 1000
+    assert spec.max_return is None
+
+
+def test_the_greatest_return_is_the_settings_then_the_instances_then_the_metadatas(
+    register: Register,
+) -> None:
+    obedience, blank = "Obedience-v0", register(lambda: Blank(VECTOR, spaces.Discrete(2)))
+    assert specify(make(obedience), settings(obedience, max_return=3.0)).max_return == 3.0
+    assert specify(make(obedience), settings(obedience)).max_return == 8.0
+    assert specify(make(blank), settings(blank)).max_return == 7.0
+
+
+def test_a_discrete_observation_with_an_offset_becomes_one_hot(register: Register) -> None:
+    name = register(lambda: Blank(spaces.Discrete(3, start=-1), spaces.Discrete(2)))
+    env = make(name)
+    assert specify(env, settings(name)).observation_size == 3
+    for seed in range(10):
+        observation, _ = env.reset(seed=seed)
+        env.unwrapped.observation_space.seed(seed)
+        state = env.unwrapped.observation_space.sample()
+        assert observation.tolist() == [state == -1, state == 0, state == 1]
+
+
+def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(3, start=5)))
+    env = make(name)
+    assert specify(env, settings(name)).n_actions == 3
+    env.reset(seed=1)
+    for action in (0, 1, 2):
+        env.step(action)
+    blank = env.unwrapped
+    assert isinstance(blank, Blank)
+    assert blank.actions == [5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(0, 255, (84, 84), np.uint8),
+        spaces.Box(0, 255, (84, 84, 3), np.uint8),
+        spaces.Box(-1, 1, (), np.float32),
+        spaces.Dict({"position": VECTOR}),
+        spaces.Tuple((VECTOR,)),
+        spaces.MultiBinary(4),
+        spaces.MultiDiscrete([2, 2]),
+    ],
+    ids=str,
+)
+def test_other_observations_are_refused_with_what_is_supported(
+    register: Register, space: spaces.Space[Any]
+) -> None:
+    blank = Blank(space, spaces.Discrete(2))
+    with pytest.raises(UnsupportedEnvironment, match=r"supported are Box vectors .* and Discrete"):
+        make(register(lambda: blank))
+    assert blank.closed
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-1, 1, (2,), np.float32),
+        spaces.MultiDiscrete([2, 2]),
+        spaces.MultiBinary(2),
+        spaces.Dict({"throttle": spaces.Discrete(2)}),
+    ],
+    ids=str,
+)
+def test_other_actions_are_refused_with_what_is_supported(
+    register: Register, space: spaces.Space[Any]
+) -> None:
+    blank = Blank(VECTOR, space)
+    with pytest.raises(UnsupportedEnvironment, match="supported is Discrete"):
+        make(register(lambda: blank))
+    assert blank.closed
+
+
+def test_an_environment_without_a_step_limit_is_refused_with_the_remedy(
+    register: Register,
+) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=None)
+    with pytest.raises(UnsupportedEnvironment, match=r"--set max_episode_steps=1000"):
+        make(name)
+
+
+def test_max_episode_steps_gives_an_environment_a_limit_or_another_one(register: Register) -> None:
+    endless = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=None)
+    limited = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=10)
+    for name in (endless, limited):
+        env = make(name, max_episode_steps=5)
+        assert specify(env, settings(name)).max_episode_steps == 5
+        assert play(env, 1, [0] * 100)[2] == [False] * 4 + [True]
+
+
+def test_limit_steps_moves_the_limit_of_the_next_episodes(register: Register) -> None:
+    env = make(register(lambda: Blank(VECTOR, spaces.Discrete(2, start=1))))
+    for steps in (3, 7, 10):
+        limit_steps(env, steps)
+        assert len(play(env, 1, [0] * 100)[1]) == steps
+
+
+def test_limit_steps_refuses_an_environment_without_a_limit_to_move() -> None:
+    with pytest.raises(UnsupportedEnvironment, match="make it with make_environment"):
+        limit_steps(Figure2(), 3)
+
+
+@pytest.mark.parametrize("name", ["Pong", "NoSuchEnvironment-v0", "CartPole-v99", "a b c"])
+def test_an_unknown_id_is_refused_with_the_two_forms_that_are_known(name: str) -> None:
+    with pytest.raises(
+        UnsupportedEnvironment, match=f"'{name}' cannot be made.*package.module:Env-v0"
+    ):
+        make(name)
+
+
+def test_a_module_that_is_not_installed_is_refused_with_the_remedy() -> None:
+    with pytest.raises(UnsupportedEnvironment, match=r"no_such_module.*install the package"):
+        make("no_such_module:Env-v0")
+
+
+def test_a_missing_extra_is_named_with_the_command_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def without_box2d(name: str, **_: Any) -> None:
+        raise gym.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr(gym, "make", without_box2d)
+    with pytest.raises(UnsupportedEnvironment, match=r'pip install "udrl\[box2d\]"'):
+        make("LunarLander-v3")
+
+
+def test_keyword_arguments_reach_the_environment_and_unknown_ones_are_refused() -> None:
+    env = make("Obedience-v0", environment_kwargs={"steps": 3})
+    assert specify(env, settings("Obedience-v0")).max_return == 3.0
+    with pytest.raises(UnsupportedEnvironment, match=r"'Obedience-v0' cannot be made.*stpes"):
+        make("Obedience-v0", environment_kwargs={"stpes": 3})
+
+
+def test_whatever_an_environment_raises_when_it_is_made_is_a_refusal() -> None:
+    with pytest.raises(UnsupportedEnvironment, match=r"AssertionError: gravity \(current value: 5"):
+        make("LunarLander-v3", environment_kwargs={"gravity": 5.0})
+
+
+MODULE = """
+import gymnasium
+from udrl.environments.obedience import Obedience
+
+class Patience(Obedience):
+    pass
+
+gymnasium.register("Patience-v0", entry_point=Patience, max_episode_steps=5)
+"""
+
+
+@pytest.fixture
+def worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The name of an importable module that registers ``Patience-v0``."""
+    name = "worlds_of_a_user"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield name
+    sys.modules.pop(name, None)
+    gym.registry.pop("Patience-v0", None)
+
+
+def test_an_importable_environment_is_imported(worlds: str) -> None:
+    env = make(f"{worlds}:Patience-v0")
+    assert type(env.unwrapped).__name__ == "Patience"
+    assert specify(env, settings(f"{worlds}:Patience-v0")).max_episode_steps == 5
+
+
+def test_a_module_that_cannot_be_imported_is_refused(worlds: str, tmp_path: Path) -> None:
+    (tmp_path / f"{worlds}.py").write_text("from gymnasium import no_such_name")
+    with pytest.raises(UnsupportedEnvironment, match="cannot import name 'no_such_name'"):
+        make(f"{worlds}:Patience-v0")
+
+
+def test_an_unknown_environment_of_an_importable_module_is_refused(worlds: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=f"'{worlds}:Impatience-v0' cannot be made"):
+        make(f"{worlds}:Impatience-v0")

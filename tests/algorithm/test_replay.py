@@ -1,0 +1,95 @@
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.replay import Entry, ReplayBuffer
+
+# Few different returns, so that there are many ties; batches of episodes, as iterations bring them.
+batches = st.lists(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), max_size=6), max_size=8)
+capacities = st.integers(1, 10)
+
+
+def numbered(batches: list[list[float]]) -> list[list[Entry]]:
+    """Entries with increasing ids, in batches."""
+    entries: list[list[Entry]] = []
+    n = 0
+    for returns in batches:
+        entries.append([Entry(r, n + i, length=1) for i, r in enumerate(returns)])
+        n += len(returns)
+    return entries
+
+
+def top_k(seen: list[Entry], k: int) -> list[Entry]:
+    """Throw away the oldest of the worst until k are left; then sort, the newer after the older."""
+    left = list(seen)
+    while len(left) > k:
+        worst = min(entry.episode_return for entry in left)
+        left.remove(min((e for e in left if e.episode_return == worst), key=lambda e: e.id))
+    left.sort(key=lambda entry: entry.id)
+    left.sort(key=lambda entry: entry.episode_return)
+    return left
+
+
+@given(batches, capacities)
+def test_the_buffer_is_the_top_k_of_all_episodes_seen(
+    batches: list[list[float]], capacity: int
+) -> None:
+    buffer = ReplayBuffer(capacity)
+    seen: list[Entry] = []
+    for entries in numbered(batches):
+        before = [*buffer, *entries]
+        evicted = buffer.admit(entries)
+        seen += entries
+        assert list(buffer) == top_k(seen, capacity)
+        assert len(buffer) == min(len(seen), capacity)
+        assert sorted([*evicted, *buffer]) == sorted(before)
+        assert evicted == sorted(evicted)
+
+
+@given(batches, capacities, st.randoms(use_true_random=False))
+def test_the_order_in_which_episodes_arrive_does_not_matter(
+    batches: list[list[float]], capacity: int, random: Random
+) -> None:
+    straight, shuffled = ReplayBuffer(capacity), ReplayBuffer(capacity)
+    entries = [entry for batch in numbered(batches) for entry in batch]
+    straight.admit(entries)
+    random.shuffle(entries)
+    for entry in entries:
+        shuffled.admit([entry])
+    assert list(shuffled) == list(straight)
+
+
+@given(batches, capacities, st.integers(1, 12))
+def test_the_best_are_the_last_and_all_when_there_are_fewer(
+    batches: list[list[float]], capacity: int, n: int
+) -> None:
+    buffer = ReplayBuffer(capacity)
+    for entries in numbered(batches):
+        buffer.admit(entries)
+    everything = list(buffer)
+    best = list(buffer.best(n))
+    assert len(best) == min(n, len(everything))
+    assert everything[len(everything) - len(best) :] == best
+
+
+def test_of_equal_returns_the_newer_ranks_higher_and_the_oldest_leaves_first() -> None:
+    buffer = ReplayBuffer(3)
+    assert buffer.admit([Entry(500.0, i, 500) for i in (3, 1, 2)]) == []
+    assert [entry.id for entry in buffer] == [1, 2, 3]
+    assert [entry.id for entry in buffer.admit([Entry(500.0, 4, 500)])] == [1]
+    assert [entry.id for entry in buffer] == [2, 3, 4]
+
+
+def test_a_new_episode_that_is_not_good_enough_leaves_at_once() -> None:
+    buffer = ReplayBuffer(2)
+    buffer.admit([Entry(1.0, 1, 1), Entry(2.0, 2, 1)])
+    assert buffer.admit([Entry(0.0, 3, 1)]) == [Entry(0.0, 3, 1)]
+    assert [entry.id for entry in buffer] == [1, 2]
+
+
+@pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1), (2, 3, 1)])
+def test_a_buffer_is_restored_from_its_entries_in_any_order(order: tuple[int, ...]) -> None:
+    buffer = ReplayBuffer(3, [Entry(float(i), i, 1) for i in order])
+    assert [entry.id for entry in buffer] == [1, 2, 3]

@@ -1,0 +1,233 @@
+from fractions import Fraction
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from udrl.config import Config, build
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.segments import Experience, Segments, draw_segments
+from udrl.streams import Purpose, Stream, stream_key
+
+Kind = Literal["trailing", "all"]
+
+
+def experience(replay_size: int, max_steps: int) -> Experience:
+    config = build(
+        Config, {"environment": "CartPole-v1", "replay_size": replay_size, "last_few": 1}
+    )
+    return Experience(
+        config, EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=max_steps)
+    )
+
+
+def random_episode(episode_id: int, length: int) -> Episode:
+    """An episode with rewards that are multiples of 1/8, so that every sum of them is exact."""
+    rng = np.random.default_rng(episode_id)
+    return Episode(
+        command_id=episode_id,
+        observations=rng.standard_normal((length, 2), np.float32),
+        actions=rng.integers(3, size=length, dtype=np.uint8),
+        rewards=(rng.integers(-800, 800, size=length) / 8).astype(np.float32),
+        terminated=True,
+        truncated=False,
+    )
+
+
+def example(episode: Episode, t1: int, t2: int) -> tuple[Any, ...]:
+    """Section 2.3.3: in s_t1, to earn sum(r[t1..t2-1]) in t2 - t1 steps, the action is a_t1."""
+    desired_return = sum(float(episode.rewards[t]) for t in range(t1, t2))
+    return (
+        episode.observations[t1].tolist(),
+        desired_return,
+        t2 - t1,
+        int(episode.actions[t1]),
+    )
+
+
+def all_times(length: int) -> list[tuple[int, int]]:
+    return list(combinations(range(length + 1), 2))
+
+
+def gathered(held: Experience, ids: list[int], wanted: list[tuple[int, int, int]]) -> list[Any]:
+    """The examples for (rank, t1, t2), row by row."""
+    segments = Segments(*np.array(wanted, np.int64).reshape(-1, 3).T)
+    return [
+        (s.tolist(), float(r), int(h), int(a))
+        for s, r, h, a in zip(*held.by_rank(ids).examples(segments), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("length", [1, 2, 9])
+def test_every_segment_of_an_episode_makes_the_papers_example(length: int) -> None:
+    episode = random_episode(5, length)
+    held = experience(replay_size=1, max_steps=length)
+    held.add(episode)
+    wanted = [(0, t1, t2) for t1, t2 in all_times(length)]
+    assert gathered(held, [5], wanted) == [example(episode, t1, t2) for _, t1, t2 in wanted]
+
+
+@given(st.lists(st.floats(-1e4, 1e4, width=32), min_size=1, max_size=40))
+def test_the_desired_return_is_the_exact_sum_up_to_rounding(rewards: list[float]) -> None:
+    n = len(rewards)
+    held = experience(replay_size=1, max_steps=n)
+    held.add(
+        Episode(
+            command_id=0,
+            observations=np.zeros((n, 2), np.float32),
+            actions=np.zeros(n, np.uint8),
+            rewards=np.array(rewards, np.float32),
+            terminated=True,
+            truncated=False,
+        )
+    )
+    times = all_times(n)
+    results = gathered(held, [0], [(0, t1, t2) for t1, t2 in times])
+    for (t1, t2), (_, desired_return, _, _) in zip(times, results, strict=True):
+        exact = sum(map(Fraction, rewards[t1:t2]), Fraction(0))
+        assert abs(Fraction(desired_return) - exact) < 1e-9
+
+
+def test_an_example_has_the_types_that_training_reads() -> None:
+    held = experience(replay_size=1, max_steps=4)
+    held.add(random_episode(0, 4))
+    examples = held.by_rank([0]).examples(Segments(*np.array([[0], [1], [4]])))
+    assert [array.dtype for array in examples] == [np.float32, np.float64, np.int64, np.uint8]
+
+
+def draw_one(u: tuple[float, float, float], lengths: list[int], kind: Kind) -> tuple[int, int, int]:
+    """An episode uniformly, then the times uniformly."""
+    rank = int(u[0] * len(lengths))
+    length = lengths[rank]
+    if kind == "trailing":
+        return rank, range(length)[int(u[1] * length)], length
+    times = list(range(length + 1))
+    one = times.pop(int(u[1] * len(times)))
+    other = times.pop(int(u[2] * len(times)))
+    return rank, min(one, other), max(one, other)
+
+
+units = st.floats(0, 1, exclude_max=True)
+
+
+@pytest.mark.parametrize("kind", ["trailing", "all"])
+@given(
+    lengths=st.lists(st.integers(1, 1000), min_size=1, max_size=5),
+    uniforms=st.lists(st.tuples(units, units, units), min_size=1),
+)
+def test_segments_are_drawn_as_a_loop_over_examples_would(
+    kind: Kind, lengths: list[int], uniforms: list[tuple[float, float, float]]
+) -> None:
+    drawn = draw_segments(np.array(uniforms).T, np.array(lengths), kind)
+    assert list(zip(*(a.tolist() for a in drawn), strict=True)) == [
+        draw_one(u, lengths, kind) for u in uniforms
+    ]
+
+
+def uniform_numbers(n: int) -> npt.NDArray[np.float64]:
+    return Stream(stream_key(1, Purpose.PROBE)).uniforms(3 * n).reshape(3, n)
+
+
+def chi_square(counts: npt.NDArray[np.int64], probabilities: npt.NDArray[np.float64]) -> float:
+    expected = counts.sum() * probabilities
+    return float(((counts - expected) ** 2 / expected).sum())
+
+
+@pytest.mark.parametrize("kind", ["trailing", "all"])
+def test_episodes_are_equally_likely_and_so_are_an_episodes_segments(kind: Kind) -> None:
+    lengths = [1, 2, 3, 7]
+    possible: list[tuple[int, int, int]] = []
+    probabilities: list[float] = []
+    for rank, length in enumerate(lengths):
+        times = [(t, length) for t in range(length)] if kind == "trailing" else all_times(length)
+        possible += [(rank, *pair) for pair in times]
+        probabilities += [1 / len(lengths) / len(times)] * len(times)
+
+    drawn = draw_segments(uniform_numbers(200_000), np.array(lengths), kind)
+    values, counts = np.unique(np.stack(drawn), axis=1, return_counts=True)
+
+    assert [tuple(v) for v in values.T.tolist()] == sorted(possible)
+    # With k - 1 degrees of freedom, chi-square has mean k - 1 and variance 2 (k - 1).
+    freedom = len(possible) - 1
+    assert chi_square(counts, np.array(probabilities)) < freedom + 4 * (2 * freedom) ** 0.5
+
+
+@pytest.mark.parametrize("kind", ["trailing", "all"])
+def test_segments_keep_the_shape_of_the_numbers_they_are_made_of(kind: Kind) -> None:
+    numbers = uniform_numbers(6)
+    flat = draw_segments(numbers, np.array([4, 5]), kind)
+    shaped = draw_segments(numbers.reshape(3, 2, 3), np.array([4, 5]), kind)
+    for one, other in zip(flat, shaped, strict=True):
+        np.testing.assert_array_equal(one.reshape(2, 3), other)
+
+
+@pytest.mark.parametrize("length", [1, 63, 64, 65, 128, 200])
+def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(length: int) -> None:
+    held = experience(replay_size=3, max_steps=200)
+    episodes = {i: random_episode(i, n) for i, n in enumerate([200, length, 200])}
+    for episode in episodes.values():
+        held.add(episode)
+    wanted = [
+        (rank, t1, episode.length)
+        for rank, episode in episodes.items()
+        for t1 in range(episode.length)
+    ]
+    wanted += [(1, t1, t1 + 1) for t1 in range(length)]
+    expected = [example(episodes[rank], t1, t2) for rank, t1, t2 in wanted]
+    assert gathered(held, [0, 1, 2], wanted) == expected
+
+
+class ExperienceAsADictionary(RuleBasedStateMachine):
+    """Episodes come and go at random; what is held must be what a dictionary would hold."""
+
+    replay_size, max_steps = 4, 150
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held = experience(self.replay_size, self.max_steps)
+        self.model: dict[int, Episode] = {}
+        self.next_id = 0
+
+    @precondition(lambda self: len(self.model) < self.replay_size)
+    @rule(length=st.integers(1, max_steps))
+    def add(self, length: int) -> None:
+        self.model[self.next_id] = random_episode(self.next_id, length)
+        self.held.add(self.model[self.next_id])
+        self.next_id += 1
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        gone = data.draw(st.sampled_from(sorted(self.model)))
+        self.held.remove(gone)
+        del self.model[gone]
+        assert gone not in self.held
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def look_up(self, data: st.DataObject) -> None:
+        ids = data.draw(st.permutations(sorted(self.model)))
+        episodes = [self.model[i] for i in ids]
+        wanted = []
+        for rank, episode in enumerate(episodes):
+            t2 = data.draw(st.integers(1, episode.length))
+            wanted += [(rank, t1, t2) for t1 in range(t2)]
+        assert self.held.by_rank(ids).lengths.tolist() == [e.length for e in episodes]
+        assert gathered(self.held, ids, wanted) == [
+            example(episodes[rank], t1, t2) for rank, t1, t2 in wanted
+        ]
+
+    @invariant()
+    def ids_are_those_of_the_dictionary(self) -> None:
+        assert self.held.ids() == set(self.model)
+        assert all(i in self.held for i in self.model)
+
+
+TestExperienceAsADictionary = ExperienceAsADictionary.TestCase
+TestExperienceAsADictionary.settings = settings(max_examples=50, stateful_step_count=30)

@@ -1,0 +1,66 @@
+"""Whole runs: all services, real Zenoh, small environments."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from udrl.config import Budget, Config
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from udrl_proto.messages import Status
+from whole_run import Cli, assert_conserved
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Callable[..., Status]:
+    """Train with the services, and return the final status."""
+    number = 0
+
+    def runner(
+        config: Config,
+        max_env_steps: int,
+        *,
+        actors: int = 1,
+        envs: int = 16,
+        run_dir: Path | None = None,
+        go_on: bool = False,
+        in_process: bool = True,
+        stop_return: float | None = None,
+    ) -> Status:
+        nonlocal number
+        number += 1
+        settings = Settings(
+            config,
+            Budget(max_env_steps=max_env_steps, stop_return=stop_return),
+            Fleet(actors=actors, envs_per_actor=envs),
+        )
+        status = train(
+            settings,
+            run_dir or tmp_path / f"run{number}",
+            threading.Event(),
+            go_on=go_on,
+            in_process=in_process,
+        )
+        assert_conserved(status)
+        return status
+
+    return runner
+
+
+@pytest.fixture
+def cli(tmp_path: Path) -> Iterator[Callable[..., Cli]]:
+    started: list[Cli] = []
+
+    def start(*arguments: str) -> Cli:
+        started.append(Cli(*arguments, cwd=tmp_path))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            os.killpg(one.process.pid, signal.SIGKILL)
+        one.process.communicate()

@@ -1,0 +1,114 @@
+"""Bad input gets a clear error: the value, what was expected, the remedy; within five seconds."""
+
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from whole_run import TOY, Cli, arguments, live_status, wait_for
+
+#: Importing torch takes a second or two on a busy machine, before anything can be checked.
+PROMPT_S = 15
+
+
+def refusal(process: Cli) -> tuple[int, str]:
+    code, _, error = process.finish(timeout=PROMPT_S)
+    assert "Traceback" not in error
+    return code, error
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["train", "NoSuchLander-v9"], "NoSuchLander"),
+        (["train", "CartPole-v1", "--set", "batchsize=3"], "did you mean 'batch_size'"),
+        (["train", "CartPole-v1", "--set", "batch_size=0"], "batch_size = 0"),
+        (["train", "CartPole-v1", "--set", "batch_size=many"], "batch_size = 'many'"),
+        (["train", "CartPole-v1", "--set", "learning_rate=nan"], "learning_rate = nan"),
+        (["train", "CartPole-v1", "--set", "last_few=9999"], "last_few = 9999"),
+        (["train", "CartPole-v1", "--set", "batch_size"], "HYPERPARAMETER=VALUE"),
+        (["train", "CartPole-v1", "--set", "environment=Acrobot-v1"], "the argument ENV"),
+        (["train", "CartPole-v1", "--preset", "nope"], "preset 'nope'"),
+        (["train", "CartPole-v1", "--config", "missing.toml"], "missing.toml"),
+        (["train", "CartPole-v1", "--resume"], "--resume needs --run-dir"),
+        (["train", "CartPole-v1", "--listen", "localhost"], "tcp/HOST:PORT"),
+        (["train", "Pendulum-v1"], "supported is Discrete"),
+        (["train", "--seed", "x", "CartPole-v1"], "--seed"),
+        (["replay", "CartPole-v1"], "--listen ENDPOINT or --connect ENDPOINT"),
+        (["replay", "CartPole-v1", "--listen", "tcp/0.0.0.0:7447"], "--insecure"),
+        (["actor", "--connect", "7447"], "tcp/HOST:PORT"),
+        (["status", "nowhere"], "nowhere holds no run"),
+        (["evaluate", "nowhere"], "nowhere holds no run"),
+        (["evaluate", "nowhere", "--weights", "new"], "latest, best or a version number"),
+    ],
+)
+def test_bad_argument_is_named_with_the_remedy(
+    given: list[str], expected: str, cli: Callable[..., Cli]
+) -> None:
+    code, error = refusal(cli(*given))
+    assert code == 2 or "nowhere" in given
+    assert code != 0
+    assert expected in error
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        yield taken.getsockname()[1]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def test_port_in_use_is_refused(taken_port: int, cli: Callable[..., Cli], tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{taken_port}"
+    code, error = refusal(cli("replay", "Figure2-v0", "--listen", endpoint))
+    assert code == 2
+    assert endpoint in error
+    assert "in use" in error
+
+
+@pytest.mark.parametrize("role", ["actor", "learner"])
+def test_endpoint_that_nobody_answers_is_reported(role: str, cli: Callable[..., Cli]) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    code, error = refusal(cli(role, "--connect", endpoint))
+    assert code == 6
+    assert f"nobody answers at '{endpoint}'" in error
+
+
+def test_run_directory_with_a_run_is_not_overwritten(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    given = arguments(TOY, 100, run_dir)
+    cli(*given, "--in-process").status()
+    code, error = refusal(cli(*given))
+    assert code == 8
+    assert "--resume" in error
+
+
+def test_run_directory_of_another_configuration_is_refused(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    cli(*arguments(TOY, 100, run_dir), "--in-process").status()
+    code, error = refusal(cli(*arguments(TOY | {"batch_size": 32}, 100, run_dir), "--resume"))
+    assert code == 8
+    assert "batch_size = 64, not 32" in error
+
+
+def test_run_directory_in_use_is_refused(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    given = arguments(TOY, 10_000_000, run_dir)
+    cli(*given)
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration, "the run to begin")
+    code, error = refusal(cli(*given, "--resume"))
+    assert code == 8
+    assert "in use" in error

@@ -1,0 +1,91 @@
+"""The other commands: status, evaluate, and joining by hand."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from test_bad_input import free_port
+from udrl_proto.messages import Status
+from whole_run import SMALL, TOY, Cli, arguments, digests, live_status, small, wait_for
+
+BUDGET = 3000
+
+
+def toml(config: dict[str, object], path: Path) -> Path:
+    path.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in config.items()))
+    return path
+
+
+def test_services_started_by_hand_equal_one_process(
+    cli: Callable[..., Cli], run: Callable[..., Status], tmp_path: Path
+) -> None:
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
+    replay = cli(
+        "replay", "CartPole-v1", "--listen", endpoint, "--run-dir", str(run_dir),
+        "--config", str(config),
+    )  # fmt: skip
+    others = [cli("learner", "--connect", endpoint), cli("actor", "--connect", endpoint)]
+    others.append(cli("actor", "--connect", endpoint, "--envs", "3"))
+    for process in (replay, *others):
+        code, _, error = process.finish()
+        assert code == 0, error
+    status = live_status(run_dir)
+    assert status is not None
+    assert status.state == "ended"
+    assert digests(status) == digests(run(small(), BUDGET))
+
+
+def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    ended = cli(*arguments(SMALL, BUDGET, run_dir), "--in-process").status()
+    assert cli("status", str(run_dir), "--json").status() == ended
+
+    code, out, error = cli("evaluate", str(run_dir), "--episodes", "5", "--json").finish()
+    assert code == 0, error
+    report = json.loads(out)
+    assert ended.closing_evaluation is not None
+    assert report["mean"] == ended.closing_evaluation.mean
+
+    code, out, error = cli(
+        "evaluate", str(run_dir), "--episodes", "3", "--greedy", "--desired-return", "30",
+        "--desired-horizon", "40", "--weights", "best",
+    ).finish()  # fmt: skip
+    assert code == 0, error
+    assert "commanded return 30.0 within 40 steps, greedy" in out
+
+    for name in ("run.sqlite", "metrics.csv", "config.toml", "weights.safetensors"):
+        assert (run_dir / name).stat().st_size > 0
+    assert (run_dir / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_budget_spent_in_the_warm_up_trains_nothing(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    code, out, error = cli(*arguments(TOY, 1, tmp_path / "run"), "--in-process").finish()
+    assert code == 0, error
+    assert "none; the budget was spent in the warm-up" in out
+
+
+def test_resuming_an_ended_run_returns_at_once(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    given = arguments(TOY, 100, tmp_path / "run")
+    ended = cli(*given, "--in-process").status()
+    assert cli(*given, "--resume").status(timeout=20) == ended
+
+
+def test_status_of_a_live_run_by_its_endpoint(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    cli(*arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.actors, "an actor")
+    status = cli("status", "--connect", endpoint, "--json").status()
+    assert status.state == "running"
+    assert [actor.environments for actor in status.actors] == [16]
+
+
+@pytest.mark.parametrize("name", ["train", "replay", "learner", "actor", "evaluate", "status"])
+def test_help_of_each_command_has_an_example(name: str, cli: Callable[..., Cli]) -> None:
+    code, out, _ = cli(name, "--help").finish()
+    assert code == 0
+    assert "Example: udrl" in " ".join(out.split())

@@ -1,0 +1,75 @@
+"""A run is a function of its configuration and seed."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from udrl.config import Config
+from udrl_proto.messages import Status
+from whole_run import digests, reference, small, toy
+
+Runner = Callable[..., Status]
+
+CASES = [(small, 4000), (toy, 400)]
+
+
+@pytest.mark.parametrize(("make", "budget"), CASES)
+def test_services_at_lead_0_equal_the_reference(
+    make: Callable[..., Config], budget: int, run: Runner
+) -> None:
+    expected = reference(make(lead=0), budget)
+    status = run(make(lead=0), budget)
+    assert digests(status) == digests(expected)
+    assert status.env_steps == expected.env_steps
+    assert status.evaluation is not None
+    assert status.evaluation.mean == expected.evaluations[status.evaluation.iteration].mean
+
+
+@pytest.mark.parametrize("lead", [0, 1, 3])
+@pytest.mark.parametrize(("make", "budget"), CASES)
+def test_result_does_not_depend_on_actors_or_environments(
+    make: Callable[..., Config], budget: int, lead: int, run: Runner
+) -> None:
+    results = [
+        run(make(lead=lead), budget, actors=actors, envs=envs)
+        for actors, envs in [(1, 16), (2, 3), (4, 20)]
+    ]
+    assert len({digests(status) for status in results}) == 1
+    assert all(status.exact for status in results)
+
+
+def test_separate_processes_equal_one_process(run: Runner) -> None:
+    config = small(lead=1)
+    apart = run(config, 4000, actors=2, in_process=False)
+    assert digests(apart) == digests(run(config, 4000))
+
+
+def test_another_seed_gives_another_result(run: Runner) -> None:
+    assert digests(run(toy(), 300)) != digests(run(toy(seed=2), 300))
+
+
+@pytest.mark.parametrize("lead", [0, 2])
+def test_resumed_run_equals_one_that_was_longer_from_the_start(
+    lead: int, run: Runner, tmp_path: Path
+) -> None:
+
+    config, run_dir = small(lead=lead), tmp_path / "short"
+    first = run(config, 2000, run_dir=run_dir)
+    longer = run(config, 4000, run_dir=run_dir, go_on=True)
+    straight = run(config, 4000)
+    assert first.iteration < longer.iteration
+    assert digests(longer) == digests(straight)
+    assert longer.eval_env_steps > straight.eval_env_steps  # it was closed twice
+
+
+def test_resuming_an_ended_run_with_the_same_budget_changes_nothing(
+    run: Runner, tmp_path: Path
+) -> None:
+
+    run_dir = tmp_path / "run"
+    first = run(toy(), 300, run_dir=run_dir)
+    again = run(toy(), 300, run_dir=run_dir, go_on=True)
+    assert digests(again) == digests(first)
+    assert again.commands == first.commands
+    assert again.closing_evaluation == first.closing_evaluation

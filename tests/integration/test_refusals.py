@@ -1,0 +1,191 @@
+"""A peer that would break the run is told why, and the run goes on."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+
+from test_bad_input import free_port
+from udrl.config import Budget
+from udrl.errors import ConfigError, Refused
+from udrl_actor.service import ActorService
+from udrl_launch import roles
+from udrl_learner.service import LearnerService
+from udrl_proto import keys
+from udrl_proto.asking import Asker
+from udrl_proto.codec import encode, encode_array
+from udrl_proto.messages import (
+    EpisodeMessage,
+    EpisodeReply,
+    Hello,
+    JoinReply,
+    JoinRequest,
+    Status,
+    StatusRequest,
+    VersionMessage,
+    VersionReply,
+)
+from udrl_proto.session import connect, find_run
+from udrl_replay.creation import create
+from whole_run import assert_conserved, digests, reference, toy
+
+BUDGET = 300
+
+
+class Hosted:
+    """A replay service in this process, and a line to it."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.stop = threading.Event()
+        store = create(run_dir, toy(lead=0))
+        self._thread = threading.Thread(
+            target=roles.replay,
+            args=(run_dir, store, Budget(max_env_steps=BUDGET), self.stop),
+            kwargs={"listen": self.endpoint},
+        )
+        self._thread.start()
+        self.session: zenoh.Session = connect(self.endpoint, 10)
+        self.hello: Hello = find_run(self.session, None, 10)
+        self.asker = Asker(self.session, self.hello.run_id, "the test", patience_s=10)
+
+    def status(self) -> Status:
+        return self.asker.ask(keys.STATUS, StatusRequest(), Status)
+
+    def finish(self) -> Status:
+        """Let a good actor and a good learner end the run; return its last status."""
+        address = roles.Address(self.endpoint, patience_s=10)
+        peers = [
+            threading.Thread(target=roles.learner, args=(address, self.stop)),
+            threading.Thread(target=roles.actor, args=(address, 4, self.stop)),
+        ]
+        for peer in peers:
+            peer.start()
+        status = self.status()
+        while status.state != "ended":
+            assert all(peer.is_alive() for peer in peers) or self.status().state == "ended"
+            status = self.status()
+        for peer in peers:
+            peer.join()
+        return status
+
+    def close(self) -> None:
+        self.stop.set()
+        self.session.close()
+        self._thread.join()
+
+
+@pytest.fixture
+def hosted(tmp_path: Path) -> Iterator[Hosted]:
+    one = Hosted(tmp_path / "run")
+    yield one
+    one.close()
+
+
+def actor(hosted: Hosted) -> None:
+    ActorService(hosted.session, hosted.hello, "another", 1, hosted.stop).run()
+
+
+def learner(hosted: Hosted) -> None:
+    LearnerService(hosted.session, hosted.hello, "another", hosted.stop).run()
+
+
+def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
+    other = msgspec.structs.replace(hosted.hello.config, max_episode_steps=1)
+    hello = msgspec.structs.replace(hosted.hello, config=other)
+    with pytest.raises(Refused, match=r"max_episode_steps=2.*yours is.*max_episode_steps=1") as no:
+        ActorService(hosted.session, hello, "other", 1, hosted.stop).run()
+    assert no.value.code == "other_environment"
+
+
+@pytest.mark.parametrize(("role", "service"), [("actor", actor), ("learner", learner)])
+def test_peer_that_rounds_differently_is_refused(
+    role: Literal["actor", "learner"], service: Callable[[Hosted], None], hosted: Hosted
+) -> None:
+    first = JoinRequest(
+        role=role, id="first", host="here", pid=1, software="0", numerics_class="0123456789abcdef"
+    )
+    hosted.asker.ask(keys.JOIN, first, JoinReply)
+    with pytest.raises(Refused, match=r"class 0123456789abcdef.*like [0-9a-f]{16}.*inexact") as no:
+        service(hosted)
+    assert no.value.code == "other_numerics"
+
+
+def test_run_of_another_protocol_is_named(hosted: Hosted) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply("udrl/999/future/hello", b"whatever that will be")
+
+    queryable = hosted.session.declare_queryable("udrl/999/future/hello", answer)
+    with pytest.raises(ConfigError, match="protocol 999, this program speaks 1"):
+        find_run(hosted.session, "future", 5)
+    queryable.undeclare()
+
+
+def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
+    good = EpisodeMessage(
+        actor="mallory",
+        command_id=0,
+        observations=encode_array(np.zeros((1, 4), np.float32)),
+        actions=encode_array(np.zeros(1, np.uint8)),
+        rewards=encode_array(np.zeros(1, np.float32)),
+        terminated=True,
+        truncated=False,
+    )
+    nan = encode_array(np.full(1, np.nan, np.float32))
+    bad = {
+        "never issued|cancelled or unknown": msgspec.structs.replace(good, command_id=77),
+        "rewards are not all finite": msgspec.structs.replace(good, rewards=nan),
+        "observations are float32": msgspec.structs.replace(good, observations=nan),
+        "actions must be 0 to 2": msgspec.structs.replace(
+            good, actions=encode_array(np.full(1, 9, np.uint8))
+        ),
+        "neither terminated": msgspec.structs.replace(good, terminated=False),
+    }
+    for reason, message in bad.items():
+        with pytest.raises(Refused, match=reason):
+            hosted.asker.ask(keys.EPISODE, message, EpisodeReply)
+    with pytest.raises(Refused, match="not MessagePack"):
+        hosted.asker.ask(keys.EPISODE, b"\xc1 garbage", EpisodeReply)
+    with pytest.raises(Refused, match="at most"):
+        hosted.asker.ask(keys.EPISODE, bytes(1 << 20), EpisodeReply)
+    status = hosted.status()
+    assert status.episodes.rejected == len(bad) + 2
+    assert_conserved(status)
+    assert digests(hosted.finish()) == digests(reference(hosted.hello.config, BUDGET))
+
+
+def test_bad_weights_are_refused(hosted: Hosted) -> None:
+    message = VersionMessage(
+        learner="mallory", version=1, weights=b"x", optimizer=b"y", loss=0.0, train_s=0.0
+    )
+    with pytest.raises(Refused, match="not safetensors"):
+        hosted.asker.ask(keys.VERSION, encode(message), VersionReply)
+    assert hosted.status().weights_version == 0
+
+
+def test_different_episode_for_a_command_marks_the_run_inexact(hosted: Hosted) -> None:
+    status = hosted.status()
+    assert status.exact
+    first = EpisodeMessage(
+        actor="one",
+        command_id=3,
+        observations=encode_array(np.zeros((1, 4), np.float32)),
+        actions=encode_array(np.zeros(1, np.uint8)),
+        rewards=encode_array(np.zeros(1, np.float32)),
+        terminated=True,
+        truncated=False,
+    )
+    assert hosted.asker.ask(keys.EPISODE, first, EpisodeReply).result == "accepted"
+    assert hosted.asker.ask(keys.EPISODE, first, EpisodeReply).result == "duplicate"
+    other = msgspec.structs.replace(first, actions=encode_array(np.ones(1, np.uint8)))
+    assert hosted.asker.ask(keys.EPISODE, other, EpisodeReply).result == "duplicate"
+    status = hosted.status()
+    assert not status.exact
+    assert "command 3" in status.inexact_reason
+    assert status.episodes.duplicate == 2

@@ -1,0 +1,179 @@
+"""Whole runs for the tests: small configurations, and what to look at from outside."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from udrl.algorithm1 import Run, algorithm1
+from udrl.config import Budget, Config, build
+from udrl.errors import UdrlError
+from udrl_launch.inspection import status_of
+from udrl_proto.messages import Status
+
+#: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
+SMALL: dict[str, Any] = {
+    "environment": "CartPole-v1",
+    "lead": 2,
+    "max_return": 500.0,
+    "batch_size": 64,
+    "hidden": [16, 16],
+    "learning_rate": 3e-3,
+    "n_warm_up_episodes": 12,
+    "n_episodes_per_iter": 6,
+    "n_updates_per_iter": 10,
+    "replay_size": 30,
+    "last_few": 10,
+    "return_scale": 0.02,
+    "horizon_scale": 0.02,
+    "eval_every": 1500,
+    "eval_episodes": 5,
+}
+TOY: dict[str, Any] = SMALL | {
+    "environment": "Figure2-v0",
+    "max_return": 2.0,
+    "eval_every": 50,
+    "segments": "all",
+}
+
+
+LANDER: dict[str, Any] = SMALL | {
+    "environment": "LunarLander-v3",
+    "max_return": None,
+    "n_warm_up_episodes": 20,
+    "n_episodes_per_iter": 10,
+    "eval_every": 5000,
+}
+
+
+def small(**changes: Any) -> Config:
+    return build(Config, SMALL | changes)
+
+
+def toy(**changes: Any) -> Config:
+    return build(Config, TOY | changes)
+
+
+def lander(**changes: Any) -> Config:
+    return build(Config, LANDER | changes)
+
+
+def digests(status: Status | Run) -> tuple[int, str, str]:
+    return status.iteration, status.weights_sha256, status.replay_sha256
+
+
+def reference(config: Config, max_env_steps: int) -> Run:
+    return algorithm1(config, Budget(max_env_steps=max_env_steps))
+
+
+def assert_conserved(status: Status) -> None:
+    commands, episodes = status.commands, status.episodes
+    assert commands.issued == commands.accepted + commands.cancelled + commands.outstanding
+    assert episodes.delivered == episodes.accepted + episodes.duplicate + episodes.rejected
+
+
+class Cli:
+    """The command ``udrl`` in a process of its own, and what it left behind."""
+
+    def __init__(self, *arguments: str, cwd: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "udrl_launch", *arguments],
+            cwd=cwd,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def finish(self, timeout: float = 60) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=timeout)
+        return self.process.returncode, out, err
+
+    def status(self, timeout: float = 60) -> Status:
+        code, out, err = self.finish(timeout)
+        assert code == 0, err
+        return msgspec.json.decode(out.strip().splitlines()[-1], type=Status)
+
+
+def arguments(config: dict[str, Any], max_env_steps: int, run_dir: Path) -> list[str]:
+    """Return the arguments of ``udrl train`` for a configuration."""
+    given = [
+        item
+        for name, value in config.items()
+        if name != "environment" and value is not None
+        for item in ("--set", f"{name}={json.dumps(value)}")
+    ]
+    return [
+        "train", config["environment"], "--run-dir", str(run_dir), "--json", *given,
+        "--max-env-steps", str(max_env_steps),
+    ]  # fmt: skip
+
+
+def wait_for(condition: Callable[[], Any], what: str, timeout: float = 40) -> Any:
+    """Return the first true value of a condition that nothing announces."""
+    deadline = time.monotonic() + timeout
+    pause = threading.Event()
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"waited {timeout} s for {what}"
+        pause.wait(0.02)
+    return value
+
+
+def live_status(run_dir: Path) -> Status | None:
+    """Return a run's status, or None while there is no run yet."""
+    try:
+        return status_of(run_dir)
+    except UdrlError:
+        return None
+
+
+def children(pid: int) -> dict[str, int]:
+    """Return the services that a process started, by the name of their log, with their pids."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal():
+            continue
+        try:
+            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            command = (entry / "cmdline").read_bytes().split(b"\0")
+        except (OSError, ValueError, IndexError):
+            continue
+        if parent == pid and b"udrl_launch" in command:
+            role = command[command.index(b"udrl_launch") + 1].decode()
+            found[role if role not in found else f"{role}-{entry.name}"] = int(entry.name)
+    return found
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def kill_at(process: Cli, run_dir: Path, role: str, iteration: int) -> None:
+    """Kill a service when the run has come so far, and wait until it is replaced."""
+
+    def far_enough() -> bool:
+        status = live_status(run_dir)
+        return status is not None and status.iteration >= iteration
+
+    wait_for(far_enough, f"iteration {iteration}")
+    pid = children(process.process.pid)[role]
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: not is_running(pid), f"the end of {role}")
+    wait_for(
+        lambda: (
+            children(process.process.pid).get(role, pid) != pid
+            or process.process.poll() is not None
+        ),
+        f"another {role}",
+    )

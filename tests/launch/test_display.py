@@ -1,0 +1,78 @@
+"""Progress: a panel in a terminal, plain lines elsewhere."""
+
+import io
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from udrl_launch.display import Display, duration, line, panel
+from udrl_proto.messages import (
+    BufferStatus,
+    CommandLedger,
+    EpisodeLedger,
+    EvaluationStatus,
+    Status,
+    Waiting,
+)
+
+STATUS = Status(
+    run_id="run", state="running", environment="CartPole-v1", iteration=7, env_steps=12345,
+    eval_env_steps=100, env_steps_per_s=9876.5, wall_s=61.0, max_env_steps=100_000,
+    time_left_s=3700.0,
+    commands=CommandLedger(issued=1, accepted=1, cancelled=0, outstanding=0),
+    episodes=EpisodeLedger(delivered=1, accepted=1, duplicate=0, rejected=0),
+    buffer=BufferStatus(episodes=3, return_min=1.0, return_mean=2.0, return_max=3.0),
+    weights_version=6, weights_lag=1, weights_lag_s=0.25, weights_sha256="", replay_sha256="",
+    loss=0.5,
+    evaluation=EvaluationStatus(
+        iteration=5, env_steps=10_000, mean=42.0, std=3.0, ci95_low=41.0, ci95_high=43.0,
+        episodes=100,
+    ),
+    closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
+    actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
+    problem="",
+)  # fmt: skip
+
+
+def test_line_says_all_that_a_user_watches() -> None:
+    text = line(STATUS)
+    for part in (
+        "iteration 7", "12,345 env steps (9,876/s)", "42.0 ± 1.0 at 10,000", "1.0 / 2.0 / 3.0",
+        "weights 6 (lag 1)", "left 1:01:40", "learner l waits for actors: iteration 7 (2.5 s)",
+    ):  # fmt: skip
+        assert part in text
+
+
+def test_line_before_anything_is_known() -> None:
+    empty = BufferStatus(episodes=0, return_min=None, return_mean=None, return_max=None)
+    text = line(
+        msgspec.structs.replace(STATUS, evaluation=None, buffer=empty, time_left_s=None, waiting=())
+    )
+    assert "evaluation none yet; buffer empty" in text
+    assert "left" not in text
+    assert "waits" not in text
+
+
+@pytest.mark.parametrize("width", [40, 120])
+def test_panel_fits_its_terminal(width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    with console.capture() as capture:
+        console.print(panel(STATUS))
+    lines = capture.get().splitlines()
+    assert max(map(len, lines)) <= width
+    assert "42.0 ± 1.0" in " ".join(capture.get().split())
+
+
+def test_pipe_gets_plain_lines_and_none_twice() -> None:
+    output = io.StringIO()
+    with Display(Console(file=output, force_terminal=False)) as display:
+        display.show(STATUS)
+        display.show(STATUS)
+    assert output.getvalue() == line(STATUS) + "\n"
+    assert "\x1b" not in output.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3661, "1:01:01")])
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

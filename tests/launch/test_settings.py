@@ -1,0 +1,53 @@
+"""Where settings come from: preset, then file, then options, then --set; the last word counts."""
+
+from pathlib import Path
+
+import pytest
+
+from udrl.config import preset
+from udrl.errors import ConfigError
+from udrl_launch.settings import gather
+
+
+def test_preset_named_like_the_environment_is_taken() -> None:
+    settings = gather("CartPole-v1", options={})
+    assert settings.config.batch_size == preset("CartPole-v1")["batch_size"]
+    assert settings.budget.max_env_steps == preset("CartPole-v1")["max_env_steps"]
+
+
+def test_another_preset_can_be_named() -> None:
+    settings = gather("LunarLander-v3", preset_name="CartPole-v1", options={})
+    assert settings.config.environment == "LunarLander-v3"
+    assert settings.config.replay_size == preset("CartPole-v1")["replay_size"]
+
+
+def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text("seed = 2\nlead = 2\nbatch_size = 2\nactors = 3\n")
+    settings = gather(
+        "CartPole-v1", file=file, options={"seed": 3, "lead": 3, "eval_every": None},
+        assignments=["seed=4"],
+    )  # fmt: skip
+    config = settings.config
+    assert (config.batch_size, config.lead, config.seed) == (2, 3, 4)
+    assert config.eval_every == preset("CartPole-v1")["eval_every"]
+    assert settings.fleet.actors == 3
+
+
+def test_stored_settings_replace_the_preset() -> None:
+    settings = gather("CartPole-v1", stored={"batch_size": 5}, options={})
+    assert settings.config.batch_size == 5
+    assert settings.config.hidden != tuple(preset("CartPole-v1")["hidden"])
+
+
+def test_file_of_another_environment_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text('environment = "Acrobot-v1"\n')
+    with pytest.raises(ConfigError, match=r"'Acrobot-v1' in .*, but ENV is 'CartPole-v1'"):
+        gather("CartPole-v1", file=file, options={})
+
+
+@pytest.mark.parametrize("name", ["actor", "max_steps", "envs"])
+def test_unknown_setting_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"unknown setting '{name}'"):
+        gather("CartPole-v1", options={name: 1})

@@ -1,0 +1,89 @@
+"""Children are started again when they die, unless that would only repeat."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from udrl.errors import RunFailed
+from udrl_launch import supervisor as module
+from udrl_launch.supervisor import Supervisor
+
+
+@pytest.fixture
+def supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervisor]:
+    """A supervisor whose children are the Python code that their first argument is."""
+
+    class Python:
+        executable = str(tmp_path / "python")
+
+    script = f'#!/bin/sh\nexec {sys.executable} -c "$3"\n'  # called with: -m udrl_launch CODE
+    Path(Python.executable).write_text(script)
+    os.chmod(Python.executable, 0o755)
+    monkeypatch.setattr(module, "sys", Python)
+    one = Supervisor(tmp_path / "logs")
+    yield one
+    one.end()
+
+
+def check_until(one: Supervisor, condition: Callable[[], bool]) -> None:
+    pause = threading.Event()
+    while not condition():
+        one.check()
+        pause.wait(0.01)
+
+
+def pid(one: Supervisor) -> int:
+    process = one.children[0].process
+    assert process is not None
+    return process.pid
+
+
+def test_child_that_ends_well_is_done(supervisor: Supervisor) -> None:
+    supervisor.start("child", "print('bye')")
+    check_until(supervisor, lambda: supervisor.done)
+    assert supervisor.children[0].last_words() == "bye"
+
+
+def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
+    supervisor.start("child", "import time; time.sleep(100)")
+    first = pid(supervisor)
+    os.kill(first, signal.SIGKILL)
+    check_until(supervisor, lambda: pid(supervisor) != first)
+    assert not supervisor.done
+
+
+@pytest.mark.parametrize("code", sorted(module.FINAL_CODES))
+def test_error_that_would_be_repeated_is_final(supervisor: Supervisor, code: int) -> None:
+    supervisor.start("child", f"print('because'); raise SystemExit({code})")
+    with pytest.raises(RunFailed, match=f"child ended with code {code}:\nbecause") as failure:
+        check_until(supervisor, lambda: False)
+    assert failure.value.exit_code == code
+
+
+def test_child_that_keeps_dying_is_given_up(supervisor: Supervisor) -> None:
+    supervisor.start("child", "raise SystemExit(1)")
+    with pytest.raises(RunFailed, match="child ended with code 1"):
+        check_until(supervisor, lambda: False)
+    assert len(supervisor.children[0].restarts) == 5
+
+
+def test_end_kills_a_child_that_does_not_listen(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_END_S", 0.2)
+    ready = supervisor._log_dir / "child.log"
+    supervisor.start(
+        "child",
+        "import signal,time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        "print('ready', flush=True); time.sleep(100)",
+    )
+    check_until(supervisor, lambda: "ready" in ready.read_text())
+    supervisor.end()
+    process = supervisor.children[0].process
+    assert process is not None
+    assert process.returncode == -signal.SIGKILL

@@ -1,0 +1,65 @@
+"""Any message, drawn from the types themselves: a new field is covered as soon as it exists."""
+
+from typing import Any
+
+import msgspec
+from hypothesis import strategies as st
+from msgspec import inspect
+
+from udrl.config import Config
+from udrl_proto.messages import Message
+
+MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
+
+
+def messages(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
+    """Return a strategy for all messages of a kind, with finite numbers."""
+    return _any(inspect.type_info(kind))
+
+
+def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
+    match node:
+        case inspect.StructType(cls=cls, fields=fields):
+            values = st.fixed_dictionaries(
+                {f.name: _any(f.type) for f in fields if f.required},
+                optional={f.name: _any(f.type) for f in fields if not f.required},
+            )
+            return values.map(lambda given: _build(cls, given))
+        case inspect.UnionType(types=types):
+            return st.one_of(*map(_any, types))
+        case inspect.LiteralType(values=literals):
+            return st.sampled_from(literals)
+        case inspect.VarTupleType(item_type=item, min_length=least, max_length=most):
+            return st.lists(_any(item), min_size=least or 0, max_size=min(most or 4, 4)).map(tuple)
+        case inspect.DictType(key_type=key, value_type=value):
+            return st.dictionaries(_any(key), _any(value), max_size=3)
+        case inspect.StrType(pattern=str()):
+            return st.from_regex(r"[A-Za-z0-9._-]{1,100}", fullmatch=True)
+        case inspect.StrType(min_length=least, max_length=most):
+            return st.text(min_size=least or 0, max_size=min(most or 20, 20))
+        case inspect.BytesType(min_length=least, max_length=most):
+            return st.binary(min_size=least or 0, max_size=most or 20)
+        case inspect.IntType(ge=ge, le=le):
+            return st.integers(-(2**63) if ge is None else ge, 2**63 - 1 if le is None else le)
+        case inspect.FloatType(gt=gt, ge=ge, le=le):
+            return st.floats(
+                gt if ge is None else ge,
+                le,
+                exclude_min=gt is not None,
+                allow_nan=False,
+                allow_infinity=False,
+            )
+        case inspect.BoolType():
+            return st.booleans()
+        case inspect.NoneType():
+            return st.none()
+    raise NotImplementedError(node)
+
+
+def _build(cls: type[msgspec.Struct], values: dict[str, Any]) -> msgspec.Struct:
+    if cls is Config:
+        values["replay_size"] = max(
+            values.get("replay_size", 500), min(values.get("last_few", 75), 1_000_000)
+        )
+        values["last_few"] = min(values.get("last_few", 75), values["replay_size"])
+    return cls(**values)

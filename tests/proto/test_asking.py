@@ -1,0 +1,249 @@
+"""Asking until there is an answer, and answering: at least once, never for ever."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+
+from udrl.errors import Interrupted, InvalidMessage, Refused, Unreachable
+from udrl_proto import asking, keys
+from udrl_proto.answering import Question, Verb, serve
+from udrl_proto.asking import Asker
+from udrl_proto.codec import SMALL, encode
+from udrl_proto.messages import (
+    Acknowledged,
+    FailureMessage,
+    Message,
+    Problem,
+    StateReply,
+    StateRequest,
+)
+from udrl_proto.session import connect
+
+RUN = "run"
+REQUEST = StateRequest(learner="l")
+ANSWER = StateReply(version=3, weights=b"w", optimizer=b"o")
+WAIT_S = 10.0
+
+Inbox = queue.Queue[Question]
+Ask = Callable[..., Future[StateReply]]
+
+
+@pytest.fixture
+def inbox(router: zenoh.Session) -> Inbox:
+    """Questions that arrive at a service on the router."""
+    questions: Inbox = queue.Queue()
+    serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, questions)
+    return questions
+
+
+@pytest.fixture
+def asker(client: zenoh.Session) -> Asker:
+    return Asker(client, RUN, "learner l", patience_s=WAIT_S)
+
+
+@pytest.fixture
+def ask(asker: Asker) -> Iterator[Ask]:
+    """Asks from another thread."""
+    with ThreadPoolExecutor(1) as thread:
+
+        def submit(request: Message | bytes = REQUEST, limit: int = SMALL) -> Future[StateReply]:
+            return thread.submit(lambda: asker.ask(keys.STATE, request, StateReply, limit))
+
+        yield submit
+
+
+def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
+    """Treat the first query with the first function, and so on."""
+    remaining = iter(answers)
+    session.declare_queryable(keys.key(RUN, keys.STATE), lambda query: next(remaining)(query))
+
+
+def answer(query: zenoh.Query) -> None:
+    with query:
+        query.reply(keys.key(RUN, keys.STATE), encode(ANSWER))
+
+
+def test_answer_is_returned(inbox: Inbox, ask: Ask) -> None:
+    future = ask()
+    question = inbox.get(timeout=WAIT_S)
+    assert (question.verb, question.request) == (keys.STATE, REQUEST)
+    question.answer(ANSWER)
+    assert future.result(WAIT_S) == ANSWER
+
+
+def test_request_may_be_encoded_already(inbox: Inbox, ask: Ask) -> None:
+    future = ask(encode(REQUEST))
+    question = inbox.get(timeout=WAIT_S)
+    assert question.request == REQUEST
+    question.answer(ANSWER)
+    assert future.result(WAIT_S) == ANSWER
+
+
+def test_problem_is_raised_with_its_code(inbox: Inbox, ask: Ask) -> None:
+    future = ask()
+    inbox.get(timeout=WAIT_S).answer(Problem(code="rewind", message="version 3 is next"))
+    with pytest.raises(Refused, match="version 3 is next") as caught:
+        future.result(WAIT_S)
+    assert caught.value.code == "rewind"
+
+
+def test_question_without_an_answer_is_asked_again(router: zenoh.Session, asker: Asker) -> None:
+    answer_each(router, zenoh.Query.drop, zenoh.Query.drop, answer)
+    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+
+
+def test_question_that_hangs_is_asked_again(
+    router: zenoh.Session, asker: Asker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asking, "ATTEMPT_S", 0.1)
+    hanging: list[zenoh.Query] = []
+    answer_each(router, hanging.append, answer)
+    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+    hanging.pop().drop()
+
+
+def test_error_that_is_not_ours_is_no_answer(router: zenoh.Session, asker: Asker) -> None:
+    answer_each(router, lambda query: query.reply_err(b"router is busy"), answer)
+    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+
+
+def test_service_that_starts_later_is_found(
+    router: zenoh.Session, asker: Asker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class FirstPause(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            answer_each(router, answer)
+            return False
+
+    monkeypatch.setattr(asker, "_stop", FirstPause())
+    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+
+
+def test_patience_ends(client: zenoh.Session) -> None:
+    asker = Asker(client, RUN, "learner l", patience_s=0.05)
+    with pytest.raises(Unreachable, match=r"^learner l asked .* of run for 'state' and got no"):
+        asker.ask(keys.STATE, REQUEST, StateReply)
+
+
+def test_long_wait_says_who_waits_for_what(
+    client: zenoh.Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class NoPause(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            return False
+
+    seconds = iter(range(100))
+    clock = SimpleNamespace(monotonic=lambda: next(seconds))  # every look at it takes a second
+    monkeypatch.setattr(asking, "time", clock)
+    asker = Asker(client, RUN, "learner l", NoPause(), patience_s=5.0)
+    with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
+        asker.ask(keys.STATE, REQUEST, StateReply)
+    assert [record.getMessage() for record in caplog.records] == [
+        "learner l has been waiting 2 s for the replay service to answer 'state'",
+        "learner l has been waiting 4 s for the replay service to answer 'state'",
+    ]
+
+
+def test_asking_can_be_stopped(client: zenoh.Session) -> None:
+    stop = threading.Event()
+    asker = Asker(client, RUN, "learner l", stop)
+    with ThreadPoolExecutor(1) as thread:
+        future = thread.submit(asker.ask, keys.STATE, REQUEST, StateReply)
+        stop.set()
+        with pytest.raises(Interrupted, match="learner l was stopped while asking for 'state'"):
+            future.result(WAIT_S)
+
+
+def test_answer_of_another_kind_is_refused(inbox: Inbox, ask: Ask) -> None:
+    future = ask()
+    inbox.get(timeout=WAIT_S).answer(Acknowledged())
+    with pytest.raises(InvalidMessage, match=r"StateReply: .* `version`"):
+        future.result(WAIT_S)
+
+
+def test_answer_beyond_its_limit_is_refused(inbox: Inbox, ask: Ask) -> None:
+    future = ask(limit=10)
+    inbox.get(timeout=WAIT_S).answer(ANSWER)
+    with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
+        future.result(WAIT_S)
+
+
+# The service's side.
+
+
+@pytest.mark.parametrize(
+    ("payload", "complaint"),
+    [
+        (b"", "incomplete input"),
+        (encode(FailureMessage(actor="a", command_id=1, error="")), "StateRequest"),
+        (bytes(101), "101 bytes, at most 100"),
+    ],
+)
+def test_invalid_request_reaches_the_service_as_the_error_it_is(
+    payload: bytes, complaint: str, inbox: Inbox, ask: Ask
+) -> None:
+    future = ask(payload)
+    question = inbox.get(timeout=WAIT_S)
+    assert isinstance(question.request, InvalidMessage)
+    assert complaint in str(question.request)
+    question.answer(Problem(code="invalid", message=str(question.request)))
+    with pytest.raises(Refused, match=complaint):
+        future.result(WAIT_S)
+
+
+def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) -> None:
+    inbox: queue.Queue[Any] = queue.Queue()
+    verb = Verb(StateRequest, 100, lambda request: request.learner.upper())
+    serve(router, RUN, {keys.STATE: verb}, inbox)
+    future = ask()
+    question = inbox.get(timeout=WAIT_S)
+    assert question.request == "L"
+    question.answer(ANSWER)
+    assert future.result(WAIT_S) == ANSWER
+
+
+def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session, ask: Ask) -> None:
+    class FullAtFirst(queue.Queue[Any]):
+        refused = 0
+
+        def put_nowait(self, item: Any) -> None:
+            if not self.refused:
+                self.refused += 1
+                raise queue.Full
+            super().put_nowait(item)
+
+    inbox = FullAtFirst()
+    serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox)
+    future = ask()
+    inbox.get(timeout=WAIT_S).answer(ANSWER)
+    assert future.result(WAIT_S) == ANSWER
+    assert inbox.refused == 1
+
+
+def test_answer_to_somebody_who_is_gone_is_forgotten(
+    inbox: Inbox, router: zenoh.Session, endpoint: str
+) -> None:
+    with connect(endpoint, patience_s=5.0) as client:
+        client.get(keys.key(RUN, keys.STATE), payload=encode(REQUEST))
+        question = inbox.get(timeout=WAIT_S)
+    question.answer(ANSWER)
+    assert inbox.empty()
+
+
+def test_service_that_undeclares_its_verbs_is_not_asked(
+    router: zenoh.Session, client: zenoh.Session
+) -> None:
+    inbox: Inbox = queue.Queue()
+    for queryable in serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox):
+        queryable.undeclare()
+    asker = Asker(client, RUN, "learner l", patience_s=0.05)
+    with pytest.raises(Unreachable):
+        asker.ask(keys.STATE, REQUEST, StateReply)
+    assert inbox.empty()

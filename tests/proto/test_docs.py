@@ -1,0 +1,147 @@
+"""The page for strangers names everything that there is, with its type and limits."""
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+from tests.proto.strategies import MESSAGES
+from udrl.commands import Command
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl_proto import PROTOCOL, keys
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
+REASONS = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
+
+STRUCTS = [*MESSAGES, Command, Config, EnvironmentSpec]
+
+
+def number(value: float) -> str:
+    """Return a limit, large powers of two as such."""
+    whole = int(value)
+    for power, rest in ((whole, ""), (whole + 1, " - 1")):
+        if whole >= 2**16 and power & (power - 1) == 0:
+            return f"2^{power.bit_length() - 1}{rest}"
+    return str(whole)
+
+
+def described(kind: inspect.Type) -> str:
+    """Return how the tables name a type."""
+    match kind:
+        case inspect.UnionType(types=types):
+            return " or ".join(map(described, types))
+        case inspect.NoneType():
+            return "nil"
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.IntType(ge=None):
+            return "integer"
+        case inspect.IntType(ge=int() as least, le=int() as most):
+            return f"integer {number(least)} to {number(most)}"
+        case inspect.FloatType(gt=(int() | float()) as above, le=(int() | float()) as most):
+            return f"number above {number(above)}, to {number(most)}"
+        case inspect.FloatType(ge=(int() | float())):
+            return "finite number"
+        case inspect.FloatType():
+            return "number"
+        case inspect.StrType(pattern=str()):
+            return "name"
+        case inspect.StrType(max_length=None):
+            return "text"
+        case inspect.StrType(max_length=int() as longest):
+            return f"text to {longest}"
+        case inspect.BytesType(min_length=int() as size):
+            return f"{size} bytes"
+        case inspect.BytesType():
+            return "bytes"
+        case inspect.LiteralType(values=values):
+            return " or ".join(f"`{json.dumps(v)}`" for v in values).replace("|", "\\|")
+        case inspect.VarTupleType(item_type=item, min_length=fewest, max_length=count):
+            limit = "" if count is None else f", {number(fewest or 0)} to {number(count)} of them"
+            return f"array of {described(item)}{limit}"
+        case inspect.DictType(key_type=key, value_type=value):
+            return f"map of {described(key)} to {described(value)}"
+        case inspect.StructType(cls=cls):
+            return f"[{cls.__name__}](#{cls.__name__.lower()})"
+    raise NotImplementedError(kind)
+
+
+def default_of(field: inspect.Field) -> str:
+    if field.required:
+        return ""
+    default = field.default
+    if field.default_factory is not msgspec.NODEFAULT:
+        default = field.default_factory()
+    if default is None or default == b"":
+        return "nil" if default is None else "empty"
+    return f"`{json.dumps(default)}`"
+
+
+def rows_of(kind: type[msgspec.Struct]) -> list[list[str]]:
+    """Return the first cells of a type's table as it should be: field, type, default."""
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    return [[f"`{f.encode_name}`", described(f.type), default_of(f)] for f in info.fields]
+
+
+def table_in(page: str, heading: str) -> list[list[str]]:
+    """Return the rows below a heading, without their table's head."""
+    text = re.split(r"\n#+ ", page.split(f"\n{heading}\n", 1)[1], maxsplit=1)[0]
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[1:]]
+
+
+@pytest.mark.parametrize("kind", STRUCTS, ids=lambda kind: kind.__name__)
+def test_every_message_is_described_field_by_field(kind: type[Any]) -> None:
+    expected = rows_of(kind)
+    if not expected:
+        assert f"\n#### {kind.__name__}\n" in PAGE
+        return
+    rows = table_in(PAGE, f"#### {kind.__name__}")
+    assert [row[:3] for row in rows] == expected
+    assert all(row[3] for row in rows)
+
+
+def test_every_verb_is_described() -> None:
+    described_verbs = [row[0].strip("`") for row in table_in(PAGE, "### Verbs")]
+    assert described_verbs == list(keys.VERBS)
+
+
+def test_every_key_expression_is_described() -> None:
+    for verb in (keys.NEW_WEIGHTS, keys.PROGRESS, keys.alive("<run id>", "<role>", "<id>")):
+        assert verb.replace(f"udrl/{PROTOCOL}/", "udrl/<protocol>/") in PAGE
+    assert keys.every_hello() in PAGE
+    assert keys.RUN_ID.pattern in PAGE
+
+
+def codes_in_the_code() -> set[str]:
+    """Return every code that a refusal or problem is made with."""
+    found = set()
+    for path in ROOT.glob("services/*/*/*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                given: list[ast.expr] = []
+                if node.func.id == "Refused":
+                    given = node.args[:1]
+                if node.func.id == "Problem":
+                    given = [k.value for k in node.keywords if k.arg == "code"]
+                found |= {g.value for g in given if isinstance(g, ast.Constant)}
+    return {str(code) for code in found}
+
+
+@pytest.mark.parametrize(("page", "heading"), [(PAGE, "## Errors"), (REASONS, "## Error codes")])
+def test_every_error_code_is_described(page: str, heading: str) -> None:
+    rows = table_in(page, heading)
+    assert {row[0].strip("`") for row in rows} == codes_in_the_code()
+    assert all(len(row) >= 3 and all(row) for row in rows)
+
+
+def test_version_of_the_protocol_is_the_one_in_the_code() -> None:
+    assert f"This is protocol {PROTOCOL}." in PAGE

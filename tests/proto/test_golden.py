@@ -1,0 +1,115 @@
+"""The golden vectors are what the code says today, and the code says what the page promises."""
+
+import hashlib
+import json
+import runpy
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import torch
+from torch import Tensor
+
+from tests.proto.strategies import MESSAGES
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import BehaviorFunction
+from udrl.commands import Command
+from udrl.config import Config
+from udrl.streams import Stream
+from udrl_proto.codec import decode, encode
+from udrl_proto.messages import Message
+
+GOLDEN = Path(__file__).parents[2] / "proto" / "golden"
+MAKE = runpy.run_path(str(GOLDEN / "make.py"))
+EXAMPLES: tuple[Message, ...] = MAKE["EXAMPLES"]
+
+each_example = pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+MASK = 2**64 - 1
+
+
+def golden(message: Message) -> bytes:
+    return bytes((GOLDEN / MAKE["file_name"](message)).read_bytes())
+
+
+def test_every_message_type_has_one_example() -> None:
+    assert sorted(type(m).__name__ for m in EXAMPLES) == [kind.__name__ for kind in MESSAGES]
+
+
+@each_example
+def test_encoding_gives_the_same_bytes(message: Message) -> None:
+    assert encode(message) == golden(message)
+
+
+@each_example
+def test_decoding_gives_the_same_values(message: Message) -> None:
+    assert decode(golden(message), type(message)) == message
+
+
+@each_example
+def test_order_of_fields_is_free(message: Message) -> None:
+    fields = msgpack.unpackb(golden(message))
+    backwards = dict(reversed(fields.items()))
+    assert decode(msgpack.packb(backwards), type(message)) == message
+
+
+def test_files_are_those_that_the_script_writes() -> None:
+    written = {path.name: path.read_bytes() for path in GOLDEN.iterdir() if path.is_file()}
+    del written["make.py"]
+    assert written == MAKE["contents"]()
+
+
+# Arithmetic, by slow references that follow the page.
+
+
+def philox(key: bytes, n: int) -> list[int]:
+    """Return the first words of Philox4x64-10, counter from 1."""
+    words: list[int] = []
+    for counter in range(1, 1 + -(-n // 4)):
+        block = [counter, 0, 0, 0]
+        k0, k1 = int.from_bytes(key[:8], "little"), int.from_bytes(key[8:], "little")
+        for _ in range(10):
+            a, b = block[0] * 0xD2E7470EE14C6C93, block[2] * 0xCA5A826395121157
+            block = [(b >> 64) ^ block[1] ^ k0, b & MASK, (a >> 64) ^ block[3] ^ k1, a & MASK]
+            k0, k1 = (k0 + 0x9E3779B97F4A7C15) & MASK, (k1 + 0xBB67AE8584CAA73B) & MASK
+        words += block
+    return words[:n]
+
+
+STREAMS: list[dict[str, Any]] = json.loads((GOLDEN / "streams.json").read_text())
+CHOICES: list[dict[str, Any]] = json.loads((GOLDEN / "choices.json").read_text())
+
+
+@pytest.mark.parametrize("vector", STREAMS, ids=lambda v: v["hashed"])
+def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
+    key = hashlib.sha256(vector["hashed"].encode()).digest()[:16]
+    words = philox(key, 9)
+    assert key.hex() == vector["key"]
+    assert [str(word) for word in words] == vector["words"]
+    assert [(word >> 11) * 2.0**-53 for word in words] == vector["numbers"]
+    assert Stream(key).uniforms(9).tolist() == vector["numbers"]
+
+
+@pytest.mark.parametrize("greedy", [False, True])
+@pytest.mark.parametrize("vector", CHOICES, ids=lambda v: f"{v['logits']}-{v['u']:.3f}")
+def test_actor_chooses_as_the_vectors_say(vector: dict[str, Any], greedy: bool) -> None:
+    class Fixed(BehaviorFunction):
+        def forward(self, observation: Tensor, command: Tensor) -> Tensor:
+            return torch.tensor(vector["logits"]).expand(len(observation), -1)
+
+    config = Config(environment="Figure2-v0")
+    generator = EpisodeGenerator(config, 1)
+    command = Command(
+        id=0,
+        kind="evaluate",
+        desired_return=0.0,
+        desired_horizon=1,
+        environment_seed=1,
+        stream_key=bytes.fromhex(vector["key"]),
+        weights_version=1,
+        max_steps=2,
+        greedy=greedy,
+    )
+    (episode,) = generate_episodes(generator, [command], Fixed(generator.spec, config))
+    assert episode.actions[0] == vector["greedy" if greedy else "action"]
+    generator.close()

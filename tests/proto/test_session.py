@@ -1,0 +1,185 @@
+"""Finding each other: endpoints, routers, runs, and what is said when there is none."""
+
+import socket
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+import zenoh
+
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.errors import ConfigError, Interrupted, InvalidMessage, Unreachable
+from udrl_proto import PROTOCOL, keys
+from udrl_proto import session as sessions
+from udrl_proto.codec import encode
+from udrl_proto.messages import Hello
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/127.0.0.1:7447",
+        "tcp/localhost:1",
+        "tcp/replay.example.org:65535",
+        "tcp/[::1]:7447",
+        "tcp/0.0.0.0:7447",
+    ],
+)
+def test_endpoint_is_returned_as_it_came(endpoint: str) -> None:
+    assert sessions.check_endpoint(endpoint) == endpoint
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "",
+        "127.0.0.1:7447",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:",
+        "tcp/127.0.0.1:0",
+        "tcp/127.0.0.1:65536",
+        "tcp/127.0.0.1:-1",
+        "tcp/:7447",
+        "tcp/::1:7447",
+        "tcp/a b:7447",
+        "udp/127.0.0.1:7447",
+        "tls/127.0.0.1:7447",
+        "tcp/127.0.0.1:7447?x=1",
+        "tcp/127.0.0.1:7447\n",
+        "http://127.0.0.1:7447",
+    ],
+)
+def test_malformed_endpoint_is_named_with_what_was_expected(endpoint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        sessions.check_endpoint(endpoint)
+    assert f"endpoint {endpoint!r}: expected tcp/HOST:PORT" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.1:7447", "tcp/localhost.org:7447"]
+)
+def test_listening_beyond_loopback_must_be_asked_for(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match=r"other machines .* --insecure"):
+        sessions.listen(endpoint)
+
+
+def test_listening_beyond_loopback_is_possible_by_name(endpoint: str) -> None:
+    everywhere = endpoint.replace("127.0.0.1", "0.0.0.0")
+    with (
+        sessions.listen(everywhere, insecure=True),
+        sessions.connect(endpoint, patience_s=5.0) as client,
+    ):
+        assert list(client.info.routers_zid())
+
+
+def test_port_in_use_is_named(endpoint: str) -> None:
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with (
+        socket.create_server((host, int(port))),
+        pytest.raises(ConfigError, match=rf"{endpoint}.*in use\? choose another"),
+    ):
+        sessions.listen(endpoint)
+
+
+def test_nobody_at_an_endpoint_is_said_in_time(endpoint: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(Unreachable, match=rf"nobody answers at '{endpoint}'.*--listen {endpoint}"):
+        sessions.connect(endpoint, patience_s=0.2)
+    assert time.monotonic() - began < 3.0
+
+
+def test_connecting_can_be_stopped(endpoint: str) -> None:
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(Interrupted, match=endpoint):
+        sessions.connect(endpoint, patience_s=60.0, stop=stop)
+
+
+def test_client_connects_to_a_router_that_comes_later(endpoint: str) -> None:
+    with ExitStack() as stack:
+
+        class FirstPause(threading.Event):
+            def wait(self, timeout: float | None = None) -> bool:
+                stack.enter_context(sessions.listen(endpoint))
+                return False
+
+        client = sessions.connect(endpoint, patience_s=20.0, stop=FirstPause())
+        stack.enter_context(client)
+        assert list(client.info.routers_zid())
+
+
+# Finding a run.
+
+
+def hello(run_id: str) -> Hello:
+    return Hello(
+        protocol=PROTOCOL,
+        software="0",
+        run_id=run_id,
+        config=Config(environment="Figure2-v0"),
+        environment=EnvironmentSpec(observation_size=4, n_actions=3, max_episode_steps=2),
+    )
+
+
+def serve(session: zenoh.Session, run_id: str, payload: bytes, protocol: int = PROTOCOL) -> None:
+    key = f"udrl/{protocol}/{run_id}/{keys.HELLO}"
+    session.declare_queryable(key, lambda query: query.reply(key, payload))
+
+
+@pytest.fixture
+def served(router: zenoh.Session) -> zenoh.Session:
+    serve(router, "one", encode(hello("one")))
+    return router
+
+
+def test_only_run_of_a_router_is_found(served: zenoh.Session, client: zenoh.Session) -> None:
+    assert sessions.find_run(client, None, patience_s=5.0) == hello("one")
+
+
+def test_run_among_several_is_found_by_name(served: zenoh.Session, client: zenoh.Session) -> None:
+    serve(served, "two", encode(hello("two")))
+    assert sessions.find_run(client, "two", patience_s=5.0) == hello("two")
+
+
+def test_several_runs_are_named_when_none_was(served: zenoh.Session, client: zenoh.Session) -> None:
+    serve(served, "two", encode(hello("two")))
+    with pytest.raises(ConfigError, match=r"one, two; name one.*--run"):
+        sessions.find_run(client, None, patience_s=5.0)
+
+
+@pytest.mark.parametrize(("run_id", "named"), [(None, "no run"), ("two", "no run 'two'")])
+def test_missing_run_is_said_in_time(
+    run_id: str | None, named: str, router: zenoh.Session, client: zenoh.Session
+) -> None:
+    if run_id:
+        serve(router, "one", encode(hello("one")))
+    began = time.monotonic()
+    with pytest.raises(Unreachable, match=rf"^{named} answers after .*--run"):
+        sessions.find_run(client, run_id, patience_s=0.1)
+    assert time.monotonic() - began < 3.0
+
+
+def test_run_of_another_protocol_is_refused_with_both_versions(
+    router: zenoh.Session, client: zenoh.Session
+) -> None:
+    serve(router, "one", b"whatever it says then", protocol=PROTOCOL + 1)
+    expected = rf"speaks protocol {PROTOCOL + 1}, this program speaks {PROTOCOL}; install the same"
+    with pytest.raises(ConfigError, match=expected):
+        sessions.find_run(client, None, patience_s=5.0)
+
+
+def test_specification_that_is_none_is_refused(
+    router: zenoh.Session, client: zenoh.Session
+) -> None:
+    serve(router, "one", b"\xc1")
+    with pytest.raises(InvalidMessage, match=r"^Hello: "):
+        sessions.find_run(client, None, patience_s=5.0)
+
+
+def test_looking_for_a_run_can_be_stopped(router: zenoh.Session, client: zenoh.Session) -> None:
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(Interrupted, match="looking for a run"):
+        sessions.find_run(client, None, patience_s=60.0, stop=stop)

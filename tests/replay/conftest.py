@@ -1,0 +1,44 @@
+"""Runs in a directory of their own."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.replay.synthetic import create, reopen
+from udrl.config import Budget
+from udrl_replay.run import Run
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    """What is to be closed at the end."""
+    with ExitStack() as entered:
+        yield entered
+
+
+@pytest.fixture
+def make_run(stack: ExitStack, tmp_path: Path) -> Callable[..., Run]:
+    """Makes a new run in ``tmp_path``."""
+
+    def make(
+        lead: int = 0, max_env_steps: int = 1_000_000, stop_return: float | None = None
+    ) -> Run:
+        store = create(tmp_path, lead)
+        stack.callback(store.close)
+        return Run(store, Budget(max_env_steps=max_env_steps, stop_return=stop_return))
+
+    return make
+
+
+@pytest.fixture
+def reopened(stack: ExitStack, tmp_path: Path) -> Callable[..., Run]:
+    """Ends a run's process and starts another."""
+
+    def start(run: Run, budget: Budget | None = None) -> Run:
+        again = reopen(run, tmp_path, budget)
+        stack.callback(again.store.close)
+        return again
+
+    return start

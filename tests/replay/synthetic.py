@@ -1,0 +1,204 @@
+"""A world without networks and environments: episodes and weights are digests of their causes.
+
+An episode here is a function of its command and of the weights that the command names; weights are
+a function of the version before and of the buffer. Whatever a run does wrong shows in the digests.
+"""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from udrl.commands import Command, CommandSampler
+from udrl.config import Budget, Config
+from udrl.digests import episode_digest, replay_digest
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.evaluation import Evaluation, summarise
+from udrl.replay import Entry, ReplayBuffer
+from udrl.schedule import evaluation_due, opened_by, weights_version
+from udrl_proto.codec import decode, encode_episode
+from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
+from udrl_replay.arrival import Arrival, inspect
+from udrl_replay.run import Progress, Run
+from udrl_replay.store import Store, Version
+
+SPEC = EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=4)
+
+
+def config(lead: int = 0) -> Config:
+    """Return a run of a dozen steps an iteration, with evaluations and many ties in return."""
+    return Config(
+        environment="Synthetic-v0",
+        lead=lead,
+        n_warm_up_episodes=4,
+        n_episodes_per_iter=3,
+        replay_size=5,
+        last_few=2,
+        eval_every=9,
+        eval_episodes=2,
+    )
+
+
+def hello(lead: int = 0) -> Hello:
+    return Hello(
+        protocol=1, software="0", run_id="synthetic", config=config(lead), environment=SPEC
+    )
+
+
+def create(run_dir: Path, lead: int = 0) -> Store:
+    """Make a new run's file."""
+    return Store.create(run_dir, hello=hello(lead), progress=Progress())
+
+
+def join(name: str, environments: int = 4) -> JoinRequest:
+    return JoinRequest(
+        role="actor",
+        id=name,
+        host="h",
+        pid=1,
+        software="0",
+        environments=environments,
+        numerics_class="c",
+        environment=SPEC,
+    )
+
+
+def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
+    """Carry out a command; ``other``: as a machine would that rounds in its own way."""
+    cause = hashlib.sha256(msgspec.msgpack.encode(command) + weights).digest()
+    length = 1 + cause[0] % command.max_steps
+    return Episode(
+        command_id=command.id,
+        observations=np.frombuffer(cause[: 2 * length], np.uint8).reshape(-1, 2).astype(np.float32),
+        actions=np.frombuffer(cause[:length], np.uint8) % 3,
+        rewards=(np.frombuffer(cause[-length:], np.uint8) % 3 - other).astype(np.float32),
+        terminated=True,
+        truncated=False,
+    )
+
+
+def arrive(made: Episode, actor: str = "a") -> Arrival:
+    """Send an episode through the codec and the checks."""
+    return inspect(decode(encode_episode(made, actor), EpisodeMessage), SPEC)
+
+
+def entry(made: Episode) -> Entry:
+    return Entry(made.episode_return, made.command_id, made.length)
+
+
+def trained(version: int, before: bytes, buffer: Iterable[bytes]) -> Version:
+    """Train a version on a buffer, given as digests of its episodes by rank."""
+    weights = hashlib.sha256(b"|".join([before, *buffer])).digest()
+    return Version(version, hashlib.sha256(weights).digest(), 1.0 / version, weights, b"adam")
+
+
+class Result(NamedTuple):
+    """Where a run ended."""
+
+    iteration: int
+    env_steps: int
+    weights: bytes
+    replay: bytes
+    evaluation: Evaluation | None
+    closing: Evaluation | None
+
+
+def reference(lead: int, max_env_steps: int) -> Result:
+    """Do what a run does, the slow and obvious way: keep everything, begin with it each time."""
+    settings = config(lead)
+    sample = CommandSampler(settings, SPEC.max_episode_steps)
+    weights = [b""]
+    steps: list[int] = []
+    explored: list[list[Episode]] = []
+    evaluation = None
+
+    def buffer(iteration: int) -> list[Episode]:
+        everything = [e for done in explored[: iteration + 1] for e in done]
+        return sorted(everything, key=entry)[-settings.replay_size :]
+
+    def carry_out(commands: Sequence[Command]) -> list[Episode]:
+        return [episode(c, weights[c.weights_version]) for c in commands]
+
+    while not steps or steps[-1] < max_env_steps:
+        i = len(steps)
+        if i == 0:
+            explored.append(carry_out(sample.warm_up()))
+        else:
+            weights.append(trained(i, weights[-1], map(episode_digest, buffer(i - 1))).weights)
+            source = weights_version(i, lead) - 1
+            drawn_from = ReplayBuffer(settings.replay_size, map(entry, buffer(source)))
+            explored.append(carry_out(sample.explore(i, drawn_from)))
+            before = steps[source - 1] if source else 0
+            due = evaluation_due(source, before, steps[source], settings.eval_every)
+            if due and i == opened_by(source, lead)[0]:
+                returns = [e.episode_return for e in carry_out(sample.evaluate(i, drawn_from))]
+                evaluation = summarise(returns)
+        steps.append(sum(e.length for done in explored for e in done))
+    digest = replay_digest(map(episode_digest, buffer(i)))
+    closing = None
+    if i > 0:
+        last = ReplayBuffer(settings.replay_size, map(entry, buffer(i)))
+        closing = summarise([e.episode_return for e in carry_out(sample.close(i, last))])
+    return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
+
+
+def result(run: Run) -> Result:
+    """Say where a run stands, in the terms of :func:`reference`."""
+    version = run.store.version(run.progress.latest_version)
+    last = run.store.last_evaluation(closing=False)
+    closing = run.store.last_evaluation(closing=True)
+    return Result(
+        run.progress.iteration,
+        run.progress.env_steps,
+        version.weights if version else b"",
+        replay_digest(run.digests[e.id] for e in run.buffer),
+        last.evaluation if last else None,
+        closing.evaluation if closing else None,
+    )
+
+
+def train_next(run: Run) -> Version:
+    """Do a learner's work: return the version that the run waits for."""
+    number = run.progress.latest_version + 1
+    before = run.store.version(number - 1)
+    buffer = run.store.buffer(number - 1)
+    return trained(number, before.weights if before else b"", (p.digest for p in buffer))
+
+
+def weights_of(run: Run, command: Command) -> bytes:
+    """Return the weights that a command names, which the run must have."""
+    if command.weights_version == 0:
+        return b""
+    version = run.store.version(command.weights_version)
+    assert version is not None
+    assert version.weights, f"version {command.weights_version} is gone, {command.id} needs it"
+    return version.weights
+
+
+def work(run: Run) -> None:
+    """Deliver a version if one is awaited, and an episode for each command that can be obeyed."""
+    with run.store.transaction():
+        if run.awaits_version() is not None:
+            run.add_version(train_next(run), 0.0)
+        for item in list(run.dealer.outstanding.values()):
+            command = item.command
+            wanted = command.id in run.dealer.outstanding
+            if wanted and command.weights_version <= run.progress.latest_version:
+                run.accept(arrive(episode(command, weights_of(run, command))), 0.0)
+        run.save()
+
+
+def finish(run: Run) -> None:
+    """Work until the run has ended."""
+    while run.progress.state in ("running", "closing"):
+        work(run)
+
+
+def reopen(run: Run, run_dir: Path, budget: Budget | None = None) -> Run:
+    """End a replay service and start another on the same file."""
+    run.store.close()
+    return Run(Store(run_dir), budget or run.budget)

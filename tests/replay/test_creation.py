@@ -1,0 +1,161 @@
+"""Creating a run, going on with it, and writing its configuration."""
+
+import re
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import udrl
+from udrl.config import Budget, Config, build, read_toml
+from udrl.environments import EnvironmentSpec
+from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
+from udrl_proto import PROTOCOL, keys
+from udrl_proto.messages import Hello
+from udrl_replay import creation
+from udrl_replay.run import Progress
+from udrl_replay.store import FILE, Store
+
+TOY = Config(environment="Figure2-v0", max_return=2.0)
+
+
+@pytest.fixture
+def created(stack: ExitStack, tmp_path: Path) -> Store:
+    return stack.enter_context(closing(creation.create(tmp_path, TOY)))
+
+
+def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
+    hello = created.fact("hello", Hello)
+    assert hello == Hello(
+        protocol=PROTOCOL,
+        software=udrl.__version__,
+        run_id=hello.run_id,
+        config=TOY,
+        environment=EnvironmentSpec(
+            observation_size=4, n_actions=3, max_episode_steps=2, max_return=2.0
+        ),
+    )
+    assert created.fact("progress", Progress) == Progress()
+
+
+def test_environment_that_does_not_replay_marks_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(creation, "environment_replays", lambda config, generator: False)
+    with closing(creation.create(tmp_path, TOY)) as store:
+        progress = store.fact("progress", Progress)
+        assert not progress.exact
+        assert not store.fact("hello", Hello).exact
+    reason = "environment Figure2-v0 does not repeat an episode from its seed"
+    assert progress.inexact_reason == reason
+    assert reason in caplog.text
+
+
+def test_unknown_environment_leaves_no_run(tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedEnvironment, match="Nowhere-v0"):
+        creation.create(tmp_path / "run", Config(environment="Nowhere-v0"))
+    assert not creation.exists(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_exists_once_it_is_created(created: Store, tmp_path: Path) -> None:
+    assert creation.exists(tmp_path)
+    assert not creation.exists(tmp_path / "other")
+
+
+def test_run_is_resumed_with_its_configuration(created: Store, tmp_path: Path) -> None:
+    hello = created.fact("hello", Hello)
+    created.close()
+    with closing(creation.resume(tmp_path, TOY)) as store:
+        assert store.fact("hello", Hello) == hello
+
+
+def test_other_configuration_is_refused_with_both_values(created: Store, tmp_path: Path) -> None:
+    created.close()
+    other = Config(environment="Figure2-v0", max_return=2.0, seed=7, hidden=(8,))
+    expected = r"seed = 1, not 7; hidden = \(32, 128, 128, 128\), not \(8,\); use its configuration"
+    with pytest.raises(OtherConfiguration, match=expected):
+        creation.resume(tmp_path, other)
+    # The refusal has let go of the lock.
+    creation.resume(tmp_path, TOY).close()
+
+
+def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=rf"holds no run \({FILE} is missing\)"):
+        creation.resume(tmp_path, TOY)
+
+
+@pytest.mark.parametrize("name", ["run", "My Run.2", "-", "x" * 200, "läufe", "a" * 49 + "--b"])
+def test_id_of_a_run_fits_a_key_expression(name: str, tmp_path: Path) -> None:
+    with closing(creation.create(tmp_path / name, TOY)) as store:
+        assert keys.RUN_ID.fullmatch(store.fact("hello", Hello).run_id)
+
+
+def test_runs_of_one_name_have_different_ids(tmp_path: Path) -> None:
+    ids = set()
+    for parent in ("one", "two"):
+        with closing(creation.create(tmp_path / parent / "run", TOY)) as store:
+            ids.add(store.fact("hello", Hello).run_id)
+    assert len(ids) == 2
+
+
+@given(st.text(min_size=1, max_size=200), st.integers(0, 2**63 - 1))
+def test_directory_of_any_environment_has_a_plain_name(environment: str, seed: int) -> None:
+    name = creation.directory_name(Config(environment=environment, seed=seed))
+    assert re.fullmatch(r"[a-z0-9][a-z0-9-]*", name)
+
+
+def test_directory_says_what_the_run_is() -> None:
+    name = creation.directory_name(Config(environment="pack.age:LunarLander-v3", seed=12))
+    assert re.fullmatch(r"pack-age-lunarlander-v3-seed12-\d{8}-\d{6}", name)
+
+
+def test_resumed_run_may_allow_what_it_did_not_before(created: Store, tmp_path: Path) -> None:
+    created.close()
+    for allow_inexact in (True, False):
+        with closing(creation.resume(tmp_path, TOY, allow_inexact=allow_inexact)) as store:
+            assert store.fact("hello", Hello).allow_inexact
+
+
+printable = st.text(st.characters(min_codepoint=32, exclude_characters="\x7f", codec="utf-8"))
+kwargs: st.SearchStrategy[dict[str, Any]] = st.dictionaries(
+    printable,
+    st.booleans() | st.integers(-(2**63), 2**63 - 1) | printable
+    | st.floats(allow_nan=False, allow_infinity=False),
+    max_size=3,
+)  # fmt: skip
+
+
+@given(
+    environment_kwargs=kwargs,
+    learning_rate=st.floats(0, 10, exclude_min=True),
+    hidden=st.lists(st.integers(1, 65_536), min_size=1, max_size=4).map(tuple),
+    max_return=st.none() | st.floats(allow_nan=False, allow_infinity=False),
+    stop_return=st.none() | st.floats(allow_nan=False, allow_infinity=False),
+)
+def test_written_configuration_can_be_read_again(
+    environment_kwargs: dict[str, Any],
+    learning_rate: float,
+    hidden: tuple[int, ...],
+    max_return: float | None,
+    stop_return: float | None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    config = Config(
+        environment='odd "name"\\-v0',
+        environment_kwargs=environment_kwargs,
+        learning_rate=learning_rate,
+        hidden=hidden,
+        max_return=max_return,
+    )
+    budget = Budget(max_env_steps=5, stop_return=stop_return)
+    run_dir = tmp_path_factory.getbasetemp()
+    creation.write_config(run_dir, config, budget)
+    values = read_toml(run_dir / "config.toml")
+    assert build(Budget, {n: values.pop(n) for n in Budget.__struct_fields__ if n in values}) == (
+        budget
+    )
+    assert build(Config, values) == config

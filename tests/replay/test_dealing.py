@@ -1,0 +1,273 @@
+"""Who gets which command, and who gets it next when that one does not answer."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.replay.synthetic import join
+from udrl.commands import Command
+from udrl.config import COMMANDS_PER_ITERATION
+from udrl_proto.codec import SMALL, encode
+from udrl_proto.messages import CommandsReply, CommandsRequest
+from udrl_replay.dealing import MAX_DEALT, SILENCE_S, STRAGGLER, Dealer
+
+
+def command(index: int, iteration: int = 1, version: int = 1) -> Command:
+    return Command(
+        id=iteration * COMMANDS_PER_ITERATION + index,
+        kind="explore",
+        desired_return=0.0,
+        desired_horizon=1,
+        environment_seed=1,
+        stream_key=bytes(16),
+        weights_version=version,
+        max_steps=4,
+    )
+
+
+def ids(*indices: int) -> list[int]:
+    return [command(index).id for index in indices]
+
+
+@pytest.fixture
+def dealer() -> Dealer:
+    """Six commands, two actors."""
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(6))
+    for name in ("a", "b"):
+        dealer.join(join(name), 0.0)
+    return dealer
+
+
+def ask(
+    dealer: Dealer,
+    name: str,
+    wanted: int = 100,
+    running: list[int] | None = None,
+    now: float = 0.0,
+    version: int = 1,
+    spare_cores: float = 0.0,
+) -> list[int]:
+    """Return the ids that an actor is given."""
+    request = CommandsRequest(
+        actor=name, wanted=wanted, running=tuple(running or ()), spare_cores=spare_cores
+    )
+    return [c.id for c in dealer.deal(request, version, now)]
+
+
+def test_first_actor_does_not_get_everything(dealer: Dealer) -> None:
+    assert ask(dealer, "a") == ids(0, 1, 2)
+    assert ask(dealer, "b") == ids(3, 4, 5)
+
+
+@given(n_commands=st.integers(1, 40), n_actors=st.integers(1, 9))
+def test_shares_are_even_and_leave_nothing(n_commands: int, n_actors: int) -> None:
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(n_commands))
+    names = [f"actor-{n}" for n in range(n_actors)]
+    for name in names:
+        dealer.join(join(name), 0.0)
+    dealt = [ask(dealer, name) for name in names]
+    assert sorted(i for share in dealt for i in share) == ids(*range(n_commands))
+    assert max(map(len, dealt)) <= -(-n_commands // n_actors)
+
+
+def test_actor_gets_no_more_than_it_wants(dealer: Dealer) -> None:
+    assert ask(dealer, "a", wanted=2) == ids(0, 1)
+    assert ask(dealer, "a", wanted=0, running=ids(0, 1)) == []
+
+
+def test_what_an_actor_runs_counts_towards_its_share(dealer: Dealer) -> None:
+    running = ask(dealer, "a", wanted=2)
+    assert ask(dealer, "a", running=running) == ids(2)
+
+
+def test_earlier_iterations_come_first(dealer: Dealer) -> None:
+    dealer.add([command(0, iteration=0, version=0)])
+    assert ask(dealer, "b", wanted=1) == [0]
+
+
+def test_command_waits_for_its_weights(dealer: Dealer) -> None:
+    assert ask(dealer, "a", version=0) == []
+    assert ask(dealer, "a", version=1) == ids(0, 1, 2)
+
+
+def test_commands_whose_weights_are_missing_do_not_hold_up_others(dealer: Dealer) -> None:
+    dealer.add([command(0, iteration=2, version=2)])
+    assert ask(dealer, "a") + ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
+    assert ask(dealer, "a", running=ids(0, 1, 2)) == []
+
+
+def test_full_answer_is_a_small_message() -> None:
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(2 * MAX_DEALT))
+    dealer.join(join("a"), 0.0)
+    request = CommandsRequest(actor="a", wanted=65_536)
+    commands = dealer.deal(request, 1, 0.0)
+    assert len(commands) == MAX_DEALT
+    assert len(encode(CommandsReply(commands=tuple(commands)))) < SMALL
+
+
+# Actors that go, and replies that are lost.
+
+
+def test_commands_of_an_actor_that_is_gone_go_to_others(dealer: Dealer) -> None:
+    ask(dealer, "a")
+    dealer.leave("a")
+    assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
+
+
+def test_actor_that_joins_again_holds_nothing(dealer: Dealer) -> None:
+    ask(dealer, "a")
+    dealer.join(join("a"), 0.0)
+    assert ask(dealer, "a") == ids(0, 1, 2)
+
+
+def test_commands_of_a_lost_reply_are_dealt_again(dealer: Dealer) -> None:
+    assert ask(dealer, "a") == ids(0, 1, 2)
+    assert ask(dealer, "a", running=[]) == ids(0, 1, 2)
+
+
+def test_restarted_service_learns_what_actors_run(dealer: Dealer) -> None:
+    assert ask(dealer, "a", wanted=0, running=ids(4, 5)) == []
+    assert ask(dealer, "b") == ids(0, 1, 2)
+    assert dealer.holds("a", ids(4)[0])
+
+
+def test_running_command_that_is_not_outstanding_is_ignored(dealer: Dealer) -> None:
+    assert ask(dealer, "a", running=[*ids(99), 3]) == ids(0, 1, 2)
+
+
+def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
+    ask(dealer, "a", now=0.0)
+    ask(dealer, "b", wanted=0, now=SILENCE_S)
+    dealer.forget_silent(set(), SILENCE_S + 1)
+    assert list(dealer.actors) == ["b"]
+    assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
+
+
+def test_actor_that_delivers_is_not_silent(dealer: Dealer) -> None:
+    for name in ("a", "b", "stranger"):
+        dealer.hear(name, SILENCE_S)
+    dealer.forget_silent(set(), SILENCE_S + 1)
+    assert list(dealer.actors) == ["a", "b"]
+
+
+def test_silent_actor_whose_token_is_alive_is_not_forgotten(dealer: Dealer) -> None:
+    ask(dealer, "a", now=0.0)
+    dealer.forget_silent({"a"}, SILENCE_S + 1)
+    assert "a" in dealer.actors
+
+
+# Stragglers.
+
+
+@pytest.fixture
+def straggling(dealer: Dealer) -> Dealer:
+    """``a`` has one command since 0 s, all others are done; an episode takes 2 s."""
+    first, *others = [c for name in ("a", "b") for c in ask(dealer, name)]
+    for command_id in others:
+        dealer.remove(command_id, now=2.0)
+    assert dealer.holds("a", first)
+    return dealer
+
+
+OVERDUE = STRAGGLER * 2.0
+
+
+def test_straggler_goes_to_an_idle_actor_too(straggling: Dealer) -> None:
+    assert ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0) == ids(0)
+    assert straggling.holds("a", ids(0)[0])
+
+
+def test_straggler_is_given_time(straggling: Dealer) -> None:
+    assert ask(straggling, "b", now=OVERDUE, spare_cores=1.0) == []
+
+
+def test_straggler_is_not_run_again_on_a_saturated_machine(straggling: Dealer) -> None:
+    assert ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=0.9) == []
+
+
+def test_straggler_is_not_run_again_by_an_actor_that_is_busy(straggling: Dealer) -> None:
+    straggling.add([command(7)])
+    ask(straggling, "b", wanted=1)
+    busy = ask(straggling, "b", running=ids(7), now=OVERDUE + 0.1, spare_cores=1.0)
+    assert busy == []
+
+
+def test_straggler_runs_on_two_actors_at_most(straggling: Dealer) -> None:
+    straggling.join(join("c"), 0.0)
+    ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0)
+    assert ask(straggling, "c", now=100.0, spare_cores=1.0) == []
+
+
+def test_straggler_is_not_known_before_an_episode_has_come(dealer: Dealer) -> None:
+    ask(dealer, "a")
+    ask(dealer, "b", running=[])
+    dealer.leave("b")
+    dealer.join(join("b"), 0.0)
+    for command_id in ids(3, 4, 5):
+        dealer.remove(command_id)
+    assert ask(dealer, "b", now=1000.0, spare_cores=1.0) == []
+
+
+def test_straggler_whose_second_actor_dies_stays_with_the_first(straggling: Dealer) -> None:
+    ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0)
+    straggling.leave("b")
+    assert straggling.holds("a", ids(0)[0])
+    straggling.join(join("b"), 0.0)
+    assert ask(straggling, "b", now=OVERDUE + 0.1) == []
+
+
+# Failures.
+
+
+def fail(dealer: Dealer, name: str) -> bool:
+    ask(dealer, name, wanted=0, running=ids(0))
+    return dealer.fail(ids(0)[0], name)
+
+
+def test_three_failures_on_two_actors_are_hopeless(dealer: Dealer) -> None:
+    assert [fail(dealer, name) for name in "aba"] == [False, False, True]
+
+
+def test_failures_of_one_actor_may_be_its_own_fault(dealer: Dealer) -> None:
+    assert [fail(dealer, "a") for _ in range(5)] == [False] * 5
+    assert fail(dealer, "b")
+
+
+def test_failures_of_the_only_actor_are_hopeless(dealer: Dealer) -> None:
+    dealer.leave("b")
+    assert [fail(dealer, "a") for _ in range(3)] == [False, False, True]
+
+
+def test_failed_command_is_dealt_again(dealer: Dealer) -> None:
+    ask(dealer, "a")
+    dealer.fail(ids(0)[0], "a")
+    assert not dealer.holds("a", ids(0)[0])
+    assert ask(dealer, "b", wanted=1) == ids(0)
+
+
+# Waiting.
+
+
+def test_larger_fleet_asks_less_often_and_not_at_once(dealer: Dealer) -> None:
+    few = [dealer.retry_after_s() for _ in range(100)]
+    for number in range(100):
+        dealer.join(join(f"actor-{number}"), 0.0)
+    many = [dealer.retry_after_s() for _ in range(100)]
+    assert 0 < max(few) < min(many)
+    assert len(set(few)) > 1
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 5)), max_size=30))
+def test_iteration_is_left_with_what_is_outstanding(steps: list[tuple[str, int]]) -> None:
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(6))
+    for name, index in steps:
+        dealer.join(join(name), 0.0)
+        ask(dealer, name)
+        if command(index).id in dealer.outstanding:
+            dealer.remove(command(index).id, 1.0)
+    assert dealer.left(1) == len(dealer.outstanding)
+    assert dealer.left(2) == 0

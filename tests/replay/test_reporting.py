@@ -1,0 +1,209 @@
+"""What a run tells about itself: status, who waits for whom, and ``metrics.csv``."""
+
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.replay.synthetic import arrive, config, episode, finish, join, work
+from udrl.config import Budget
+from udrl_proto.codec import decode, encode
+from udrl_proto.messages import CommandsRequest, Status, Waiting
+from udrl_replay.reporting import COLUMNS, MetricsFile, Throughput, Waits, status
+from udrl_replay.run import Run
+
+MakeRun = Callable[..., Run]
+
+
+def shown(run: Run, now: float = 0.0) -> Status:
+    return status(run, Throughput(), Waits(), 0.0, now)
+
+
+# Status.
+
+
+def test_status_of_a_new_run_is_empty_but_complete(make_run: MakeRun) -> None:
+    seen = shown(make_run())
+    assert (seen.state, seen.iteration, seen.env_steps) == ("running", 0, 0)
+    assert (seen.buffer.episodes, seen.buffer.return_mean) == (0, None)
+    assert (seen.weights_version, seen.weights_sha256, seen.loss) == (0, "", None)
+    assert (seen.evaluation, seen.closing_evaluation, seen.time_left_s) == (None, None, None)
+    assert seen.commands.outstanding == seen.commands.issued == config().n_warm_up_episodes
+    assert seen.useful_concurrency == config().n_episodes_per_iter
+    assert decode(encode(seen), Status) == seen
+
+
+def test_useful_concurrency_grows_with_the_lead(make_run: MakeRun) -> None:
+    assert shown(make_run(lead=3)).useful_concurrency == 4 * config().n_episodes_per_iter
+
+
+def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
+    run = make_run(lead=1, max_env_steps=40)
+    finish(run)
+    seen = shown(run)
+    returns = [e.episode_return for e in run.buffer]
+    version = run.store.version(run.progress.iteration)
+    closing = run.store.last_evaluation(closing=True)
+    assert version is not None
+    assert closing is not None
+    assert seen.state == "ended"
+    assert seen.weights_version == seen.iteration == run.progress.iteration
+    assert seen.weights_sha256 == version.digest.hex()
+    assert seen.loss == version.loss
+    assert (seen.buffer.return_min, seen.buffer.return_max) == (returns[0], returns[-1])
+    assert seen.buffer.return_mean == math.fsum(returns) / len(returns)
+    assert seen.closing_evaluation is not None
+    assert seen.closing_evaluation.mean == closing.evaluation.mean
+    assert seen.evaluation is not None
+    assert seen.time_left_s is None
+    assert decode(encode(seen), Status) == seen
+
+
+def test_status_shows_every_actor_as_its_last_request_described_it(make_run: MakeRun) -> None:
+    run = make_run(max_env_steps=1000)
+    work(run)
+    work(run)
+    for name in ("b", "a"):
+        run.dealer.join(join(name, environments=4), 10.0)
+    request = CommandsRequest(actor="a", wanted=2, env_steps_per_s=12.34, weights_version=1)
+    dealt = run.dealer.deal(request, run.progress.latest_version, 11.0)
+    seen = shown(run, now=13.5)
+    first, second = seen.actors
+    assert (first.id, first.environments, first.running) == ("a", 4, len(dealt))
+    assert (first.env_steps_per_s, first.last_seen_s) == (12.3, 2.5)
+    assert first.weights_lag == run.progress.latest_version - 1
+    assert (second.id, second.running, second.last_seen_s) == ("b", 0, 3.5)
+    assert seen.weights_lag == second.weights_lag == run.progress.latest_version
+
+
+def test_status_counts_what_was_delivered_twice_or_wrongly(make_run: MakeRun) -> None:
+    run = make_run()
+    command = next(iter(run.dealer.outstanding.values())).command
+    for _ in range(3):
+        run.accept(arrive(episode(command, b"")), 0.0)
+    run.progress.delivered += 1
+    run.reject("a wrong one")
+    seen = shown(run).episodes
+    assert (seen.delivered, seen.accepted, seen.duplicate, seen.rejected) == (4, 1, 2, 1)
+
+
+def test_digest_of_the_replay_covers_its_order_and_content(make_run: MakeRun) -> None:
+    run = make_run()
+    before = shown(run).replay_sha256
+    work(run)
+    after = shown(run).replay_sha256
+    assert before != after
+    first = next(iter(run.buffer)).id
+    run.digests[first] = bytes(32)
+    assert shown(run).replay_sha256 not in (before, after)
+
+
+# Throughput.
+
+
+def test_throughput_is_the_mean_of_ten_seconds() -> None:
+    throughput = Throughput()
+    for second in range(21):
+        throughput.add(float(second), 100)
+    assert throughput.per_second(20.0) == pytest.approx(110.0)
+
+
+def test_throughput_ends_with_the_episodes() -> None:
+    throughput = Throughput()
+    assert throughput.per_second(0.0) == 0.0
+    throughput.add(0.0, 100)
+    assert throughput.per_second(10.0) > 0.0
+    assert throughput.per_second(10.1) == 0.0
+
+
+def test_throughput_of_the_first_moment_is_not_infinite() -> None:
+    throughput = Throughput()
+    throughput.add(5.0, 100)
+    assert throughput.per_second(5.0) == 100.0
+
+
+# Waits.
+
+
+def test_wait_for_the_same_goes_on() -> None:
+    waits = Waits()
+    waits.begin("actor a", "learner", "weights version 3", 10.0)
+    waits.begin("actor a", "learner", "weights version 3", 12.0)
+    assert waits.list(15.0) == (
+        Waiting(who="actor a", on="learner", why="weights version 3", seconds=5.0),
+    )
+
+
+def test_wait_for_something_else_begins_anew() -> None:
+    waits = Waits()
+    waits.begin("actor a", "learner", "weights version 3", 10.0)
+    waits.begin("actor a", "learner", "weights version 4", 12.0)
+    assert [w.seconds for w in waits.list(15.0)] == [3.0]
+
+
+def test_wait_that_ended_is_not_listed() -> None:
+    waits = Waits()
+    for who in ("b", "a"):
+        waits.begin(who, "learner", "", 0.0)
+    assert [w.who for w in waits.list(0.0)] == ["a", "b"]
+    waits.end("a")
+    waits.end("stranger")
+    assert [w.who for w in waits.list(0.0)] == ["b"]
+
+
+# metrics.csv.
+
+
+def lines(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_iteration_has_one_line(make_run: MakeRun, tmp_path: Path) -> None:
+    run = make_run(lead=1, max_env_steps=60)
+    metrics = MetricsFile(tmp_path, run.store)
+    assert (tmp_path / "metrics.csv").read_text() == ",".join(COLUMNS) + "\n"
+    while run.progress.state != "ended":
+        work(run)
+        metrics.update(run.progress.iteration)
+        metrics.update(run.progress.iteration)
+    found = lines(tmp_path)
+    assert [int(line["iteration"]) for line in found] == list(range(run.progress.iteration + 1))
+    assert int(found[-1]["env_steps"]) == run.progress.env_steps
+    assert all(tuple(line) == COLUMNS for line in found)
+
+
+def test_line_of_an_evaluated_iteration_carries_the_evaluation(
+    make_run: MakeRun, tmp_path: Path
+) -> None:
+    run = make_run(max_env_steps=60)
+    finish(run)
+    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    evaluation = run.store.last_evaluation(closing=False)
+    assert evaluation is not None
+    found = lines(tmp_path)
+    line = found[evaluation.iteration]
+    assert float(line["eval_mean"]) == evaluation.evaluation.mean
+    assert float(line["eval_ci95_low"]) == evaluation.evaluation.ci95_low
+    # The evaluated weights are those of the buffer before, whose env steps the line carries.
+    before = found[int(line["weights_version"]) - 1]
+    assert line["eval_at_env_steps"] == before["env_steps"]
+    assert found[0]["eval_mean"] == found[0]["loss"] == ""
+
+
+def test_metrics_of_a_resumed_run_are_those_of_one_that_never_stopped(
+    make_run: MakeRun, reopened: MakeRun, tmp_path: Path
+) -> None:
+    run = make_run(lead=2, max_env_steps=30)
+    first = MetricsFile(tmp_path, run.store)
+    finish(run)
+    first.update(run.progress.iteration)
+    before = lines(tmp_path)
+    run = reopened(run, Budget(max_env_steps=60))
+    finish(run)
+    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    after = lines(tmp_path)
+    assert after[: len(before)] == before
+    assert len(after) == run.progress.iteration + 1

@@ -1,0 +1,545 @@
+"""The run as a state machine: whatever happens, and in whatever order, the result is the same."""
+
+import tempfile
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+)
+from msgspec.structs import replace
+
+from tests.replay.synthetic import (
+    arrive,
+    config,
+    create,
+    episode,
+    finish,
+    join,
+    reference,
+    reopen,
+    result,
+    train_next,
+    weights_of,
+    work,
+)
+from udrl.commands import CLOSING, Command
+from udrl.config import COMMANDS_PER_ITERATION, Budget
+from udrl.errors import Refused
+from udrl.replay import Entry
+from udrl_proto.messages import CommandsRequest, FailureMessage, Status
+from udrl_replay.arrival import Arrival
+from udrl_replay.reporting import Throughput, Waits, status
+from udrl_replay.run import Progress, Run
+from udrl_replay.store import Store, Version
+
+#: Env steps after which every run of the machine ends at last.
+FINAL = 60
+#: Where a file is synced at once: on a disk this takes ten times as long.
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+class Died(Exception):
+    """The process ends in the middle of a transaction."""
+
+
+class RunMachine(RuleBasedStateMachine):
+    """Actors, a learner and a replay process that do everything they can do, in any order."""
+
+    @initialize(lead=st.integers(0, 3), max_env_steps=st.integers(1, FINAL // 2))
+    def start(self, lead: int, max_env_steps: int) -> None:
+        self.lead = lead
+        self.folder = tempfile.TemporaryDirectory(dir=MEMORY)
+        self.run_dir = Path(self.folder.name)
+        self.run = Run(create(self.run_dir, lead), Budget(max_env_steps=max_env_steps))
+        self.now = 0.0
+        self.held: dict[tuple[str, int], tuple[Command, bytes]] = {}
+        self.accepted: dict[int, tuple[Command, bytes]] = {}
+        self.explored: list[Entry] = []
+        self.trained: list[Version] = []
+
+    # Actors.
+
+    @rule(name=st.sampled_from("abc"))
+    def actor_joins(self, name: str) -> None:
+        self.run.dealer.join(join(name), self.now)
+
+    @rule(name=st.sampled_from("abc"), dies=st.booleans())
+    def actor_leaves(self, name: str, dies: bool) -> None:
+        self.run.dealer.leave(name)
+        if dies:
+            self.held = {key: item for key, item in self.held.items() if key[0] != name}
+
+    @precondition(lambda self: self.run.dealer.actors)
+    @rule(pick=st.integers(0, 2), wanted=st.integers(1, 4), arrives=st.integers(0, 4).map(bool))
+    def actor_asks(self, pick: int, wanted: int, arrives: bool) -> None:
+        name = sorted(self.run.dealer.actors)[pick % len(self.run.dealer.actors)]
+        self.now += 1.0
+        request = CommandsRequest(
+            actor=name,
+            wanted=wanted,
+            running=tuple(i for owner, i in self.held if owner == name),
+            spare_cores=2.0,
+        )
+        dealt = self.run.dealer.deal(request, self.run.progress.latest_version, self.now)
+        assert len(dealt) <= wanted
+        for command in dealt:
+            assert command.id in self.run.dealer.outstanding
+            weights = weights_of(self.run, command)
+            if arrives:
+                self.held[name, command.id] = command, weights
+
+    @precondition(lambda self: self.held)
+    @rule(pick=st.integers(0, 20), dies=st.integers(0, 5).map(lambda n: n == 0))
+    def actor_delivers(self, pick: int, dies: bool) -> None:
+        name, command_id = key = list(self.held)[pick % len(self.held)]
+        command, weights = self.held[key]
+        arrival = arrive(episode(command, weights), name)
+        if dies:
+            with suppress(Died), self.run.store.transaction():
+                with suppress(Refused):
+                    self.run.accept(arrival, self.now)
+                raise Died
+            self.replay_dies()
+            return
+        del self.held[key]
+        expected = "duplicate" if command_id in self.accepted else "rejected"
+        if command_id in self.run.dealer.outstanding:
+            expected = "accepted"
+            self.note_accepted(command, weights, arrival)
+        assert self.deliver(arrival) == expected
+
+    @rule(rounds=st.integers(1, 4), share=st.integers(1, 3))
+    def everybody_works(self, rounds: int, share: int) -> None:
+        """Carry out a part of what can be, which takes the run further than single steps do."""
+        for _ in range(rounds):
+            if self.run.awaits_version() is not None:
+                self.learner_delivers()
+            latest = self.run.progress.latest_version
+            able = [
+                item.command
+                for item in self.run.dealer.outstanding.values()
+                if item.command.weights_version <= latest
+            ]
+            for command in able[::share]:
+                if command.id in self.run.dealer.outstanding:
+                    weights = weights_of(self.run, command)
+                    arrival = arrive(episode(command, weights))
+                    self.note_accepted(command, weights, arrival)
+                    assert self.deliver(arrival) == "accepted"
+
+    def note_accepted(self, command: Command, weights: bytes, arrival: Arrival) -> None:
+        self.accepted[command.id] = command, weights
+        if command.kind != "evaluate":
+            self.explored.append(arrival.entry)
+
+    @precondition(lambda self: self.accepted)
+    @rule(pick=st.integers(0, 100), other=st.booleans())
+    def actor_delivers_again(self, pick: int, other: bool) -> None:
+        command, weights = list(self.accepted.values())[pick % len(self.accepted)]
+        known = self.run.store.episode_digest(command.id) is not None
+        assert self.deliver(arrive(episode(command, weights, other))) == "duplicate"
+        assert not (other and known and self.run.progress.exact)
+
+    @rule(iteration=st.integers(0, 3), index=st.integers(6, CLOSING - 1))
+    def actor_delivers_what_nobody_wants(self, iteration: int, index: int) -> None:
+        unknown = Command(
+            id=iteration * COMMANDS_PER_ITERATION + index,
+            kind="explore",
+            desired_return=0.0,
+            desired_horizon=1,
+            environment_seed=0,
+            stream_key=bytes(16),
+            weights_version=0,
+            max_steps=4,
+        )
+        assert self.deliver(arrive(episode(unknown, b""))) == "rejected"
+
+    @precondition(lambda self: self.held)
+    @rule(pick=st.integers(0, 20), times=st.integers(1, 2))
+    def actor_fails(self, pick: int, times: int) -> None:
+        name, command_id = list(self.held)[pick % len(self.held)]
+        del self.held[name, command_id]
+        before = self.run.progress.env_failures
+        with self.run.store.transaction():
+            for _ in range(times):
+                self.run.fail(FailureMessage(actor=name, command_id=command_id, error="e"))
+            self.run.save()
+        assert self.run.progress.env_failures <= before + 1
+
+    def deliver(self, arrival: Arrival) -> str:
+        with self.run.store.transaction():
+            try:
+                return self.run.accept(arrival, self.now)
+            except Refused as refusal:
+                return refusal.code
+            finally:
+                self.run.save()
+
+    # The learner.
+
+    @precondition(lambda self: self.run.awaits_version() is not None)
+    @rule()
+    def learner_delivers(self) -> None:
+        self.trained.append(train_next(self.run))
+        assert self.deliver_version(self.trained[-1]) == "accepted"
+        self.check_collected()
+
+    @precondition(lambda self: self.trained)
+    @rule(pick=st.integers(0, 20), equal=st.booleans())
+    def learner_delivers_again(self, pick: int, equal: bool) -> None:
+        version = self.trained[pick % len(self.trained)]
+        if equal:
+            assert self.deliver_version(version) == "duplicate"
+        else:
+            other = version._replace(digest=b"other", weights=b"other")
+            assert self.deliver_version(other) == "unequal_version"
+
+    @rule(ahead=st.integers(1, 3))
+    def learner_is_ahead(self, ahead: int) -> None:
+        ahead += self.run.awaits_version() is not None
+        version = Version(self.run.progress.latest_version + ahead, b"d", 1.0, b"w", b"o")
+        assert self.deliver_version(version) == "rewind"
+
+    def deliver_version(self, version: Version) -> str:
+        with self.run.store.transaction():
+            try:
+                return self.run.add_version(version, 0.0)
+            except Refused as refusal:
+                return refusal.code
+            finally:
+                self.run.save()
+
+    # The replay process.
+
+    @rule()
+    def replay_dies(self) -> None:
+        self.run = reopen(self.run, self.run_dir)
+
+    @rule(more=st.integers(0, FINAL // 4))
+    def run_is_resumed_with_a_larger_budget(self, more: int) -> None:
+        budget = Budget(max_env_steps=min(self.run.budget.max_env_steps + more, FINAL))
+        self.run = reopen(self.run, self.run_dir, budget)
+        if self.run.progress.state == "running":
+            # Evaluations that closed the run before are forgotten.
+            self.accepted = {i: a for i, a in self.accepted.items() if a[0].index < CLOSING}
+
+    # What is true at every moment.
+
+    @invariant()
+    def nothing_is_created_or_lost(self) -> None:
+        shown = status(self.run, Throughput(), Waits(), 0.0, self.now)
+        assert_conserved(shown)
+        assert shown.episodes.accepted >= len(self.accepted)
+        assert shown.commands.outstanding == len(self.run.store.commands(cancelled=False)) - len(
+            self.run.store.pending_ids()
+        )
+
+    @invariant()
+    def buffer_holds_the_best_of_everything(self) -> None:
+        assert list(self.run.buffer) == self.best(self.run.progress.iteration)
+        assert sorted(self.run.digests) == sorted(e.id for e in self.run.buffer)
+
+    @invariant()
+    def earlier_buffers_can_be_asked_for(self) -> None:
+        for iteration in self.needed_buffers():
+            ids = [p.entry.id for p in self.run.store.buffer(iteration)]
+            assert ids == [e.id for e in self.best(iteration)]
+            assert len(self.run.store.episode_bodies(ids, 1 << 30)) == len(ids)
+
+    @invariant()
+    def weights_that_commands_name_are_kept(self) -> None:
+        outstanding = [item.command for item in self.run.dealer.outstanding.values()]
+        for command in [*outstanding, *self.run.store.commands(cancelled=True)]:
+            if command.weights_version <= self.run.progress.latest_version:
+                weights_of(self.run, command)
+
+    @invariant()
+    def everything_is_on_disk(self) -> None:
+        assert self.run.store.fact("progress", Progress) == self.run.progress
+
+    def needed_buffers(self) -> range:
+        """Return the iterations after which the buffer may still be asked for."""
+        latest, iteration = self.run.progress.latest_version, self.run.progress.iteration
+        return range(min(latest, iteration), iteration + 1)
+
+    def best(self, iteration: int) -> list[Entry]:
+        """Return the buffer after an iteration, from all that was ever accepted."""
+        end = (iteration + 1) * COMMANDS_PER_ITERATION
+        admitted = sorted((e for e in self.explored if e.id < end), key=lambda e: e.id)
+        return sorted(admitted)[-config().replay_size :]
+
+    def check_collected(self) -> None:
+        """A version has arrived: nothing is kept that nobody can ask for."""
+        store, progress = self.run.store, self.run.progress
+        wanted = {p.entry.id for i in self.needed_buffers() for p in store.buffer(i)}
+        wanted |= store.pending_ids()
+        assert {i for i in self.accepted if store.episode_digest(i) is not None} == wanted
+        named = {c.weights_version for c in store.commands(cancelled=True)}
+        named |= {c.weights_version for c in store.commands(cancelled=False)}
+        named |= {progress.best_version, progress.latest_version}
+        latest = progress.latest_version
+        assert set(store.versions_kept()) == {v for v in named if 0 < v <= latest}
+
+    def teardown(self) -> None:
+        if not hasattr(self, "run"):
+            return
+        with self.folder:
+            self.run = reopen(self.run, self.run_dir, Budget(max_env_steps=FINAL))
+            finish(self.run)
+            assert self.run.progress.state == "ended"
+            assert result(self.run) == reference(self.lead, FINAL)
+            self.run.store.close()
+
+
+TestRunMachine = RunMachine.TestCase
+TestRunMachine.settings = settings(max_examples=60, stateful_step_count=50)
+
+
+def assert_conserved(shown: Status) -> None:
+    commands, episodes = shown.commands, shown.episodes
+    assert commands.issued == commands.accepted + commands.cancelled + commands.outstanding
+    assert episodes.delivered == episodes.accepted + episodes.duplicate + episodes.rejected
+
+
+# The same, one thing at a time.
+
+MakeRun = Callable[..., Run]
+
+
+def outstanding(run: Run) -> list[Command]:
+    return [item.command for item in run.dealer.outstanding.values()]
+
+
+def deliver(run: Run, command: Command, other: bool = False) -> str:
+    with run.store.transaction():
+        try:
+            return run.accept(arrive(episode(command, weights_of(run, command), other)), 0.0)
+        finally:
+            run.save()
+
+
+def until_closing(run: Run) -> None:
+    """Work until only the closing evaluation is left."""
+    while run.progress.state == "running":
+        work(run)
+    while run.awaits_version() is not None:
+        with run.store.transaction():
+            run.add_version(train_next(run), 0.0)
+
+
+def fail(run: Run, command_id: int, *actors: str) -> None:
+    """Let actors get a command and fail on it, one after the other."""
+    for name in actors:
+        run.dealer.join(join(name), 0.0)
+        run.dealer.deal(
+            CommandsRequest(actor=name, wanted=0, running=(command_id,)),
+            run.progress.latest_version,
+            0.0,
+        )
+    with run.store.transaction():
+        for name in actors:
+            run.fail(FailureMessage(actor=name, command_id=command_id, error="no more fuel"))
+        run.save()
+
+
+@pytest.mark.parametrize("lead", range(4))
+@pytest.mark.parametrize("max_env_steps", [1, 30, 100])
+def test_run_equals_the_reference(lead: int, max_env_steps: int, make_run: MakeRun) -> None:
+    run = make_run(lead, max_env_steps)
+    finish(run)
+    assert result(run) == reference(lead, max_env_steps)
+
+
+def test_reopened_run_issues_nothing_again(make_run: MakeRun, reopened: MakeRun) -> None:
+    run = make_run()
+    before = outstanding(run)
+    run = reopened(run)
+    assert outstanding(run) == before
+    assert run.progress.issued == len(before) == config().n_warm_up_episodes
+
+
+def test_second_delivery_is_a_duplicate(make_run: MakeRun) -> None:
+    run = make_run()
+    command = outstanding(run)[0]
+    assert deliver(run, command) == "accepted"
+    assert deliver(run, command) == "duplicate"
+    assert run.progress.exact
+
+
+def test_other_episode_of_a_command_is_a_duplicate_that_marks_the_run(make_run: MakeRun) -> None:
+    run = make_run()
+    command = outstanding(run)[0]
+    deliver(run, command)
+    assert deliver(run, command, other=True) == "duplicate"
+    assert not run.progress.exact
+    assert f"command {command.id} and their episodes differ" in run.progress.inexact_reason
+
+
+def test_longer_episode_than_the_command_allows_leaves_it_outstanding(make_run: MakeRun) -> None:
+    run = make_run()
+    command = next(c for c in outstanding(run) if len(episode(c, b"").rewards) > 1)
+    run.dealer.outstanding[command.id].command = replace(command, max_steps=1)
+    with pytest.raises(Refused, match=r"steps, its command allows 1"):
+        deliver(run, command)
+    assert run.progress.rejected == 1
+    assert command.id in run.dealer.outstanding
+
+
+def test_warm_up_that_spends_the_budget_ends_the_run(make_run: MakeRun) -> None:
+    run = make_run(max_env_steps=1)
+    for command in outstanding(run):
+        deliver(run, command)
+    assert run.progress.state == "ended"
+    assert run.awaits_version() is None
+
+
+def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) -> None:
+    run = make_run(lead=2, max_env_steps=20)
+    seeds = set()
+    while run.progress.state == "running":
+        seeds |= {c.environment_seed for c in outstanding(run)}
+        work(run)
+    until_closing(run)
+    final = run.progress.iteration
+    assert [c.id for c in outstanding(run)] == [
+        final * COMMANDS_PER_ITERATION + CLOSING + n for n in range(config().eval_episodes)
+    ]
+    assert {c.weights_version for c in outstanding(run)} == {final}
+    assert seeds.isdisjoint(c.environment_seed for c in outstanding(run))
+
+
+def test_closing_episode_delivered_again_is_a_duplicate(make_run: MakeRun) -> None:
+    run = make_run(max_env_steps=20)
+    until_closing(run)
+    closing = outstanding(run)
+    assert [deliver(run, c) for c in closing + closing] == ["accepted"] * 2 + ["duplicate"] * 2
+    assert run.progress.state == "ended"
+
+
+def test_cancelled_command_is_refused_until_the_run_goes_on(
+    make_run: MakeRun, reopened: MakeRun
+) -> None:
+    run = make_run(lead=1, max_env_steps=20)
+    finish(run)
+    cancelled = run.store.commands(cancelled=True)[0]
+    with pytest.raises(Refused, match=f"command {cancelled.id} is cancelled"):
+        deliver(run, cancelled)
+    run = reopened(run, Budget(max_env_steps=40))
+    assert deliver(run, cancelled) == "accepted"
+
+
+def test_resumed_run_completes_what_had_arrived_before_its_end(
+    make_run: MakeRun, reopened: MakeRun
+) -> None:
+    run = make_run(lead=1, max_env_steps=11)
+    work(run)
+    run.add_version(train_next(run), 0.0)
+    *others, last = [c for c in outstanding(run) if c.iteration == 1]
+    for command in [*others, *(c for c in outstanding(run) if c.iteration == 2), last]:
+        deliver(run, command)
+    assert (run.progress.state, run.progress.iteration) == ("closing", 1)
+    run = reopened(run, Budget(max_env_steps=40))
+    assert (run.progress.state, run.progress.iteration) == ("running", 2)
+
+
+def test_evaluation_that_reaches_the_stop_return_ends_the_run(make_run: MakeRun) -> None:
+    run = make_run(stop_return=0.0)
+    finish(run)
+    evaluation = run.store.last_evaluation(closing=False)
+    assert evaluation is not None
+    assert evaluation.iteration == run.progress.iteration == 1
+
+
+def test_best_version_is_kept(make_run: MakeRun) -> None:
+    run = make_run(max_env_steps=120)
+    best: dict[int, float] = {}
+    while run.progress.state != "ended":
+        work(run)
+        last = run.store.last_evaluation(closing=False)
+        if last is not None:
+            best.setdefault(last.iteration, last.evaluation.mean)
+    expected = min(best, key=lambda version: (-best[version], version))
+    assert 0 < run.progress.best_version == expected < run.progress.latest_version
+    version = run.store.version(expected)
+    assert version is not None
+    assert version.weights
+
+
+def test_version_with_other_values_is_refused_with_both_digests(make_run: MakeRun) -> None:
+    run = make_run()
+    work(run)
+    version = train_next(run)
+    run.add_version(version, 0.0)
+    assert run.add_version(version, 0.0) == "duplicate"
+    other = version._replace(digest=bytes(32))
+    with pytest.raises(Refused, match=f"{version.digest.hex()[:16]}, now {'0' * 16}") as caught:
+        run.add_version(other, 0.0)
+    assert caught.value.code == "unequal_version"
+
+
+def test_diverged_version_is_refused_with_the_remedy(make_run: MakeRun) -> None:
+    run = make_run()
+    work(run)
+    with pytest.raises(Refused, match="loss nan; training diverged, lower learning_rate"):
+        run.add_version(train_next(run)._replace(loss=float("nan")), 0.0)
+    assert run.awaits_version() == 1
+
+
+def test_three_failures_on_two_actors_stop_the_run(make_run: MakeRun) -> None:
+    run = make_run()
+    fail(run, 2, "a", "b")
+    before = run.progress.state
+    fail(run, 2, "a")
+    assert (before, run.progress.state) == ("running", "failed")
+    assert run.progress.problem == (
+        "command 2 failed three times: no more fuel; reproduce it with: udrl reproduce RUN_DIR 2"
+    )
+
+
+def test_failure_that_is_reported_again_counts_once(make_run: MakeRun) -> None:
+    run = make_run()
+    fail(run, 2, "a")
+    for _ in range(3):
+        run.fail(FailureMessage(actor="a", command_id=2, error="no more fuel"))
+    assert run.progress.env_failures == 1
+    assert run.progress.state == "running"
+
+
+def test_failed_run_tries_again_when_it_is_resumed(make_run: MakeRun, reopened: MakeRun) -> None:
+    run = make_run(max_env_steps=20)
+    fail(run, 2, "a", "b")
+    fail(run, 2, "a")
+    run = reopened(run)
+    assert (run.progress.state, run.progress.problem) == ("running", "")
+    finish(run)
+    assert result(run) == reference(0, 20)
+
+
+def test_failed_closing_evaluation_is_tried_again(make_run: MakeRun, reopened: MakeRun) -> None:
+    run = make_run(max_env_steps=20)
+    until_closing(run)
+    for actors in ("ab", "a"):
+        fail(run, outstanding(run)[0].id, *actors)
+    assert run.progress.state == "failed"
+    run = reopened(run)
+    assert run.progress.state == "closing"
+    finish(run)
+    assert result(run) == reference(0, 20)
+
+
+def test_run_that_is_only_looked_at_writes_nothing(make_run: MakeRun, tmp_path: Path) -> None:
+    run = make_run(max_env_steps=20)
+    finish(run)
+    with closing(Store(tmp_path, read_only=True)) as store:
+        looked_at = Run(store, Budget(max_env_steps=1000))
+        assert looked_at.progress == run.progress
+        assert result(looked_at) == result(run)

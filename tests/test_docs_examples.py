@@ -1,0 +1,204 @@
+"""What the documentation names exists: commands, code, files, links."""
+
+import importlib
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import gymnasium as gym
+import pytest
+
+import udrl.environments  # noqa: F401 - registers environments
+from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
+from udrl.config import Budget, Config, parse_assignment
+from udrl.errors import UdrlError
+from udrl_launch.cli import cli
+from udrl_launch.settings import Fleet, gather
+from udrl_proto.session import check_endpoint
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=str)
+
+
+@each_page
+def test_toml_and_python_in_the_documentation_can_be_read(page: Path) -> None:
+    for language, code in Page(page).code:
+        if language == "python":
+            compile(code, str(page), "exec")
+        if language == "toml":
+            tomllib.loads(code)
+
+
+def shell_commands(code: str) -> Iterator[list[str]]:
+    """Yield the simple commands of a piece of shell, as words."""
+    for line in code.replace("\\\n", " ").splitlines():
+        words = shlex.shlex(line.removeprefix("$ "), posix=True, punctuation_chars=True)
+        words.whitespace_split = True
+        command: list[str] = []
+        for word in [*words, ";"]:
+            if set(word) <= set(";&|()"):
+                if command:
+                    yield command
+                command = []
+            elif command or not re.fullmatch(r"\w+=.*", word):  # a variable for this command
+                command.append(word)
+
+
+def commands_in(page: Path) -> Iterator[list[str]]:
+    """Yield the commands in a page that one could type."""
+    parts = Page(page)
+    for language, code in parts.code:
+        if language in ("sh", "bash", "console"):
+            yield from shell_commands(code)
+        elif not language:  # a drawing, perhaps
+            for line in re.findall(r"^(?:\$ )?(?:\S*/)?(?:udrl|make) .*", code, flags=re.MULTILINE):
+                yield from shell_commands(line)
+    for code in parts.inline:
+        if re.match(r"(\S*/)?(udrl|make) \S", code) and not re.search(r"…|\.\.\.|\[[-A-Z]", code):
+            yield from shell_commands(code)
+
+
+def check_udrl(words: list[str]) -> None:
+    """Parse the arguments of a command ``udrl``, without running it.
+
+    Raises:
+        click.UsageError, UdrlError: it could not be given so.
+    """
+    name, *arguments = words
+    if name.startswith("-"):
+        assert name in ("--help", "-h", "--version"), name
+        return
+    command = cli.commands[name]
+    if not arguments:
+        return  # a mention of the command
+    try:
+        context = command.make_context(name, [placeholder(word) for word in arguments])
+    except click.exceptions.Exit:
+        return  # --help
+    given = context.params
+    for endpoint in (given.get("listen"), given.get("connect")):
+        if endpoint is not None:
+            check_endpoint(endpoint)
+    if "assignments" in given:
+        settings = {*Config.__struct_fields__, *Budget.__struct_fields__, *Fleet.__struct_fields__}
+        options = {n: v for n, v in given.items() if n in settings}
+        gather(
+            given["env"],
+            preset_name=given["preset_name"],
+            options=options,
+            assignments=given["assignments"],
+        )
+        for assignment in given["assignments"]:
+            assert parse_assignment(assignment)[0] in settings
+        assert given["env"] == "ENV" or ":" in given["env"] or given["env"] in gym.registry
+
+
+def placeholder(word: str) -> str:
+    """Return a value that a placeholder may stand for."""
+    if word == "ENDPOINT":
+        return "tcp/127.0.0.1:7447"
+    if re.fullmatch(r"[A-Z]", word):
+        return "1"
+    return word.replace(":PORT", ":7447")
+
+
+@each_page
+def test_commands_in_the_documentation_can_be_given(page: Path) -> None:
+    for command in commands_in(page):
+        program, *arguments = command
+        program = program.rpartition("/")[2]
+        shown = shlex.join(command)
+        if program == "udrl" and arguments:
+            try:
+                check_udrl(arguments)
+            except (click.UsageError, UdrlError, KeyError, AssertionError) as error:
+                pytest.fail(f"{page}: {shown}: {type(error).__name__}: {error}")
+        if program == "make":
+            target = next((a for a in arguments if a[0] != "-" and "=" not in a), "train")
+            assert target in make_targets() or "-C" in arguments, f"{page}: {shown}"
+
+
+def test_commands_are_found_where_they_stand() -> None:
+    code = (
+        "# a comment\n$ A=1 .venv/bin/udrl train \\\n  CartPole-v1 --set hidden=[8,8] && make x | y"
+    )
+    assert list(shell_commands(code)) == [
+        [".venv/bin/udrl", "train", "CartPole-v1", "--set", "hidden=[8,8]"],
+        ["make", "x"],
+        ["y"],
+    ]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "nothing",
+        "train CartPole-v1 --seeed 3",
+        "train CartPole-v1 --set batchsize=3",
+        "train CartPole-v1 --set batch_size=0",
+        "train NoSuchLander-v9 --seed 1",
+        "train CartPole-v1 --preset nope",
+        "actor --envs 16",
+        "actor --connect localhost",
+        "status --jason",
+    ],
+)
+def test_wrong_commands_would_be_found(words: str) -> None:
+    with pytest.raises((click.UsageError, UdrlError, KeyError, AssertionError)):
+        check_udrl(words.split())
+
+
+# Links and names.
+
+
+@each_page
+def test_links_in_the_repository_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", Page(page).words):
+        if re.match(r"[a-z]+:", target):
+            continue  # another site's
+        path, _, anchor = target.partition("#")
+        there = (ROOT / page).parent / path if path else ROOT / page
+        assert there.exists(), f"{page}: {target} does not exist"
+        if anchor and there.suffix == ".md":
+            assert anchor in anchors(there), f"{page}: {target}: there is no such heading"
+
+
+_PATH = re.compile(r"(udrl|proto|services|tests|docs|benchmarks|experiments|\.ci)(/[\w.-]+)*/?")
+_DOTTED = re.compile(r"(udrl|udrl_(?:proto|actor|learner|replay|launch))(\.\w+)+")
+
+
+def is_there(dotted: str) -> bool:
+    """Say whether a dotted name is a module, or something in one."""
+    module, _, rest = dotted.partition(".")
+    found = importlib.import_module(module)
+    for part in rest.split("."):
+        module = f"{module}.{part}"
+        if not hasattr(found, part):
+            try:
+                importlib.import_module(module)
+            except ModuleNotFoundError:
+                return False
+        found = getattr(found, part)
+    return True
+
+
+@each_page
+def test_code_named_in_the_documentation_exists(page: Path) -> None:
+    modules = {path.name for path in files("*.py")}
+    for name in Page(page).inline:
+        if re.search(r"/\d|NAME", name):
+            continue  # a key of the protocol, or a placeholder
+        if "/" in name and _PATH.fullmatch(name):
+            assert (ROOT / name).exists() or (ROOT / page).parent.joinpath(name).exists(), name
+        elif _DOTTED.fullmatch(name):
+            assert is_there(name), f"{page}: {name}"
+        elif re.fullmatch(r"\w+\.py", name):
+            assert name in modules, f"{page}: {name}"
+
+
+def test_pages_named_in_the_code_exist() -> None:
+    for path in [*files("*.py"), Path("Makefile"), Path(".ci/run")]:
+        for page in re.findall(r"\b(?:docs|proto)/[\w-]+\.md\b", text_of(path)):
+            assert (ROOT / page).exists(), f"{path} names {page}"

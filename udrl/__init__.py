@@ -1,0 +1,18 @@
+"""Upside-Down Reinforcement Learning (Srivastava et al. 2019): the algorithm, free of messaging.
+
+The paper's parts and where they live:
+
+================================  ======================================
+Algorithm 1                       :mod:`udrl.algorithm1`
+2.3.1 replay buffer               :mod:`udrl.replay`
+2.3.2 behavior function           :mod:`udrl.behavior`
+2.3.3 training                    :mod:`udrl.segments`, :mod:`udrl.training`
+2.3.4 exploratory commands        :mod:`udrl.commands`
+2.3.5 experience, Algorithm 2     :mod:`udrl.acting`
+2.3.6 evaluation                  :mod:`udrl.commands`, :mod:`udrl.evaluation`
+3.1, 3.4 environments             :mod:`udrl.environments`
+Table 2 hyperparameters           :mod:`udrl.config`
+================================  ======================================
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,124 @@
+"""Algorithm 1, in one process and one page: the reference that the services must equal.
+
+At ``lead = 0`` the distributed system gives the same bits as this file.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.commands import CommandSampler
+from udrl.config import Budget, Config
+from udrl.digests import Digest, episode_digest, replay_digest, tensors_digest
+from udrl.episode import Episode
+from udrl.errors import ConfigError
+from udrl.evaluation import Evaluation, summarise
+from udrl.numerics import use_one_thread
+from udrl.replay import Entry, ReplayBuffer
+from udrl.schedule import evaluation_due
+from udrl.segments import Experience
+from udrl.training import TrainingState, train, untrained
+
+
+@dataclass
+class Run:
+    """Where a run stands after an iteration.
+
+    Attributes:
+        iteration: the last one completed.
+        env_steps: steps of warm-up and exploratory episodes.
+        evaluations: by iteration.
+    """
+
+    buffer: ReplayBuffer
+    state: TrainingState
+    experience: Experience
+    iteration: int = 0
+    env_steps: int = 0
+    evaluations: dict[int, Evaluation] = field(default_factory=dict)
+    digests: dict[int, Digest] = field(default_factory=dict)
+
+    def add(self, episodes: Sequence[Episode]) -> None:
+        """Add episodes to the replay buffer (2.3.1), which keeps the best."""
+        self.env_steps += sum(e.length for e in episodes)
+        entries = [Entry(e.episode_return, e.command_id, e.length) for e in episodes]
+        evicted = {entry.id for entry in self.buffer.admit(entries)}
+        for gone in evicted & self.experience.ids():
+            self.experience.remove(gone)
+            del self.digests[gone]
+        for episode in episodes:
+            if episode.command_id not in evicted:
+                self.experience.add(episode)
+                self.digests[episode.command_id] = episode_digest(episode)
+
+    @property
+    def weights_sha256(self) -> str:
+        """Digest of the behavior function."""
+        return tensors_digest(self.state.behavior.state_dict()).hex()
+
+    @property
+    def replay_sha256(self) -> str:
+        """Digest of the replay buffer."""
+        return replay_digest(self.digests[entry.id] for entry in self.buffer).hex()
+
+
+def algorithm1(
+    config: Config,
+    budget: Budget,
+    n_environments: int = 16,
+    report: Callable[[Run], None] = lambda run: None,
+) -> Run:
+    """Train with Algorithm 1 until the budget is spent, and return where the run stands.
+
+    Args:
+        config: its ``lead`` must be 0.
+        budget: when to stop.
+        n_environments: episodes generated side by side; changes the speed, not the result.
+        report: called after every iteration.
+    """
+    if config.lead != 0:
+        raise ConfigError(
+            f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
+        )
+    use_one_thread()
+    generator = EpisodeGenerator(config, n_environments)
+    sample = CommandSampler(config, generator.spec.max_episode_steps)
+
+    # 1: initialise replay buffer with warm-up episodes using random actions
+    run = Run(
+        ReplayBuffer(config.replay_size),
+        untrained(config, generator.spec),  # 2: initialise a behavior function
+        Experience(config, generator.spec),
+    )
+    run.add(generate_episodes(generator, sample.warm_up(), None))
+    due = evaluation_due(0, 0, run.env_steps, config.eval_every)
+    report(run)
+
+    # 3: while stopping criteria is not reached
+    stop = run.env_steps >= budget.max_env_steps
+    while not stop:
+        run.iteration += 1
+        # 4: improve the behavior function by training on replay buffer
+        train(run.state, run.experience.by_rank([e.id for e in run.buffer]), config)
+        # 5: sample exploratory commands based on replay buffer
+        exploratory = sample.explore(run.iteration, run.buffer)
+        evaluation = sample.evaluate(run.iteration, run.buffer) if due else []
+        # 6: generate episodes using Algorithm 2 and add to replay buffer
+        before = run.env_steps
+        run.add(generate_episodes(generator, exploratory, run.state.behavior))
+        # 7-9: if evaluation required, evaluate current agent using Algorithm 2
+        if due:
+            episodes = generate_episodes(generator, evaluation, run.state.behavior)
+            run.evaluations[run.iteration] = summarise([e.episode_return for e in episodes])
+        due = evaluation_due(run.iteration, before, run.env_steps, config.eval_every)
+        stop = run.env_steps >= budget.max_env_steps or _lands(run, budget)
+        report(run)
+    generator.close()
+    return run
+
+
+def _lands(run: Run, budget: Budget) -> bool:
+    latest = run.evaluations.get(run.iteration)
+    return (
+        budget.stop_return is not None and latest is not None and latest.mean >= budget.stop_return
+    )

@@ -1,0 +1,150 @@
+"""Commands: what an episode is told to achieve, and everything else that it depends on.
+
+An episode is a pure function of its command. Sections 2.3.4 (exploratory commands) and 2.3.6
+(evaluation commands) are here, and so are the warm-up's, which say "act at random".
+"""
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from udrl.config import COMMANDS_PER_ITERATION, Config
+from udrl.replay import ReplayBuffer
+from udrl.schedule import weights_version
+from udrl.streams import Purpose, Stream, stream_key
+
+Kind = Literal["warm_up", "explore", "evaluate"]
+
+#: Reset seeds (section 3.2), half-open ranges.
+TRAINING_SEEDS = (1_000_000, 10_000_000)
+SEARCH_SEEDS = (500_000, 1_000_000)
+EVALUATION_SEEDS = (1, 500_000)
+
+#: Within an iteration, the closing evaluation of a run that ends there has indices from here on.
+CLOSING = 500_000
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An order to an actor.
+
+    Attributes:
+        id: ``iteration * COMMANDS_PER_ITERATION + index``; the episode's id is the same.
+        kind: what the episode is for.
+        desired_return: initial desired return; 0 in the warm-up, where nothing reads it.
+        desired_horizon: initial desired horizon in steps; likewise.
+        environment_seed: what the environment is reset with.
+        stream_key: 16 bytes, the key of the stream whose number t decides action t.
+        weights_version: the behavior function to act with; 0 in the warm-up: act at random.
+        max_steps: the episode is truncated after so many steps.
+        greedy: take the mode of the action distribution instead of a sample.
+    """
+
+    id: Annotated[int, Meta(ge=0, le=2**62)]
+    kind: Kind
+    desired_return: float
+    desired_horizon: Annotated[int, Meta(ge=0, le=2**31)]
+    environment_seed: Annotated[int, Meta(ge=0, le=2**31)]
+    stream_key: Annotated[bytes, Meta(min_length=16, max_length=16)]
+    weights_version: Annotated[int, Meta(ge=0, le=2**62)]
+    max_steps: Annotated[int, Meta(ge=1, le=2**31)]
+    greedy: bool = False
+
+    @property
+    def iteration(self) -> int:
+        """The iteration that the command belongs to."""
+        return self.id // COMMANDS_PER_ITERATION
+
+    @property
+    def index(self) -> int:
+        """The command's number within its iteration."""
+        return self.id % COMMANDS_PER_ITERATION
+
+
+class CommandSampler:
+    """Draws the commands of a run, iteration by iteration.
+
+    Args:
+        config: the run's settings.
+        max_episode_steps: the environment's time limit.
+    """
+
+    def __init__(self, config: Config, max_episode_steps: int) -> None:
+        self._config = config
+        self._max_episode_steps = max_episode_steps
+        self._max_train_steps = min(max_episode_steps, config.max_train_steps or max_episode_steps)
+
+    def warm_up(self) -> list[Command]:
+        """Return the commands of iteration 0: random actions (section 2.3.1)."""
+        n = self._config.n_warm_up_episodes
+        return self._commands("warm_up", 0, 0, [0.0] * n, 0, TRAINING_SEEDS)
+
+    def explore(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
+        """Return an iteration's exploratory commands (section 2.3.4).
+
+        The desired horizon is the mean length of the ``last_few`` best episodes; the desired
+        returns are uniform in [M, M + S], with M and S the mean and the (population) standard
+        deviation of their returns.
+        """
+        mean, deviation, horizon = self._best(buffer)
+        stream = self._stream(iteration)
+        numbers = stream.uniforms(self._config.n_episodes_per_iter)
+        returns = [mean + deviation * u for u in numbers.tolist()]
+        return self._commands("explore", iteration, 0, returns, horizon, TRAINING_SEEDS)
+
+    def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
+        """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
+        first = self._config.n_episodes_per_iter
+        return self._evaluation(iteration, first, buffer)
+
+    def close(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
+        """Return the evaluation that closes a run at an iteration: fresh seeds, final weights."""
+        closing = self._evaluation(iteration, CLOSING, buffer)
+        return [msgspec.structs.replace(c, weights_version=iteration) for c in closing]
+
+    def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
+        mean, _, horizon = self._best(buffer)
+        returns = [mean] * self._config.eval_episodes
+        return self._commands("evaluate", iteration, first, returns, horizon, EVALUATION_SEEDS)
+
+    def _best(self, buffer: ReplayBuffer) -> tuple[float, float, int]:
+        """Return M, S and the mean length, rounded, of the best episodes."""
+        best = buffer.best(self._config.last_few)
+        n = len(best)
+        # fsum rounds once, so that the result does not depend on the order of summation.
+        mean = math.fsum(e.episode_return for e in best) / n
+        variance = math.fsum((e.episode_return - mean) ** 2 for e in best) / n
+        mean_length = sum(e.length for e in best) / n
+        return mean, math.sqrt(variance), math.floor(mean_length + 0.5)
+
+    def _stream(self, iteration: int, index: int = -1) -> Stream:
+        return Stream(stream_key(self._config.seed, Purpose.COMMANDS, iteration, index))
+
+    def _commands(
+        self,
+        kind: Kind,
+        iteration: int,
+        first: int,
+        returns: list[float],
+        horizon: int,
+        seeds: tuple[int, int],
+    ) -> list[Command]:
+        environment_seeds = self._stream(iteration, first).integers(len(returns), *seeds)
+        evaluation = kind == "evaluate"
+        return [
+            Command(
+                id=iteration * COMMANDS_PER_ITERATION + index,
+                kind=kind,
+                desired_return=desired_return,
+                desired_horizon=horizon,
+                environment_seed=seed,
+                stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
+                weights_version=weights_version(iteration, self._config.lead),
+                max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
+                greedy=evaluation and self._config.eval_greedy,
+            )
+            for index, (desired_return, seed) in enumerate(
+                zip(returns, environment_seeds.tolist(), strict=True), start=first
+            )
+        ]

@@ -1,0 +1,59 @@
+"""SHA-256 digests of content: two runs are equal when these are.
+
+They cover decoded values, not encodings: tensors by name, dtype, shape and bytes; episodes by their
+arrays; a buffer by its episodes in the order of (return, id). Who made an episode and when is left
+out. Numbers are little-endian.
+"""
+
+import hashlib
+import struct
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from udrl.episode import Episode
+
+Digest = bytes
+
+
+def arrays_digest(arrays: Mapping[str, npt.NDArray[np.generic]]) -> Digest:
+    """Return the digest of named arrays, whatever order they come in."""
+    sha = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        little = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        sha.update(f"{name}|{little.dtype.str}|{little.shape}|".encode())
+        sha.update(little.tobytes())
+    return sha.digest()
+
+
+def tensors_digest(tensors: Mapping[str, Tensor]) -> Digest:
+    """Return the digest of named tensors, e.g. a ``state_dict``."""
+    return arrays_digest({name: t.detach().cpu().numpy() for name, t in tensors.items()})
+
+
+def episode_digest(episode: Episode) -> Digest:
+    """Return the digest of an episode's content and id."""
+    sha = hashlib.sha256(
+        struct.pack("<Q??", episode.command_id, episode.terminated, episode.truncated)
+    )
+    sha.update(
+        arrays_digest(
+            {
+                "observations": episode.observations,
+                "actions": episode.actions,
+                "rewards": episode.rewards,
+            }
+        )
+    )
+    return sha.digest()
+
+
+def replay_digest(episode_digests: Iterable[Digest]) -> Digest:
+    """Return the digest of a buffer from those of its episodes, in the buffer's order."""
+    sha = hashlib.sha256()
+    for digest in episode_digests:
+        sha.update(digest)
+    return sha.digest()

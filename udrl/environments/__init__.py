@@ -1,0 +1,30 @@
+"""Environments: the paper's that Gymnasium lacks, and the one door to all others.
+
+Importing this package registers ``LunarLanderSparse-v3`` (section 3.4), ``Figure2-v0`` (the paper's
+toy) and ``Obedience-v0`` (obeying the command is trivial) with Gymnasium.
+"""
+
+import gymnasium as gym
+
+from udrl.environments.making import (
+    Environment,
+    EnvironmentSpec,
+    limit_steps,
+    make_environment,
+    specify,
+)
+from udrl.environments.sparse import RewardAtEnd
+
+__all__ = ["Environment", "EnvironmentSpec", "limit_steps", "make_environment", "specify"]
+
+if "LunarLanderSparse-v3" not in gym.registry:
+    gym.register(
+        "LunarLanderSparse-v3",
+        entry_point="gymnasium.envs.box2d.lunar_lander:LunarLander",
+        max_episode_steps=1000,
+        additional_wrappers=(RewardAtEnd.wrapper_spec(),),
+    )
+    gym.register("Figure2-v0", entry_point="udrl.environments.figure2:Figure2", max_episode_steps=2)
+    gym.register(
+        "Obedience-v0", entry_point="udrl.environments.obedience:Obedience", max_episode_steps=16
+    )

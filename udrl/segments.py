@@ -1,0 +1,158 @@
+"""Section 2.3.3: supervised examples from segments of the episodes in the replay buffer.
+
+An example asks: in state s_t1, what action began a behavior that earned the desired return
+sum(r[t1..t2-1]) in the desired horizon t2 - t1? The answer is a_t1. Trailing segments have t2 = T.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from udrl.config import Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Actions, Episode, action_dtype
+
+_PAGE = 64
+
+Indices = npt.NDArray[np.int64]
+Numbers = npt.NDArray[np.float64]
+
+
+class Segments(NamedTuple):
+    """Segments, one per element: episode (by rank in the buffer), t1 and t2, int64 arrays."""
+
+    rank: Indices
+    t1: Indices
+    t2: Indices
+
+
+class Examples(NamedTuple):
+    """Inputs and targets of the behavior function, one per row.
+
+    Attributes:
+        observation: s_t1, float32 [n, observation_size].
+        desired_return: float64 [n].
+        desired_horizon: int64 [n], in steps.
+        action: a_t1, uint8 or int32 [n].
+    """
+
+    observation: npt.NDArray[np.float32]
+    desired_return: Numbers
+    desired_horizon: Indices
+    action: Actions
+
+
+def draw_segments(
+    uniforms: Numbers, lengths: Indices, kind: Literal["trailing", "all"]
+) -> Segments:
+    """Turn random numbers into segments: an episode uniformly, then the times uniformly.
+
+    Args:
+        uniforms: in [0, 1), float64 [3, ...]; the third row decides t2, and trailing segments
+            ignore it.
+        lengths: T of each episode, by rank.
+        kind: ``trailing``: 0 <= t1 < T, t2 = T. ``all``: every pair 0 <= t1 < t2 <= T is as likely
+            as any other of the same episode.
+    """
+    rank = (uniforms[0] * len(lengths)).astype(np.int64)
+    length = lengths[rank]
+    if kind == "trailing":
+        return Segments(rank, (uniforms[1] * length).astype(np.int64), length)
+    # Two different times out of 0..T: the second skips the first.
+    one = (uniforms[1] * (length + 1)).astype(np.int64)
+    other = (uniforms[2] * length).astype(np.int64)
+    other += other >= one
+    return Segments(rank, np.minimum(one, other), np.maximum(one, other))
+
+
+@dataclass(frozen=True)
+class _Place:
+    slot: int
+    pages: Indices
+
+
+class Experience:
+    """The steps of the buffer's episodes in flat arrays, from which examples are gathered.
+
+    Steps lie in pages of 64, handed out and taken back as episodes come and go, so that neither
+    copies what stays. The arrays are allocated for the worst case; the operating system provides
+    memory for pages when they are first written.
+    """
+
+    def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
+        pages_per_episode = -(-spec.max_episode_steps // _PAGE)
+        n_pages = config.replay_size * pages_per_episode
+        steps = n_pages * _PAGE
+        self._observations = np.empty((steps, spec.observation_size), np.float32)
+        self._actions = np.empty(steps, action_dtype(spec.n_actions))
+        self._earned = np.empty(steps)  # P[t]: rewards earned before step t
+        self._page_table = np.zeros((config.replay_size, pages_per_episode), np.int64)
+        self._lengths = np.zeros(config.replay_size, np.int64)
+        self._returns = np.zeros(config.replay_size)
+        self._free_slots = list(range(config.replay_size))[::-1]
+        self._free_pages = list(range(n_pages))[::-1]
+        self._places: dict[int, _Place] = {}
+
+    def __contains__(self, episode_id: int) -> bool:
+        return episode_id in self._places
+
+    def ids(self) -> set[int]:
+        """Return the ids of the episodes held."""
+        return set(self._places)
+
+    def add(self, episode: Episode) -> None:
+        """Take in an episode; there must be room (remove the evicted first)."""
+        slot = self._free_slots.pop()
+        count = -(-episode.length // _PAGE)
+        pages = np.array([self._free_pages.pop() for _ in range(count)], np.int64)
+        rows = (pages[:, None] * _PAGE + np.arange(_PAGE)).reshape(-1)[: episode.length]
+        self._observations[rows] = episode.observations
+        self._actions[rows] = episode.actions
+        self._earned[rows] = episode.cumulative_rewards[:-1]
+        self._page_table[slot, :count] = pages
+        self._lengths[slot] = episode.length
+        self._returns[slot] = episode.episode_return
+        self._places[episode.command_id] = _Place(slot, pages)
+
+    def remove(self, episode_id: int) -> None:
+        """Forget an episode."""
+        place = self._places.pop(episode_id)
+        self._free_slots.append(place.slot)
+        self._free_pages.extend(place.pages.tolist())
+
+    def by_rank(self, ids: list[int]) -> "RankedExperience":
+        """Return a view in which episodes go by their rank in the buffer, given as ids."""
+        slots = np.array([self._places[i].slot for i in ids], np.int64)
+        return RankedExperience(self, slots)
+
+
+class RankedExperience:
+    """The episodes of an :class:`Experience` in the order of the buffer, least return first."""
+
+    def __init__(self, experience: Experience, slots: Indices) -> None:
+        self._experience = experience
+        self._slots = slots
+        self.lengths: Indices = experience._lengths[slots]
+
+    def examples(self, segments: Segments) -> Examples:
+        """Gather the examples that segments stand for."""
+        held = self._experience
+        slot = self._slots[segments.rank]
+        row = self._row(slot, segments.t1)
+        earned_at_t2 = held._returns[slot]
+        inner = np.flatnonzero(segments.t2 < held._lengths[slot])
+        if len(inner):
+            earned_at_t2[inner] = held._earned[self._row(slot[inner], segments.t2[inner])]
+        return Examples(
+            observation=held._observations[row],
+            desired_return=earned_at_t2 - held._earned[row],
+            desired_horizon=segments.t2 - segments.t1,
+            action=held._actions[row],
+        )
+
+    def _row(self, slot: Indices, t: Indices) -> Indices:
+        page = self._experience._page_table[slot, t // _PAGE]
+        rows: Indices = page * _PAGE + t % _PAGE
+        return rows
