@@ -42,6 +42,8 @@ MAX_FAILURES = 3
 
 _FIRST_CAPACITY = 1024
 
+_Rows = npt.NDArray[np.int64]
+
 
 class Failure(NamedTuple):
     """An episode that could not be finished, through the environment's fault."""
@@ -74,31 +76,31 @@ class EpisodeGenerator:
         self.spec: EnvironmentSpec = specify(self._envs[0], config)
         self._limits = [self.spec.max_episode_steps] * n_environments
         self._commands: list[Command | None] = [None] * n_environments
-        self._streams: list[Stream | None] = [None] * n_environments
-        self._rows = np.arange(n_environments)
-        self._running = np.zeros(n_environments, np.int64)
-        self._greedy = np.zeros(n_environments, bool)
-        self._actor_of: dict[BehaviorFunction, npt.NDArray[np.bool_]] = {}
+        self._behaviors: list[BehaviorFunction | None] = [None] * n_environments
+        self._calls: list[tuple[BehaviorFunction, _Rows]] | None = None
+        self._greedy: list[int] = []
 
-        # What the network reads, padded to whole calls. See training._Batch for why torch owns it.
+        # What the network reads in one call. See training._Batch for why torch owns it.
         rows = config.inference_rows
-        padded = -(-n_environments // rows) * rows
-        self._calls = [slice(i, i + rows) for i in range(0, padded, rows)]
-        self._observation_t = torch.zeros(padded, self.spec.observation_size)
-        self._command_t = torch.zeros(padded, 2)
-        self._observation = self._observation_t.numpy()
-        self._command = self._command_t.numpy()[:n_environments]
-        self._scales = np.array([config.return_scale, config.horizon_scale])
-        self._logits = np.zeros((padded, self.spec.n_actions))
+        self._observation_in = torch.zeros(rows, self.spec.observation_size)
+        self._command_in = torch.zeros(rows, 2)
 
-        # dr_t, dh_t, the cap on dr_t, and t of Algorithm 2.
+        # s_t, c_t = (dr_t, dh_t), c_t bounded and scaled, r_t, and the logits of P(a | s_t, c_t).
+        self._observation = np.zeros((n_environments, self.spec.observation_size), np.float32)
         self._desired = np.zeros((n_environments, 2))
-        self._cap = np.full(n_environments, np.inf)
+        self._command = np.zeros((n_environments, 2), np.float32)
         self._reward = np.zeros(n_environments, np.float32)
-        self._t = np.zeros(n_environments, np.int64)
+        self._logits = np.zeros((n_environments, self.spec.n_actions))
+        self._cap = np.full(n_environments, np.inf)
+        self._least = np.array([-np.inf, 1.0])
+        self._scales = np.array([config.return_scale, config.horizon_scale])
 
+        # A ring of rounds: round k of all environments is kept at k % capacity, until the longest
+        # running episode needs more.
+        self._round = 0
+        self._began = [0] * n_environments
         self._capacity = min(self.spec.max_episode_steps, _FIRST_CAPACITY)
-        shape = (n_environments, self._capacity)
+        shape = (self._capacity, n_environments)
         self._observations = np.zeros((*shape, self.spec.observation_size), np.float32)
         self._actions = np.zeros(shape, action_dtype(self.spec.n_actions))
         self._rewards = np.zeros(shape, np.float32)
@@ -107,7 +109,7 @@ class EpisodeGenerator:
     @property
     def free(self) -> int:
         """Episodes that could be started now."""
-        return len(self._envs) - int(self._running.sum())
+        return self._commands.count(None)
 
     @property
     def running(self) -> list[Command]:
@@ -135,46 +137,46 @@ class EpisodeGenerator:
             self._rebuild(row)
             return Failure(command, _fault("reset", command, error))
         self._commands[row] = command
-        self._running[row] = 1
-        self._greedy[row] = command.greedy
-        self._t[row] = 0
+        self._behaviors[row] = behavior
+        self._calls = None
+        if command.greedy:
+            self._greedy.append(row)
         self._desired[row] = command.desired_return, command.desired_horizon
         self._cap[row] = np.inf
         if command.kind == "evaluate" and self.spec.max_return is not None:
             self._cap[row] = self.spec.max_return
-        self._streams[row] = stream = Stream(command.stream_key)
-        self._uniforms[row] = stream.uniforms(self._capacity)
         self._logits[row] = 0.0
-        if behavior is not None:
-            mask = self._actor_of.setdefault(behavior, np.zeros(len(self._logits), bool))
-            mask[row] = True
+        self._began[row] = self._round
+        self._lay_out_uniforms(row, command)
         return None
 
     def step(self) -> list[Episode | Failure]:
         """Advance every running episode by one step and return those that ended, in any order."""
+        self._make_room()
         over: list[tuple[int, bool, bool]] = []
         failed: list[tuple[int, EnvironmentFault]] = []
-        if int(self._t.max()) >= self._capacity:
-            self._grow()
-        self._actions[self._rows, self._t] = actions = self._choose_actions()
-        self._observations[self._rows, self._t] = self._observation[: len(self._envs)]
         observation, reward, envs = self._observation, self._reward, self._envs
+        at = self._round % self._capacity
+        self._observations[at] = observation
+        self._actions[at] = actions = self._choose_actions(self._uniforms[at])
         chosen = actions.tolist()
-        for row in np.flatnonzero(self._running).tolist():
+        for row, command in enumerate(self._commands):
+            if command is None:
+                continue
             try:
                 observation[row], reward[row], terminated, truncated, _ = envs[row].step(
                     chosen[row]
                 )
             except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
-                failed.append((row, _fault("step", self._command_of(row), error)))
+                failed.append((row, _fault("step", command, error)))
                 continue
             if terminated or truncated:
                 over.append((row, bool(terminated), bool(truncated)))
-        self._rewards[self._rows, self._t] = reward
-        # Lines 8, 9 and 11 of Algorithm 2; idle rows stay as they are.
+        self._rewards[at] = reward
+        # Lines 8, 9 and 11 of Algorithm 2; nobody reads the rows of idle environments.
         self._desired[:, 0] -= reward
-        self._desired[:, 1] -= self._running
-        self._t += self._running
+        self._desired[:, 1] -= 1.0
+        self._round += 1
 
         outcomes: list[Episode | Failure] = [self._finish(*ended) for ended in over]
         for row, fault in failed:
@@ -188,38 +190,53 @@ class EpisodeGenerator:
         for env in self._envs:
             env.close()
 
-    def _choose_actions(self) -> npt.NDArray[np.int64]:
+    def _choose_actions(self, uniforms: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
         """Sample a_t ~ P(a | s_t, c_t) for every row, by inverse CDF in float64."""
+        desired, command, logits = self._desired, self._command, self._logits
         if self.spec.max_return is not None:
-            np.minimum(self._desired[:, 0], self._cap, out=self._desired[:, 0])
-        self._command[:, 0] = self._desired[:, 0] * self._scales[0]
-        self._command[:, 1] = np.maximum(self._desired[:, 1], 1.0) * self._scales[1]
+            np.minimum(desired[:, 0], self._cap, out=desired[:, 0])
+        np.multiply(
+            np.maximum(desired, self._least), self._scales, out=command, casting="same_kind"
+        )
+        if self._calls is None:
+            self._calls = self._plan_calls()
+        observation_in, command_in = self._observation_in.numpy(), self._command_in.numpy()
         with torch.inference_mode():
-            for behavior, mask in self._actor_of.items():
-                for call in self._calls:
-                    if len(self._calls) > 1 and not mask[call].any():
-                        continue
-                    logits = behavior(self._observation_t[call], self._command_t[call])
-                    np.copyto(self._logits[call], logits.numpy(), where=mask[call, None])
-        n = len(self._envs)
-        logits = self._logits[:n]
+            for behavior, rows in self._calls:
+                n = len(rows)
+                self._observation.take(rows, axis=0, out=observation_in[:n], mode="clip")
+                command.take(rows, axis=0, out=command_in[:n], mode="clip")
+                logits[rows] = behavior(self._observation_in, self._command_in).numpy()[:n]
         weights = np.exp(logits - np.maximum.reduce(logits, axis=1, keepdims=True))
         cumulative = np.add.accumulate(weights, axis=1)
-        threshold = self._uniforms[self._rows, self._t] * cumulative[:, -1]
+        threshold = uniforms * cumulative[:, -1]
         actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)
         np.minimum(actions, self.spec.n_actions - 1, out=actions)
-        if self._greedy.any():
-            actions = np.where(self._greedy, logits.argmax(axis=1), actions)
+        if self._greedy:
+            actions[self._greedy] = logits[self._greedy].argmax(axis=1)
         return actions
 
+    def _plan_calls(self) -> list[tuple[BehaviorFunction, _Rows]]:
+        """Gather the rows of each weights version into calls of at most ``inference_rows``."""
+        rows_of: dict[BehaviorFunction, list[int]] = {}
+        for row, behavior in enumerate(self._behaviors):
+            if behavior is not None:
+                rows_of.setdefault(behavior, []).append(row)
+        size = len(self._command_in)
+        return [
+            (behavior, np.array(rows[i : i + size]))
+            for behavior, rows in rows_of.items()
+            for i in range(0, len(rows), size)
+        ]
+
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
-        length = int(self._t[row])
         command = self._command_of(row)
+        places = self._places(self._began[row], self._round - self._began[row])
         episode = Episode(
             command_id=command.id,
-            observations=self._observations[row, :length].copy(),
-            actions=self._actions[row, :length].copy(),
-            rewards=self._rewards[row, :length].copy(),
+            observations=self._observations[places, row],
+            actions=self._actions[places, row],
+            rewards=self._rewards[places, row],
             terminated=terminated,
             truncated=truncated,
         )
@@ -231,13 +248,10 @@ class EpisodeGenerator:
         return episode
 
     def _release(self, row: int) -> None:
-        self._commands[row] = self._streams[row] = None
-        self._running[row] = self._t[row] = 0
-        self._reward[row] = self._desired[row] = self._observation[row] = 0.0
-        self._greedy[row] = False
-        for mask in self._actor_of.values():
-            mask[row] = False
-        self._actor_of = {b: mask for b, mask in self._actor_of.items() if mask.any()}
+        self._commands[row] = self._behaviors[row] = self._calls = None
+        if row in self._greedy:
+            self._greedy.remove(row)
+        self._reward[row] = self._desired[row] = 0.0
 
     def _rebuild(self, row: int) -> None:
         """Replace an environment that can no longer be trusted."""
@@ -246,15 +260,34 @@ class EpisodeGenerator:
         self._envs[row] = self._make(self._config)
         self._limits[row] = self.spec.max_episode_steps
 
-    def _grow(self) -> None:
-        """Make room for longer episodes: twice as many steps."""
-        for name in ("_observations", "_actions", "_rewards", "_uniforms"):
-            old = getattr(self, name)
-            setattr(self, name, np.concatenate([old, np.zeros_like(old)], axis=1))
-        for row, stream in enumerate(self._streams):
-            if stream is not None:
-                self._uniforms[row, self._capacity :] = stream.uniforms(self._capacity)
+    def _places(self, first: int, count: int) -> _Rows:
+        """Return where ``count`` rounds from ``first`` on lie in the ring."""
+        return np.arange(first, first + count) % self._capacity
+
+    def _lay_out_uniforms(self, row: int, command: Command) -> None:
+        """Put number t of the command's stream where step t of its episode will look."""
+        numbers = Stream(command.stream_key).uniforms(self._capacity)
+        self._uniforms[self._places(self._began[row], self._capacity), row] = numbers
+
+    def _make_room(self) -> None:
+        """Make the ring twice as long if an episode would overwrite its own beginning."""
+        if self._capacity >= self.spec.max_episode_steps:
+            return
+        running = [(row, c) for row, c in enumerate(self._commands) if c is not None]
+        first = self._round - self._capacity
+        if not any(self._began[row] == first for row, _ in running):
+            return
+        count = self._capacity
+        old = self._places(first, count)
         self._capacity *= 2
+        new = self._places(first, count)
+        for name in ("_observations", "_actions", "_rewards", "_uniforms"):
+            ring = getattr(self, name)
+            longer = np.zeros((self._capacity, *ring.shape[1:]), ring.dtype)
+            longer[new] = ring[old]
+            setattr(self, name, longer)
+        for row, command in running:
+            self._lay_out_uniforms(row, command)
 
     def _command_of(self, row: int) -> Command:
         command = self._commands[row]
