@@ -1,0 +1,115 @@
+"""``udrl evaluate``, ``udrl reproduce``, ``udrl status``: looking at a run."""
+
+import traceback
+from pathlib import Path
+from typing import Literal
+
+import click
+import msgspec
+
+from udrl.errors import ConfigError, EnvironmentFault
+from udrl_launch import inspection
+from udrl_launch.commands.options import RUN, RUN_DIR
+from udrl_launch.display import panel
+from udrl_proto.session import check_endpoint
+
+
+def _version(text: str) -> int | Literal["latest", "best"]:
+    if text == "latest" or text == "best":
+        return text  # type: ignore[return-value]
+    if text.isdecimal():
+        return int(text)
+    raise ConfigError(f"--weights {text}: expected latest, best or a version number")
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR)
+@click.option("--episodes", type=click.IntRange(1, 100_000), default=100, show_default=True,
+              help="Episodes to run.")  # fmt: skip
+@click.option("--greedy/--sampled", default=None,
+              help="Act by the mode of the action distribution, or sample. Default: as the run's "
+              "evaluations.")  # fmt: skip
+@click.option("--desired-return", type=float, help="Default: as in section 2.3.6.")
+@click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
+@click.option("--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
+              help="Which of the versions that the run keeps.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def evaluate(
+    run_dir: Path,
+    episodes: int,
+    greedy: bool | None,
+    desired_return: float | None,
+    desired_horizon: int | None,
+    weights: str,
+    as_json: bool,
+) -> int:
+    """Evaluate a trained agent, with the run's command or one of your own.
+
+    Example: udrl evaluate runs/mine --greedy --desired-return 200 --desired-horizon 300
+    """
+    agent = inspection.load_agent(run_dir, _version(weights))
+    result = inspection.evaluate(
+        agent, episodes=episodes, greedy=greedy, desired_return=desired_return,
+        desired_horizon=desired_horizon,
+    )  # fmt: skip
+    if as_json:
+        report = {
+            "run_dir": str(run_dir), "weights_version": agent.version, "greedy": result.greedy,
+            "desired_return": result.desired_return, "desired_horizon": result.desired_horizon,
+            **result.evaluation._asdict(), "returns": result.returns,
+        }  # fmt: skip
+        click.echo(msgspec.json.encode(report).decode())
+        return 0
+    found = result.evaluation
+    click.echo(
+        f"commanded return {result.desired_return:.1f} within {result.desired_horizon} steps, "
+        f"{'greedy' if result.greedy else 'sampled'}, weights version {agent.version}: mean return "
+        f"{found.mean:.1f} (95 % interval {found.ci95_low:.1f} to {found.ci95_high:.1f}), "
+        f"standard deviation {found.std:.1f}, {found.episodes} episodes"
+    )
+    return 0
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR)
+@click.argument("command_id", type=click.IntRange(0))
+def reproduce(run_dir: Path, command_id: int) -> int:
+    """Carry out one outstanding command of a run here, to see why it fails.
+
+    Example: udrl reproduce runs/mine 12000003
+    """
+    try:
+        episode = inspection.reproduce(run_dir, command_id)
+    except EnvironmentFault as fault:
+        traceback.print_exception(fault.__cause__)
+        raise
+    click.echo(
+        f"command {command_id} gave an episode of {episode.length} steps with return "
+        f"{episode.episode_return}; nothing was changed"
+    )
+    return 0
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR, required=False)
+@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@RUN
+def status(run_dir: Path | None, connect: str | None, as_json: bool, run_id: str | None) -> int:
+    """Say how a run is doing, by its directory or its endpoint.
+
+    Example: udrl status runs/mine
+    """
+    if (run_dir is None) == (connect is None):
+        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+    if run_dir is not None:
+        found = inspection.status_of(run_dir)
+    else:
+        found = inspection.status_at(check_endpoint(connect or ""), run_id)
+    if as_json:
+        click.echo(msgspec.json.encode(found).decode())
+    else:
+        from rich.console import Console
+
+        Console(soft_wrap=True).print(panel(found))
+    return 0

@@ -1,0 +1,147 @@
+"""``udrl replay``, ``udrl learner``, ``udrl actor``: one service each."""
+
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from udrl.errors import ConfigError, InexactArithmetic
+from udrl.numerics import STRICT_MKL
+from udrl_launch import roles
+from udrl_launch.commands.options import (
+    PARENT,
+    PATIENCE,
+    RUN,
+    RUN_DIR,
+    gather_settings,
+    new_run_dir,
+    settings_options,
+)
+from udrl_launch.process import die_with_parent, log_to_stderr, run_service
+from udrl_launch.settings import Settings
+from udrl_proto.session import check_endpoint
+from udrl_replay.creation import create, exists, resume, write_config
+
+log = logging.getLogger("udrl")
+
+
+def _as_service(parent: int | None, service: Callable[[threading.Event], None]) -> int:
+    if parent is not None:
+        die_with_parent(parent)
+    log_to_stderr()
+    return run_service(service)
+
+
+@click.command()
+@click.argument("env")
+@settings_options
+@click.option(
+    "--listen", metavar="ENDPOINT", help="Host the run's Zenoh endpoint, e.g. tcp/127.0.0.1:7447."
+)
+@click.option("--connect", metavar="ENDPOINT", help="Use the router at this endpoint instead.")
+@click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
+@click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
+@click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@PARENT
+def replay(
+    env: str,
+    listen: str | None,
+    connect: str | None,
+    run_dir: Path | None,
+    resume: bool,
+    insecure: bool,
+    allow_inexact: bool,
+    parent: int | None,
+    **given: Any,
+) -> int:
+    """Start the replay service of a run: the only store, and its Zenoh endpoint.
+
+    Example: udrl replay LunarLander-v3 --listen tcp/127.0.0.1:7447 --run-dir runs/mine
+    """
+    if (listen is None) == (connect is None):
+        raise ConfigError("give either --listen ENDPOINT or --connect ENDPOINT")
+    check_endpoint(listen or connect or "")
+    settings = gather_settings(env, given, run_dir, go_on=resume)
+    run_dir = run_dir or new_run_dir(settings)
+
+    def service(stop: threading.Event) -> None:
+        log.info("the run's directory is %s", run_dir)
+        store = _open(run_dir, settings, go_on=resume, allow_inexact=allow_inexact)
+        roles.replay(
+            run_dir, store, settings.budget, stop, listen=listen, connect=connect, insecure=insecure
+        )
+
+    return _as_service(parent, service)
+
+
+def _open(run_dir: Path, settings: Settings, *, go_on: bool, allow_inexact: bool) -> Any:
+    if go_on and exists(run_dir):
+        store = resume(run_dir, settings.config, allow_inexact=allow_inexact)
+    else:
+        store = create(run_dir, settings.config, allow_inexact=allow_inexact)
+    write_config(run_dir, settings.config, settings.budget)
+    return store
+
+
+@click.command()
+@click.option(
+    "--connect",
+    metavar="ENDPOINT",
+    required=True,
+    help="Where the run is, e.g. tcp/127.0.0.1:7447.",
+)
+@PATIENCE
+@RUN
+@PARENT
+def learner(connect: str, patience: float, run_id: str | None, parent: int | None) -> int:
+    """Start the learner of a run.
+
+    Example: udrl learner --connect tcp/127.0.0.1:7447
+    """
+    address = roles.Address(check_endpoint(connect), run_id, patience)
+    return _as_service(parent, partial(roles.learner, address))
+
+
+@click.command()
+@click.option(
+    "--connect",
+    metavar="ENDPOINT",
+    required=True,
+    help="Where the run is, e.g. tcp/127.0.0.1:7447.",
+)
+@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True,
+              help="Environments to step at once.")  # fmt: skip
+@click.option("--nice", type=click.IntRange(0, 19), default=0, help="Yield to other processes.")
+@click.option("--hang-timeout", type=click.FloatRange(1), default=60.0, show_default=True,
+              help="Seconds of one round of steps after which the process ends.")  # fmt: skip
+@PATIENCE
+@RUN
+@PARENT
+def actor(
+    connect: str,
+    envs: int,
+    nice: int,
+    hang_timeout: float,
+    patience: float,
+    run_id: str | None,
+    parent: int | None,
+) -> int:
+    """Start an actor; the run tells it everything else.
+
+    Example: udrl actor --connect tcp/127.0.0.1:7447 --envs 16
+    """
+    os.nice(nice)
+    address = roles.Address(check_endpoint(connect), run_id, patience)
+    code = _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))
+    if code == InexactArithmetic.exit_code and not STRICT_MKL.items() <= os.environ.items():
+        log.warning("starting again with slower arithmetic that is exact")
+        command = [sys.executable, "-m", "udrl_launch", *sys.argv[1:]]
+        os.execve(sys.executable, command, os.environ | STRICT_MKL)  # noqa: S606 - ourselves
+    return code

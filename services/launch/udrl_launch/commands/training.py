@@ -1,0 +1,111 @@
+"""``udrl train``."""
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch import inspection
+from udrl_launch.commands.options import RUN_DIR, gather_settings, new_run_dir, settings_options
+from udrl_launch.curve import draw
+from udrl_launch.display import Display
+from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.settings import Settings
+from udrl_launch.training import train as run_training
+from udrl_proto.messages import Status
+
+log = logging.getLogger("udrl")
+
+
+@click.command()
+@click.argument("env")
+@settings_options
+@click.option("--actors", type=int, help="Actor processes on this machine.")
+@click.option("--envs-per-actor", type=int, help="Environments that each actor steps at once.")
+@click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
+@click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
+@click.option("--in-process", is_flag=True, help="All services in one process.")
+@click.option(
+    "--listen",
+    metavar="ENDPOINT",
+    help="Endpoint, e.g. tcp/127.0.0.1:7447. Default: a free loopback port.",
+)
+@click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="End with the final status as a line of JSON."
+)
+def train(
+    env: str,
+    run_dir: Path | None,
+    resume: bool,
+    in_process: bool,
+    listen: str | None,
+    insecure: bool,
+    allow_inexact: bool,
+    as_json: bool,
+    **given: Any,
+) -> int:
+    """Train an agent on this machine: replay, learner and actors.
+
+    Example: udrl train LunarLander-v3 --max-env-steps 2000000 --seed 7
+    """
+    if resume and run_dir is None:
+        raise ConfigError("--resume needs --run-dir: the directory of the run to go on with")
+    settings = gather_settings(env, given, run_dir, go_on=resume)
+    run_dir = run_dir or new_run_dir(settings)
+    log_to_stderr(logging.WARNING)
+    _warn_of_idle_actors(settings)
+
+    def service(stop: threading.Event) -> None:
+        with Display() as display:
+            status = run_training(
+                settings, run_dir, stop, go_on=resume, in_process=in_process,
+                allow_inexact=allow_inexact, listen=listen, insecure=insecure, display=display,
+            )  # fmt: skip
+        _finish(run_dir, status)
+        if as_json:
+            click.echo(msgspec.json.encode(status).decode())
+        if status.problem:
+            raise UdrlError(status.problem)
+
+    return run_service(service)
+
+
+def _warn_of_idle_actors(settings: Settings) -> None:
+    config, _, fleet = settings
+    useful = config.n_episodes_per_iter * (config.lead + 1)
+    environments = fleet.actors * fleet.envs_per_actor
+    if environments > 2 * useful:
+        log.warning(
+            "%d environments, but at most %d episodes can run at once (n_episodes_per_iter x "
+            "(lead + 1)); the others will be idle",
+            environments, useful,
+        )  # fmt: skip
+
+
+def _finish(run_dir: Path, status: Status) -> None:
+    """Write the weights and the picture, and say where everything is."""
+    closing = status.closing_evaluation
+    if closing is not None:
+        click.echo(
+            f"final evaluation: mean return {closing.mean:.1f} "
+            f"(95 % interval {closing.ci95_low:.1f} to {closing.ci95_high:.1f}, "
+            f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
+            f"{status.wall_s:.0f} s"
+        )
+    if status.weights_version:
+        weights = run_dir / "weights.safetensors"
+        weights.write_bytes(inspection.load_agent(run_dir).weights)
+        click.echo(f"weights:        {weights} (version {status.weights_version})")
+    else:
+        click.echo("weights:        none; the budget was spent in the warm-up")
+    click.echo(f"metrics:        {run_dir / 'metrics.csv'}")
+    try:
+        click.echo(f"learning curve: {draw(run_dir, status.environment)}")
+    except ConfigError as error:
+        click.echo(f"learning curve: {error}")
