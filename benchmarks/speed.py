@@ -1,8 +1,8 @@
 """The whole system's env steps per second beside the limit that its parts set.
 
-One training run with the shipped preset is measured in steady state, evaluation steps counted too.
-Then its parts are timed alone, on the same machine: a bare environment step (replaying actions that
-the run recorded), a row of batched inference, an update. From these::
+One training run with the shipped preset, budget included, is measured from the end of its warm-up on,
+evaluation steps counted too. Then its parts are timed alone, on the same machine: a bare environment
+step (replaying actions that the run recorded), a row of batched inference, an update. From these::
 
     limit = cores / (step + inference + update x updates per env step)
 
@@ -48,7 +48,7 @@ _TICK = os.sysconf("SC_CLK_TCK")
 
 
 class Window(NamedTuple):
-    """What happened in the steady part of a run."""
+    """What happened in a part of a run."""
 
     seconds: float
     steps: int
@@ -67,11 +67,11 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="LunarLander-v3")
-    parser.add_argument("--max-env-steps", type=int, default=1_000_000)
+    parser.add_argument("--max-env-steps", type=int, help="default: the preset's budget")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--lead", type=int)
-    parser.add_argument("--actors", type=int, default=2)
-    parser.add_argument("--envs-per-actor", type=int, default=16)
+    parser.add_argument("--actors", type=int)
+    parser.add_argument("--envs-per-actor", type=int)
     options = parser.parse_args()
     use_one_thread()
     print(f"machine: {_machine()}")
@@ -132,12 +132,12 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
 def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], float]:
     """Train; return the last live status and the CPU seconds that the replay service used."""
     command = [
-        sys.executable, "-m", "udrl_launch", "train", options.env, "--run-dir", str(run_dir),
-        "--max-env-steps", str(options.max_env_steps), "--actors", str(options.actors),
-        "--envs-per-actor", str(options.envs_per_actor), "--json",
+        sys.executable, "-m", "udrl_launch", "train", options.env,
+        "--run-dir", str(run_dir), "--json",
     ]  # fmt: skip
-    if options.lead is not None:
-        command += ["--lead", str(options.lead)]
+    for name in ("max_env_steps", "lead", "actors", "envs_per_actor"):
+        if (value := getattr(options, name)) is not None:
+            command += [f"--{name.replace('_', '-')}", str(value)]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
@@ -164,16 +164,13 @@ def _cpu_of_replay(run_dir: Path) -> float:
 
 
 def _window(run_dir: Path) -> Window:
-    """Return the second half of the run."""
+    """Return the run after its warm-up."""
     lines = (run_dir / "metrics.csv").read_text().splitlines()
     names = lines[0].split(",")
     rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
     total = [int(r["env_steps"]) + int(r["eval_env_steps"]) for r in rows]
-    first = next(i for i, t in enumerate(total) if t >= total[-1] / 2)
     return Window(
-        float(rows[-1]["wall_s"]) - float(rows[first]["wall_s"]),
-        total[-1] - total[first],
-        len(rows) - 1 - first,
+        float(rows[-1]["wall_s"]) - float(rows[0]["wall_s"]), total[-1] - total[0], len(rows) - 1
     )
 
 

@@ -53,14 +53,17 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         config.segments,
     )
     batch = _Batch(config, state.behavior)
+    parameters = list(state.behavior.parameters())
     losses = torch.zeros((), dtype=torch.float64)
+    one = torch.ones(())
     for rank, t1, t2 in zip(*segments, strict=True):
         batch.fill(experience, Segments(rank, t1, t2))
         loss = functional.cross_entropy(
             state.behavior(batch.observation, batch.command), batch.action
         )
-        state.optimizer.zero_grad()
-        loss.backward()
+        for parameter in parameters:
+            parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
+        loss.backward(one)
         state.optimizer.step()
         losses += loss.detach()
     state.version = version

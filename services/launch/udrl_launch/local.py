@@ -57,7 +57,7 @@ class Processes:
         for number in range(1, fleet.actors + 1):
             start(
                 f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
-                "--nice", "5", "--patience", _PATIENCE_S,
+                "--nice", "10", "--patience", _PATIENCE_S,
             )  # fmt: skip
 
     @property

@@ -54,7 +54,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                start_new_session=True,  # a Ctrl-C at the terminal is the parent's to handle
+                process_group=0,  # a Ctrl-C at the terminal is the parent's to handle
             )
 
     def last_words(self) -> str:
