@@ -1,8 +1,9 @@
 """The whole system's env steps per second beside the limit that its parts set.
 
-One training run with the shipped preset, budget included, is measured from the end of its warm-up on,
-evaluation steps counted too. Then its parts are timed alone, on the same machine: a bare environment
-step (replaying actions that the run recorded), a row of batched inference, an update. From these::
+One training run with the shipped preset, budget included, is measured from the end of its warm-up
+on, evaluation steps counted too. Then its parts are timed alone, on the same machine: a bare
+environment step (replaying actions that the run recorded), a row of batched inference, an update.
+From these::
 
     limit = cores / (step + inference + update x updates per env step)
 

@@ -55,7 +55,7 @@ def train(
         Interrupted: ``stop`` was set.
     """
     config, budget, _ = settings
-    endpoint = sessions.check_endpoint(listen) if listen else f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = sessions.check_endpoint(listen) if listen else f"tcp/127.0.0.1:{free_port()}"
     if go_on and exists(run_dir):
         store = resume(run_dir, config, allow_inexact=allow_inexact)
     else:
@@ -112,7 +112,8 @@ class _GiveUp(threading.Event):
         return self._stop_event.wait(timeout) or self.is_set()
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of the loopback interface that nobody listens on now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
