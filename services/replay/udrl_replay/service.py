@@ -237,6 +237,7 @@ class ReplayService:
         peer = presence.role, presence.name
         if presence.here:
             self._here.add(peer)
+            log.info("%s %s is here", *peer)
         else:
             self._here.discard(peer)
             self._waits.end(f"{presence.role} {presence.name}")
