@@ -32,7 +32,11 @@ from udrl_launch.settings import Settings, gather
 from udrl_proto.messages import Status
 
 _HERE = Path(__file__).parent
+#: ``--hang-timeout`` where environments hang; elsewhere it must not notice a stopped actor.
 _HANG_S = 4.0
+_NEVER_S = 60.0
+#: Seconds after a disturbance in which it is noticed, if ever.
+_NOTICED_S = 4.0
 _OPTIONS: dict[str, dict[str, Any]] = {
     # Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
     "CartPole-v1": {
@@ -123,7 +127,7 @@ def _settings(options: argparse.Namespace, environment: str | None) -> Settings:
 
 def _undisturbed(options: argparse.Namespace, run_dir: Path) -> tuple[Status, float]:
     began = time.monotonic()
-    run = DisturbedRun(_settings(options, None), run_dir, options.limit, _HANG_S)
+    run = DisturbedRun(_settings(options, None), run_dir, options.limit, _NEVER_S)
     with run.going():
         failure = run.failure()
     if failure is not None:
@@ -137,7 +141,8 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     os.environ[SLOW_ONE] = str(folder / f"{name}.slow")
     chance = random.Random(f"{options.seed}-{fault.name}")  # noqa: S311
     began = time.monotonic()
-    run = DisturbedRun(_settings(options, fault.environment), folder / name, options.limit, _HANG_S)
+    hang_s = _HANG_S if "Hanging" in str(fault.environment) else _NEVER_S
+    run = DisturbedRun(_settings(options, fault.environment), folder / name, options.limit, hang_s)
     spans: list[tuple[float, float]] = []
     failure: RunFailed | None = None
     remarks: list[str] = []
@@ -212,18 +217,16 @@ def _heal_and_finish(run: DisturbedRun, options: argparse.Namespace) -> None:
 def _measure(run: DisturbedRun, fault: Fault, start: float, end: float) -> Injection:
     """Find in the logs and observations what followed a disturbance."""
     found = Injection()
-    gone = "|".join(role for role in fault.lose if role != "replay")
-    pattern = rf"^({gone}) \S+ left" if gone else "has been waiting|waiting for a replay service"
-    if fault.lose and (lines := run.lines(pattern, start)):
+    gone = "actor|learner" if "replay" in fault.lose else "|".join(fault.lose)
+    waits = "has been waiting|waiting for a replay service"
+    pattern = waits if "replay" in fault.lose else rf"^({gone}) \S+ left"
+    lines = [x for x in run.lines(pattern, start) if x.at < end + _NOTICED_S]
+    if fault.lose and lines:
         found.detected, found.reported_by = lines[0].at - start, lines[0].service.split("-")[0]
-    if "replay" in fault.lose:
-        gone = "actor|learner"
-    peers = len(run.children(*gone.split("|"))) if fault.name != "kill actor" else 1
+    peers = 1 if fault.name in ("kill actor", "stop actor") else len(run.children(*gone.split("|")))
     back = run.lines(rf"^({gone}) \S+ is here", end) if gone else []
-    if back and fault.name != "stop actor":
+    if back:
         found.reconnected = back[min(peers, len(back)) - 1].at - end
-    elif back:
-        found.reconnected = back[0].at - end
     before = [m for m in run.moments if m.at <= end]
     after = [m for m in run.moments if m.at > end]
     if before and after:
