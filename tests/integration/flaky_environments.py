@@ -1,5 +1,6 @@
 """Environments that fail, importable as ``flaky_environments:Flaky-v0`` and so on."""
 
+import ctypes
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -33,7 +34,16 @@ class Cursed(CartPoleEnv):
         return super().reset(seed=seed, options=options)
 
 
-for environment in (Flaky, Cursed):
+class Hung(CartPoleEnv):
+    """CartPole that hangs in native code, with Python's lock, when it starts from a few states."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None and seed > 1_000_100 and seed % 7 == 0:
+            ctypes.PyDLL(None).sleep(3600)
+        return super().reset(seed=seed, options=options)
+
+
+for environment in (Flaky, Cursed, Hung):
     name = f"{environment.__name__}-v0"
     if name not in gym.registry:
         gym.register(

@@ -5,7 +5,9 @@ a function of the version before and of the buffer. Whatever a run does wrong sh
 """
 
 import hashlib
+import sqlite3
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +28,8 @@ from udrl_replay.arrival import Arrival, inspect
 from udrl_replay.run import Progress, Run
 from udrl_replay.store import Store, Version
 
+#: Several pages of a file.
+BLOB = bytes(range(256)) * 40
 SPEC = EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=4)
 
 
@@ -202,3 +206,8 @@ def reopen(run: Run, run_dir: Path, budget: Budget | None = None) -> Run:
     """End a replay service and start another on the same file."""
     run.store.close()
     return Run(Store(run_dir), budget or run.budget)
+
+
+def edit(path: Path, statement: str, *values: object) -> None:
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute(statement, values)

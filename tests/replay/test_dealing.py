@@ -141,7 +141,8 @@ def test_running_command_that_is_not_outstanding_is_ignored(dealer: Dealer) -> N
 def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     ask(dealer, "b", wanted=0, now=SILENCE_S)
-    dealer.forget_silent(set(), SILENCE_S + 1)
+    assert dealer.silent(set(), SILENCE_S + 1) == ["a"]
+    dealer.leave("a")
     assert list(dealer.actors) == ["b"]
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
 
@@ -149,14 +150,13 @@ def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
 def test_actor_that_delivers_is_not_silent(dealer: Dealer) -> None:
     for name in ("a", "b", "stranger"):
         dealer.hear(name, SILENCE_S)
-    dealer.forget_silent(set(), SILENCE_S + 1)
+    assert dealer.silent(set(), SILENCE_S + 1) == []
     assert list(dealer.actors) == ["a", "b"]
 
 
 def test_silent_actor_whose_token_is_alive_is_not_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
-    dealer.forget_silent({"a"}, SILENCE_S + 1)
-    assert "a" in dealer.actors
+    assert dealer.silent({"a"}, SILENCE_S + 1) == ["b"]
 
 
 # Stragglers.
@@ -224,7 +224,8 @@ def test_straggler_whose_second_actor_dies_stays_with_the_first(straggling: Deal
 
 def fail(dealer: Dealer, name: str) -> bool:
     ask(dealer, name, wanted=0, running=ids(0))
-    return dealer.fail(ids(0)[0], name)
+    dealer.fail(ids(0)[0], name)
+    return dealer.is_hopeless(ids(0)[0])
 
 
 def test_three_failures_on_two_actors_are_hopeless(dealer: Dealer) -> None:
@@ -246,6 +247,109 @@ def test_failed_command_is_dealt_again(dealer: Dealer) -> None:
     dealer.fail(ids(0)[0], "a")
     assert not dealer.holds("a", ids(0)[0])
     assert ask(dealer, "b", wanted=1) == ids(0)
+
+
+# Actors that vanish with what they hold.
+
+
+@pytest.fixture
+def alone() -> Dealer:
+    """Three commands, of which the first was held by three actors that vanished."""
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(3))
+    for name in ("x", "y", "z"):
+        dealer.join(join(name), 0.0)
+        assert ask(dealer, name) == ids(0, 1, 2)
+        assert [item.command.id for item in dealer.leave(name)] == ids(0, 1, 2)
+    for command_id in ids(1, 2):
+        dealer.remove(command_id)
+    dealer.add(command(index) for index in range(3, 6))
+    return dealer
+
+
+def vanish(dealer: Dealer, name: str) -> bool:
+    """Let an actor die of the first command; say whether that makes it hopeless."""
+    dealer.join(join(name), 0.0)
+    assert ask(dealer, name) == ids(0)
+    dealer.leave(name)
+    return dealer.is_hopeless(ids(0)[0])
+
+
+def test_command_of_three_vanished_actors_is_carried_out_alone(alone: Dealer) -> None:
+    for name in ("a", "b"):
+        alone.join(join(name), 0.0)
+    assert ask(alone, "a") == ids(0)
+    assert ask(alone, "a", running=ids(0)) == []
+    assert ask(alone, "b") == ids(3, 4)
+
+
+def test_command_of_three_vanished_actors_waits_for_an_actor_without_work(alone: Dealer) -> None:
+    alone.join(join("a"), 0.0)
+    alone.add([command(7)])
+    assert ask(alone, "a", running=ids(7)) == ids(3, 4, 5)
+    assert ask(alone, "a", running=ids(7, 3, 4, 5)) == []
+    assert ask(alone, "a") == ids(0)
+
+
+def test_command_of_three_vanished_actors_waits_for_its_weights(alone: Dealer) -> None:
+    alone.join(join("a"), 0.0)
+    assert ask(alone, "a", version=0) == []
+
+
+def test_commands_that_are_carried_out_alone_and_succeed_are_done(dealer: Dealer) -> None:
+    dealer.leave("b")
+    for name in ("a", "c", "d"):
+        dealer.join(join(name), 0.0)
+        held = ask(dealer, name)
+        dealer.leave(name)
+    dealer.join(join("e"), 0.0)
+    for command_id in held:
+        assert ask(dealer, "e") == [command_id]
+        dealer.remove(command_id, 1.0)
+    assert not dealer.outstanding
+
+
+def test_three_actors_that_vanish_with_nothing_else_are_hopeless(alone: Dealer) -> None:
+    assert [vanish(alone, name) for name in "abc"] == [False, False, True]
+
+
+def test_vanished_actors_and_reported_failures_count_together(alone: Dealer) -> None:
+    assert [vanish(alone, name) for name in "ab"] == [False, False]
+    alone.join(join("c"), 0.0)
+    assert ask(alone, "c") == ids(0)
+    alone.fail(ids(0)[0], "c")
+    assert alone.is_hopeless(ids(0)[0])
+
+
+def test_actors_of_one_environment_are_given_three_more_tries() -> None:
+    dealer = Dealer()
+    dealer.add([command(0)])
+    assert [vanish(dealer, name) for name in "abcdef"] == [False] * 5 + [True]
+
+
+def test_actor_that_was_only_cut_off_has_not_vanished(alone: Dealer) -> None:
+    for _ in range(10):
+        assert vanish(alone, "a") is False
+        alone.join(join("a"), 0.0)
+        assert ask(alone, "a", running=ids(0)) == []
+    assert alone.outstanding[ids(0)[0]].vanished.keys() == {"x", "y", "z"}
+
+
+def test_neighbours_of_a_deadly_command_are_never_blamed() -> None:
+    """One of eight commands ends every actor that begins it; the others always succeed."""
+    dealer = Dealer()
+    dealer.add(command(index) for index in range(8))
+    (deadly,) = ids(5)
+    for number in range(100):
+        dealer.join(join(f"actor-{number}"), 0.0)
+        while deadly not in (held := ask(dealer, f"actor-{number}", wanted=4)):
+            for command_id in held:
+                dealer.remove(command_id, 1.0)
+        dealer.leave(f"actor-{number}")
+        if any(dealer.is_hopeless(i) for i in dealer.outstanding):
+            break
+    assert dealer.is_hopeless(deadly)
+    assert number < 6
 
 
 # Waiting.

@@ -1,5 +1,6 @@
 """Looking at a run from outside: its status, its weights, its learning curve."""
 
+import faulthandler
 import json
 import logging
 import os
@@ -31,6 +32,8 @@ from udrl_replay.store import Store
 log = logging.getLogger("udrl")
 
 _ANSWER_S = 3.0
+#: Seconds after which a command that is reproduced shows where it is, again and again.
+_SHOW_S = 60.0
 
 
 def status_at(endpoint: str, run_id: str | None) -> Status:
@@ -138,7 +141,11 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
     version = command.weights_version
     behavior = load_agent(run_dir, version).behavior if version else None
     use_one_thread()
-    return generate_episodes(EpisodeGenerator(config, 1), [command], behavior)[0]
+    faulthandler.dump_traceback_later(_SHOW_S, repeat=True)  # it may hang, in native code too
+    try:
+        return generate_episodes(EpisodeGenerator(config, 1), [command], behavior)[0]
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 class Result(NamedTuple):

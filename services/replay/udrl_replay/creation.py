@@ -13,7 +13,7 @@ import msgspec
 import udrl
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
-from udrl.errors import OtherConfiguration
+from udrl.errors import OtherConfiguration, StoreError
 from udrl.numerics import environment_replays
 from udrl_proto import PROTOCOL
 from udrl_proto.messages import Hello
@@ -102,13 +102,27 @@ def _closed_on_error(store: Store) -> Iterator[None]:
 
 
 def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
-    """Write the effective configuration, as TOML that ``--config`` reads."""
+    """Write the effective configuration, as TOML that ``--config`` reads.
+
+    Raises:
+        StoreError: it cannot be written; a file that was there before is still there.
+    """
     lines = []
     for settings in (config, budget):
         for name, value in msgspec.to_builtins(settings).items():
             if value is not None and value != {}:
                 lines.append(f"{name} = {_toml(value)}")
-    (run_dir / "config.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path = run_dir / "config.toml"
+    unfinished = path.with_suffix(".new")
+    try:
+        # Aside and renamed: it holds the budget, which a full disk must not take.
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        unfinished.replace(path)
+    except OSError as error:
+        raise StoreError(
+            f"{path} cannot be written: {error}; free some disk space, or name a directory that "
+            f"you may write"
+        ) from error
 
 
 def _toml(value: object) -> str:

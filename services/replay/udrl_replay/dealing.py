@@ -2,6 +2,10 @@
 
 All of this is memory. An actor says with every request what it holds, so that a replay service that
 was restarted knows after one round.
+
+An environment that hangs or crashes takes its actor along, and nobody reports which of the actor's
+commands did it. So a command that several actors held when they vanished is carried out alone: an
+actor that vanishes then has told which one it was, and that counts as a failure.
 """
 
 import heapq
@@ -21,6 +25,8 @@ STRAGGLER = 3.0
 MAX_DEALT = 4096
 #: Seconds after which an actor without a liveliness token that says nothing is forgotten.
 SILENCE_S = 30.0
+#: Actors that vanished while they held a command, after which it is carried out alone.
+SUSPICIOUS = 3
 
 
 @dataclass
@@ -30,11 +36,19 @@ class Outstanding:
     Attributes:
         holders: actors that it was dealt to, and when.
         failures: the actors that could not carry it out, one entry a failure.
+        vanished: actors that were gone while they held it, and whether that was while it was
+            carried out alone.
     """
 
     command: Command
     holders: dict[str, float] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
+    vanished: dict[str, bool] = field(default_factory=dict)
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether it must be carried out alone, because too many actors vanished with it."""
+        return len(self.vanished) >= SUSPICIOUS
 
 
 @dataclass
@@ -95,19 +109,26 @@ class Dealer:
         asked = CommandsRequest(actor=request.id, wanted=0)
         self.actors[request.id] = Actor(request, now, asked)
 
-    def leave(self, name: str) -> None:
-        """Forget an actor; what it held goes to others."""
+    def leave(self, name: str) -> list[Outstanding]:
+        """Forget an actor and return what it held, which goes to others."""
         actor = self.actors.pop(name, None)
-        if actor is not None:
-            for command_id in actor.holds:
-                self._put_back(command_id, name)
+        held = [] if actor is None else [self.outstanding[i] for i in sorted(actor.holds)]
+        for item in held:
+            item.vanished[name] = len(held) == 1 and item.is_suspect
+            self._put_back(item.command.id, name)
+        return held
 
-    def forget_silent(self, here: Container[str], now: float) -> None:
-        """Forget actors that have said nothing for long, except those that are ``here``."""
-        silent = [n for n, a in self.actors.items() if now - a.last_seen > SILENCE_S]
-        for name in silent:
-            if name not in here:
-                self.leave(name)
+    def silent(self, here: Container[str], now: float) -> list[str]:
+        """Return actors that have said nothing for long, except those that are ``here``."""
+        quiet = [n for n, a in self.actors.items() if now - a.last_seen > SILENCE_S]
+        return [name for name in quiet if name not in here]
+
+    def is_hopeless(self, command_id: int) -> bool:
+        """Say whether a command failed so often that nobody can carry it out: the run must stop."""
+        item = self.outstanding[command_id]
+        failures = [*item.failures, *(name for name, alone in item.vanished.items() if alone)]
+        on_two = len(set(failures)) >= min(2, len(self.actors))
+        return len(failures) >= MAX_FAILURES and on_two
 
     def _put_back(self, command_id: int, name: str) -> None:
         item = self.outstanding.get(command_id)
@@ -123,7 +144,14 @@ class Dealer:
             self._put_back(lost, request.actor)
         for known in running - actor.holds:
             self.outstanding[known].holders.setdefault(request.actor, now)
+            self.outstanding[known].vanished.pop(request.actor, None)  # it was only cut off
         actor.holds = running
+        if any(self.outstanding[i].is_suspect for i in running):
+            return []
+        if request.wanted and not running:
+            suspect = self._suspect(latest_version)
+            if suspect is not None:
+                return [self._give(suspect, actor, now)]
 
         in_play = sum(n for v, n in self._of_version.items() if v <= latest_version)
         share = math.ceil(in_play / len(self.actors)) - len(running)
@@ -133,11 +161,17 @@ class Dealer:
             if item is not None and item.command.weights_version > latest_version:
                 break
             heapq.heappop(self._undealt)
-            if item is not None and not item.holders:
+            if item is not None and not item.holders and not item.is_suspect:
                 dealt.append(self._give(item, actor, now))
         if not dealt and request.wanted and not running and request.spare_cores >= 1:
             dealt.extend(self._straggler(actor, latest_version, now))
         return dealt
+
+    def _suspect(self, latest_version: int) -> Outstanding | None:
+        """Return a command to be carried out alone."""
+        suspects = (i for i in self.outstanding.values() if i.is_suspect and not i.holders)
+        ready = (i for i in suspects if i.command.weights_version <= latest_version)
+        return next(ready, None)
 
     def _give(self, item: Outstanding, actor: Actor, now: float) -> Command:
         item.holders[actor.join.id] = now
@@ -166,15 +200,13 @@ class Dealer:
         if name in self.actors:
             self.actors[name].last_seen = now
 
-    def fail(self, command_id: int, name: str) -> bool:
-        """Note an actor's failure; say whether the command is hopeless and the run has to stop."""
+    def fail(self, command_id: int, name: str) -> None:
+        """Note that an actor could not carry out a command."""
         item = self.outstanding[command_id]
         item.failures.append(name)
         if name in self.actors:
             self.actors[name].holds.discard(command_id)
         self._put_back(command_id, name)
-        on_two = len(set(item.failures)) >= min(2, len(self.actors))
-        return len(item.failures) >= MAX_FAILURES and on_two
 
     def retry_after_s(self) -> float:
         """Return when to ask again: later in a larger fleet, and not all at once."""

@@ -3,6 +3,7 @@
 import csv
 import math
 from collections import deque
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from udrl.digests import replay_digest
@@ -35,21 +36,24 @@ class MetricsFile:
         self._path = run_dir / "metrics.csv"
         self._store = store
         self._written = -1
-        self._path.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
+        self._write("w", [COLUMNS])
 
     def update(self, iteration: int) -> None:
         """Append the lines of all iterations up to one."""
         if iteration <= self._written:
             return
+        self._write("a", self._store.metrics(self._written))
+        self._written = iteration
+
+    def _write(self, mode: str, rows: Iterable[Sequence[object]]) -> None:
         try:
-            with self._path.open("a", newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerows(self._store.metrics(self._written))
+            with self._path.open(mode, newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
         except OSError as error:
             raise StoreError(
                 f"{self._path} cannot be written: {error}; free some disk space and start again "
                 f"with --resume; nothing is lost"
             ) from error
-        self._written = iteration
 
 
 class Throughput:

@@ -20,7 +20,7 @@ from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import FailureMessage, Hello
 from udrl_replay.arrival import Arrival
-from udrl_replay.dealing import Dealer
+from udrl_replay.dealing import SUSPICIOUS, Dealer
 from udrl_replay.store import EvaluationRow, Store, Version
 
 log = logging.getLogger("udrl")
@@ -181,13 +181,33 @@ class Run:
             return  # said again, or by an actor whose commands have gone to others
         self.progress.env_failures += 1
         log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, failure.error)
-        if self.dealer.fail(failure.command_id, failure.actor):
-            self.progress.state = "failed"
-            self.progress.problem = (
-                f"command {failure.command_id} failed three times: {failure.error}; reproduce it "
-                f"with: udrl reproduce RUN_DIR {failure.command_id}"
+        self.dealer.fail(failure.command_id, failure.actor)
+        if self.dealer.is_hopeless(failure.command_id):
+            self._give_up(
+                failure.command_id,
+                f"command {failure.command_id} failed three times: {failure.error}",
             )
-            log.error("%s", RunFailed(self.progress.problem))
+
+    def lose(self, actor: str) -> None:
+        """Note that an actor is gone, perhaps through a command that it held."""
+        for item in self.dealer.leave(actor):
+            command_id = item.command.id
+            if len(item.vanished) == SUSPICIOUS:
+                log.warning(
+                    "command %d was held by %d actors that vanished and is now carried out alone",
+                    command_id, SUSPICIOUS,
+                )  # fmt: skip
+            if self.dealer.is_hopeless(command_id):
+                self._give_up(
+                    command_id,
+                    f"command {command_id} ended three actors that carried out nothing else: its "
+                    f"environment hangs or crashes",
+                )
+
+    def _give_up(self, command_id: int, why: str) -> None:
+        self.progress.state = "failed"
+        self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
+        log.error("%s", RunFailed(self.progress.problem))
 
     # Iterations.
 

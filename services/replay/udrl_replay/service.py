@@ -135,20 +135,24 @@ class ReplayService:
             *serve(self._session, run_id, self._verbs(), self._inbox),
         ]
         log.info("replay serves run %s", run_id)
-        ended_at: float | None = None
         try:
-            while not stop.is_set():
-                self._answer(self._next_group())
-                now = time.monotonic()
-                if self.run.progress.state in ("ended", "failed"):
-                    ended_at = ended_at or now
-                    if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
-                        return
+            self._answer_until_ended(stop)
+            # Only here: after an error, what is in memory may be ahead of what is on disk.
+            with self._store.transaction():
+                self.run.save()
         finally:
             for declaration in declared:
                 declaration.undeclare()
-            with self._store.transaction():
-                self.run.save()
+
+    def _answer_until_ended(self, stop: threading.Event) -> None:
+        ended_at: float | None = None
+        while not stop.is_set():
+            self._answer(self._next_group())
+            now = time.monotonic()
+            if self.run.progress.state in ("ended", "failed"):
+                ended_at = ended_at or now
+                if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
+                    return
 
     def _verbs(self) -> dict[str, Verb]:
         config, spec = self.run.config, self.run.hello.environment
@@ -200,11 +204,13 @@ class ReplayService:
         run = self.run
         before = run.progress.iteration
         answers: list[tuple[Question, Message]] = []
-        run.dealer.forget_silent({name for _, name in self._here}, now)
-        if not group:
+        silent = run.dealer.silent({name for _, name in self._here}, now)
+        if not group and not silent:
             return
         with self._store.transaction():
             snapshot = msgspec.json.encode(run.progress)
+            for name in silent:
+                run.lose(name)
             for item in group:
                 if isinstance(item, _Presence):
                     self._note_presence(item, now)
@@ -237,11 +243,12 @@ class ReplayService:
         peer = presence.role, presence.name
         if presence.here:
             self._here.add(peer)
+            log.info("%s %s is here", *peer)
         else:
             self._here.discard(peer)
             self._waits.end(f"{presence.role} {presence.name}")
             if presence.role == "actor":
-                self.run.dealer.leave(presence.name)
+                self.run.lose(presence.name)
             log.info("%s %s left", *peer)
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:

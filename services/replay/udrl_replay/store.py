@@ -1,11 +1,10 @@
 """One SQLite file per run, the only thing in the system that is worth saving.
 
 Every change of a run is one transaction, synced before anything is acknowledged; what is on disk is
-consistent at every moment. Names of tables and columns are documented in ``docs/operations.md``.
+consistent at every moment. What it holds is described in :mod:`udrl_replay.tables`.
 """
 
 import fcntl
-import hashlib
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,33 +19,12 @@ from udrl.config import COMMANDS_PER_ITERATION
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl.evaluation import Evaluation
 from udrl.replay import Entry
+from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal, sha256
 
-SCHEMA = 1
 FILE = "run.sqlite"
 
-_TABLES = """
-CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
-CREATE TABLE commands (id INTEGER PRIMARY KEY, cancelled INTEGER NOT NULL, body BLOB NOT NULL);
-CREATE TABLE episodes (
-    id INTEGER PRIMARY KEY, episode_return REAL NOT NULL, length INTEGER NOT NULL,
-    digest BLOB NOT NULL, admitted INTEGER, evicted INTEGER, body BLOB NOT NULL,
-    checksum BLOB NOT NULL);
-CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
-CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
-CREATE TABLE iterations (
-    iteration INTEGER PRIMARY KEY, commands INTEGER NOT NULL, env_steps INTEGER NOT NULL,
-    eval_env_steps INTEGER NOT NULL, wall_s REAL NOT NULL, return_min REAL NOT NULL,
-    return_mean REAL NOT NULL, return_max REAL NOT NULL, explored_return REAL,
-    weights_version INTEGER NOT NULL);
-CREATE TABLE evaluations (
-    iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
-    desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
-    mean REAL NOT NULL, std REAL NOT NULL, ci95_low REAL NOT NULL, ci95_high REAL NOT NULL,
-    episodes INTEGER NOT NULL, PRIMARY KEY (iteration, closing)) WITHOUT ROWID;
-CREATE TABLE versions (
-    version INTEGER PRIMARY KEY, digest BLOB NOT NULL, loss REAL NOT NULL, train_s REAL NOT NULL,
-    weights BLOB, optimizer BLOB, checksum BLOB);
-"""
+#: Tables whose rows may be written again.
+_REPLACED = {"facts", "evaluations", "versions"}
 
 Fact = TypeVar("Fact")
 
@@ -119,8 +97,9 @@ class Store:
                 self._db.execute("PRAGMA synchronous = FULL")
         except sqlite3.Error as error:
             raise self._fault(error) from error
+        self._db.create_function("seal", -1, seal, deterministic=True)
         if not self.read_only:
-            ((verdict,),) = self._rows("PRAGMA quick_check(1)")
+            ((verdict,),) = self._rows("PRAGMA integrity_check(1)")
             if verdict != "ok":
                 raise self._damaged(verdict)
         schema = self.fact("schema", int)
@@ -129,6 +108,16 @@ class Store:
                 f"{self._path} has schema {schema}, this version of udrl reads {SCHEMA}; "
                 f"use the version that wrote it"
             )
+        self._check_seals()
+
+    def _check_seals(self) -> None:
+        for table, columns in SEALED.items():
+            key = columns.split(",")[0]
+            broken = self._rows(
+                f"SELECT {key} FROM {table} WHERE seal IS NOT seal({columns}) LIMIT 1"  # noqa: S608
+            )
+            if broken:
+                raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
 
     @classmethod
     def create(cls, run_dir: Path, **facts: object) -> "Store":
@@ -151,10 +140,11 @@ class Store:
                 unfinished = path.with_suffix(".new")
                 unfinished.unlink(missing_ok=True)
                 with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
-                    db.executescript(_TABLES)
+                    db.executescript(TABLES)
                     for name, value in {"schema": SCHEMA, **facts}.items():
                         encoded = msgspec.json.encode(value)
-                        db.execute("INSERT INTO facts VALUES (?, ?)", (name, encoded))
+                        row = name, encoded, seal(name, encoded)
+                        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
                 unfinished.rename(path)
                 _sync(run_dir)
         except (OSError, sqlite3.Error) as error:
@@ -186,6 +176,12 @@ class Store:
                     self._db.execute("ROLLBACK")
         except sqlite3.Error as error:
             raise self._fault(error) from error
+
+    def _insert(self, table: str, *values: Value, unsealed: Sequence[bytes] = ()) -> None:
+        """Add a row: what its seal covers, the seal, and the rest."""
+        insert = "INSERT OR REPLACE" if table in _REPLACED else "INSERT"
+        row = *values, seal(*values), *unsealed
+        self._db.execute(f"{insert} INTO {table} VALUES ({marks(row)})", row)
 
     def _rows(self, query: str, values: Sequence[object] = ()) -> list[Any]:
         try:
@@ -222,18 +218,14 @@ class Store:
 
     def set_fact(self, name: str, value: object) -> None:
         """Set a named value."""
-        self._db.execute(
-            "INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, msgspec.json.encode(value))
-        )
+        self._insert("facts", name, msgspec.json.encode(value))
 
     # Commands: those that are outstanding or cancelled.
 
     def add_commands(self, commands: Iterable[Command]) -> None:
         """Add outstanding commands."""
-        self._db.executemany(
-            "INSERT INTO commands VALUES (?, 0, ?)",
-            ((c.id, msgspec.msgpack.encode(c)) for c in commands),
-        )
+        for command in commands:
+            self._insert("commands", command.id, 0, msgspec.msgpack.encode(command))
 
     def commands(self, *, cancelled: bool) -> list[Command]:
         """Return the outstanding or the cancelled commands, by id."""
@@ -248,7 +240,8 @@ class Store:
     def mark_commands(self, ids: Iterable[int], *, cancelled: bool) -> None:
         """Cancel commands, or take that back."""
         self._db.executemany(
-            "UPDATE commands SET cancelled = ? WHERE id = ?", ((int(cancelled), i) for i in ids)
+            "UPDATE commands SET cancelled = ?1, seal = seal(id, ?1, body) WHERE id = ?2",
+            ((int(cancelled), i) for i in ids),
         )
 
     def remove_commands(self, ids: Iterable[int]) -> None:
@@ -259,10 +252,8 @@ class Store:
 
     def add_episode(self, entry: Entry, digest: bytes, body: bytes) -> None:
         """Add an episode that arrived."""
-        self._db.execute(
-            "INSERT INTO episodes VALUES (?, ?, ?, ?, NULL, NULL, ?, ?)",
-            (entry.id, entry.episode_return, entry.length, digest, body, _checksum(body)),
-        )
+        row = entry.id, entry.episode_return, entry.length, digest, None, None, sha256(body)
+        self._insert("episodes", *row, unsealed=(body,))
 
     def episode_digest(self, episode_id: int) -> bytes | None:
         """Return an episode's digest if its row is still there."""
@@ -286,12 +277,13 @@ class Store:
 
     def admit(self, iteration: int, ids: Iterable[int], evicted: Iterable[int]) -> None:
         """Note which episodes entered and left the buffer with an iteration."""
-        self._db.executemany(
-            "UPDATE episodes SET admitted = ? WHERE id = ?", ((iteration, i) for i in ids)
-        )
-        self._db.executemany(
-            "UPDATE episodes SET evicted = ? WHERE id = ?", ((iteration, i) for i in evicted)
-        )
+        columns = SEALED["episodes"]
+        for column, changed in (("admitted", ids), ("evicted", evicted)):
+            self._db.executemany(
+                f"UPDATE episodes SET {column} = ?1, "  # noqa: S608
+                f"seal = seal({columns.replace(column, '?1')}) WHERE id = ?2",
+                ((iteration, i) for i in changed),
+            )
 
     def remove_episodes(self, ids: Iterable[int]) -> None:
         """Forget episodes."""
@@ -325,7 +317,7 @@ class Store:
             limit -= len(body)
             if bodies and limit < 0:
                 break
-            if _checksum(body) != checksum:
+            if sha256(body) != checksum:
                 raise self._damaged(f"episode {episode_id} is not what was written")
             bodies.append(body)
         return bodies
@@ -334,7 +326,7 @@ class Store:
 
     def add_iteration(self, *values: float | None) -> None:
         """Add a row to ``iterations``; values in the order of its columns."""
-        self._db.execute(f"INSERT INTO iterations VALUES ({_marks(values)})", values)  # noqa: S608
+        self._insert("iterations", *values)
 
     def issued_in(self, iteration: int) -> int:
         """Return how many commands a completed iteration had."""
@@ -348,8 +340,7 @@ class Store:
 
     def add_evaluation(self, row: EvaluationRow) -> None:
         """Add or replace an evaluation."""
-        values = (*row[:-1], *row.evaluation)
-        self._db.execute(f"INSERT OR REPLACE INTO evaluations VALUES ({_marks(values)})", values)  # noqa: S608
+        self._insert("evaluations", *row[:-1], *row.evaluation)
 
     def last_evaluation(self, *, closing: bool) -> EvaluationRow | None:
         """Return the newest evaluation, of those that close a run or of the others."""
@@ -359,7 +350,7 @@ class Store:
         )
         if not rows:
             return None
-        iteration, is_closing, env_steps, desired_return, desired_horizon, *found = rows[0]
+        iteration, is_closing, env_steps, desired_return, desired_horizon, *found, _ = rows[0]
         return EvaluationRow(
             iteration,
             bool(is_closing),
@@ -387,13 +378,10 @@ class Store:
 
     def add_version(self, version: Version, train_s: float) -> None:
         """Add a version, or bring back one whose blobs had gone."""
-        self._db.execute(
-            "INSERT OR REPLACE INTO versions VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (
-                version.version, version.digest, version.loss, train_s,
-                version.weights, version.optimizer,
-                _checksum(version.weights) + _checksum(version.optimizer),
-            ),
+        weights, optimizer = version.weights, version.optimizer
+        self._insert(
+            "versions", version.version, version.digest, version.loss, train_s,
+            sha256(weights) + sha256(optimizer), unsealed=(weights, optimizer),
         )  # fmt: skip
 
     def version(self, version: int) -> Version | None:
@@ -412,7 +400,7 @@ class Store:
         *values, checksum = rows[0]
         found = Version(*values)
         for blob, expected in ((found.weights, checksum[:32]), (found.optimizer, checksum[32:])):
-            if blob and _checksum(blob) != expected:
+            if blob and sha256(blob) != expected:
                 raise self._damaged(f"weights version {version} is not what was written")
         return found
 
@@ -438,14 +426,6 @@ class Store:
     def remove_versions(self, after: int) -> None:
         """Forget versions that were trained beyond the end of the run."""
         self._db.execute("DELETE FROM versions WHERE version > ?", (after,))
-
-
-def _marks(values: Sequence[object]) -> str:
-    return ", ".join("?" * len(values))
-
-
-def _checksum(blob: bytes) -> bytes:
-    return hashlib.sha256(blob).digest()
 
 
 def _sync(folder: Path) -> None:

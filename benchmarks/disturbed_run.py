@@ -1,0 +1,199 @@
+"""A real run in processes of its own, to be disturbed, and an observer that sees what comes of it.
+
+The observer reads the store's file beside the service that writes it, so it sees the run also while
+nobody answers; when services noticed something is in their logs.
+"""
+
+import os
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from severed_link import SeveredLink, free_port
+from udrl.errors import RunFailed, StoreError, UdrlError
+from udrl_launch.inspection import read_status
+from udrl_launch.settings import Settings
+from udrl_launch.supervisor import Child, Supervisor
+from udrl_proto.messages import Status
+from udrl_replay.creation import create, write_config
+from udrl_replay.run import Progress
+from udrl_replay.store import Store
+
+_POLL_S = 0.02
+_LINE = re.compile(r"(\d{4}-\S+ [\d:]+,\d+) (\w+) +(.*)")
+
+
+class Moment(NamedTuple):
+    """What the observer saw of a run."""
+
+    at: float
+    accepted: int
+    iteration: int
+
+
+class Line(NamedTuple):
+    """A line of a service's log."""
+
+    at: float
+    service: str
+    text: str
+
+
+class TooLate(UdrlError):
+    """A run did not do in time what it should have done."""
+
+
+class DisturbedRun:
+    """A run of ``udrl replay``, ``udrl learner`` and ``udrl actor``, started again as they die.
+
+    Actors and learner reach the replay service through a link that can be severed.
+
+    Args:
+        settings: what to train.
+        run_dir: a directory that is not there yet.
+        limit_s: seconds after which waiting for anything is given up.
+        hang_s: the actors' ``--hang-timeout``.
+    """
+
+    def __init__(self, settings: Settings, run_dir: Path, limit_s: float, hang_s: float) -> None:
+        self.run_dir = run_dir
+        self.settings = settings
+        self.unbalanced: list[str] = []
+        self.moments: list[Moment] = []
+        self._hang_s = hang_s
+        self._deadline = time.monotonic() + limit_s
+        self._port = free_port()
+        create(run_dir, settings.config).close()
+        write_config(run_dir, settings.config, settings.budget)
+        self.link = SeveredLink(self._port)
+        self._supervisor = Supervisor(run_dir / "logs")
+
+    @contextmanager
+    def going(self) -> Iterator["DisturbedRun"]:
+        """Start the services; end them however this ends."""
+        environment = self.settings.config.environment
+        start = self._supervisor.start
+        try:
+            start(
+                "replay", "replay", environment, "--run-dir", str(self.run_dir), "--resume",
+                "--listen", f"tcp/127.0.0.1:{self._port}",
+            )  # fmt: skip
+            start("learner", "learner", "--connect", self.endpoint, "--patience", "60")
+            for number in range(1, self.settings.fleet.actors + 1):
+                start(
+                    f"actor-{number}", "actor", "--connect", self.endpoint, "--patience", "60",
+                    "--envs", str(self.settings.fleet.envs_per_actor),
+                    "--hang-timeout", str(self._hang_s),
+                )  # fmt: skip
+            yield self
+        finally:
+            for child in self._supervisor.children:
+                self._signal(child, signal.SIGCONT)
+            self._supervisor.end()
+            self.link.close()
+
+    @property
+    def endpoint(self) -> str:
+        """Where actors and learner connect to."""
+        return f"tcp/127.0.0.1:{self.link.port}"
+
+    def children(self, *roles: str) -> list[Child]:
+        """Return the services of some roles."""
+        return [c for c in self._supervisor.children if c.name.split("-")[0] in roles]
+
+    def send(self, number: signal.Signals, *roles: str) -> None:
+        """Send a signal to all services of some roles, or to some of their names."""
+        for child in self._supervisor.children:
+            if child.name in roles or child.name.split("-")[0] in roles:
+                self._signal(child, number)
+
+    def _signal(self, child: Child, number: signal.Signals) -> None:
+        if child.process is not None and child.process.poll() is None:
+            os.kill(child.process.pid, number)
+
+    # Watching.
+
+    def wait(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for a condition, observing the run and restarting what dies."""
+        while not condition():
+            if time.monotonic() > self._deadline:
+                raise TooLate(f"{self.run_dir}: gave up waiting for {what}")
+            self._supervisor.check()
+            self._observe()
+            time.sleep(_POLL_S)
+
+    def pass_by(self, seconds: float) -> None:
+        """Let time pass."""
+        until = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() >= until, f"{seconds} s")
+
+    @property
+    def accepted(self) -> int:
+        """Episodes accepted when the observer last looked."""
+        return self.moments[-1].accepted if self.moments else 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the replay service has ended because the run has."""
+        return all(child.done for child in self.children("replay"))
+
+    def _observe(self) -> None:
+        try:
+            with closing(Store(self.run_dir, read_only=True)) as store:
+                progress = store.fact("progress", Progress)
+                arrived = store.pending_ids()
+                waiting = [c.id for c in store.commands(cancelled=False) if c.id not in arrived]
+        except StoreError as error:
+            self.unbalanced.append(f"the store could not be read: {error}")
+            return
+        now = time.time()
+        self.moments.append(Moment(now, progress.accepted, progress.iteration))
+        commands = progress.accepted + progress.cancelled + len(waiting)
+        episodes = progress.accepted + progress.duplicate + progress.rejected
+        if (progress.issued, progress.delivered) != (commands, episodes) and progress.issued:
+            self.unbalanced.append(f"{progress}, outstanding {len(waiting)}")
+
+    def status(self) -> Status:
+        """Return the status of the run as its file says it."""
+        return read_status(self.run_dir)
+
+    def failure(self) -> RunFailed | None:
+        """Run until the end; return how the run failed, or None if it did not."""
+        try:
+            self.wait(lambda: self.is_over, "the end of the run")
+        except RunFailed as error:
+            return error
+        return None
+
+    # What services noticed.
+
+    def lines(self, pattern: str, after: float) -> list[Line]:
+        """Return lines of all logs that match, from a time on, in the order of time."""
+        found = []
+        for path in sorted((self.run_dir / "logs").glob("*.log")):
+            for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
+                match = _LINE.match(text)
+                if match and re.search(pattern, match[3]):
+                    at = datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S,%f").timestamp()
+                    if at >= after:
+                        found.append(Line(at, path.stem, match[3]))
+        return sorted(found)
+
+
+def digests(status: Status) -> tuple[int, str, str]:
+    """Return what must not depend on what happened."""
+    return status.iteration, status.weights_sha256, status.replay_sha256
+
+
+def is_balanced(status: Status) -> bool:
+    """Say whether both ledgers of a status balance."""
+    commands, episodes = status.commands, status.episodes
+    return (
+        commands.issued == commands.accepted + commands.cancelled + commands.outstanding
+        and episodes.delivered == episodes.accepted + episodes.duplicate + episodes.rejected
+    )

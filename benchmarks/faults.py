@@ -1,0 +1,94 @@
+"""What can go wrong with a run, one function for each disturbance.
+
+A disturbance begins when its function is called and is over when it returns, be it that what was
+stopped goes on, that a cut network is whole again, or, for a kill, at once.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from disturbed_run import DisturbedRun
+
+#: Seconds of a stop or cut: longer than the lease (2 s) and than a query (3 s).
+OUTAGE_S = 5.0
+
+ROLES = ("actor", "learner", "replay")
+
+
+class Fault(NamedTuple):
+    """A disturbance.
+
+    Attributes:
+        name: for ``--faults``.
+        begin: what is done at random moments; None: the environment does it by itself.
+        lose: roles of the services that lose contact.
+        environment: the class of :mod:`disturbed_environments` around the run's own; None: none.
+        stops_the_run: it must end with exit code 9 and name a reproduction.
+    """
+
+    name: str
+    begin: Callable[[DisturbedRun], None] | None = None
+    lose: Sequence[str] = ()
+    environment: str | None = None
+    stops_the_run: bool = False
+
+
+def _kill(who: Sequence[str], run: DisturbedRun) -> None:
+    run.send(signal.SIGKILL, *who)
+
+
+def _stop(who: Sequence[str], run: DisturbedRun) -> None:
+    run.send(signal.SIGSTOP, *who)
+    run.pass_by(OUTAGE_S)
+    run.send(signal.SIGCONT, *who)
+
+
+def _cut(how: Callable[[DisturbedRun], AbstractContextManager[None]], run: DisturbedRun) -> None:
+    with how(run):
+        run.pass_by(OUTAGE_S)
+
+
+def _twins(run: DisturbedRun) -> None:
+    """Let two more actors join under one name, and take them away again."""
+    twin = [
+        sys.executable,
+        str(Path(__file__).with_name("twin.py")),
+        run.endpoint,
+        str(os.getpid()),
+    ]
+    both = [
+        subprocess.Popen(twin, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for _ in range(2)
+    ]
+    try:
+        run.pass_by(OUTAGE_S)
+    finally:
+        for process in both:
+            process.kill()
+            process.wait(5)
+
+
+FAULTS = (
+    *(Fault(f"kill {role}", partial(_kill, (f"{role}-1" if role == "actor" else role,)), (role,))
+      for role in ROLES),
+    Fault("kill all actors", partial(_kill, ("actor",)), ("actor",)),
+    Fault("kill replay and learner", partial(_kill, ("replay", "learner")), ("replay", "learner")),
+    *(Fault(f"stop {role}", partial(_stop, (f"{role}-1" if role == "actor" else role,)), (role,))
+      for role in ROLES),
+    Fault("stall network", partial(_cut, lambda run: run.link.stalled()), ("actor", "learner")),
+    Fault("sever network", partial(_cut, lambda run: run.link.severed()), ("actor", "learner")),
+    Fault("twins", _twins),
+    Fault("slow actor", environment="Slow"),
+    Fault("environment raises", environment="Raising"),
+    Fault("environment returns NaN", environment="Nan"),
+    Fault("environment hangs", environment="Hanging"),
+    Fault("command always raises", environment="AlwaysRaising", stops_the_run=True),
+    Fault("command always hangs", environment="AlwaysHanging", stops_the_run=True),
+)  # fmt: skip

@@ -1,0 +1,102 @@
+"""A link between services and their router that can be stalled and severed: a small TCP proxy."""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+
+_CHUNK = 1 << 16
+_TRY_AGAIN_S = 0.2
+
+
+def free_port() -> int:
+    """Return a port of the loopback interface that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class SeveredLink:
+    """Forwards connections to a port of this machine, unless told otherwise.
+
+    Args:
+        target: the port to forward to.
+    """
+
+    def __init__(self, target: int) -> None:
+        self._target = target
+        self._flows = threading.Event()
+        self._flows.set()
+        self._refuses = False
+        self._ends = threading.Event()
+        self._sockets: set[socket.socket] = set()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, name="link", daemon=True).start()
+
+    @contextlib.contextmanager
+    def stalled(self) -> Iterator[None]:
+        """Let nothing through and tell nobody, as an unplugged cable does."""
+        self._flows.clear()
+        try:
+            yield
+        finally:
+            self._flows.set()
+
+    @contextlib.contextmanager
+    def severed(self) -> Iterator[None]:
+        """Close all connections and refuse new ones, as a firewall or a dead router does."""
+        self._refuses = True
+        self._close_all()
+        try:
+            yield
+        finally:
+            self._refuses = False
+
+    def close(self) -> None:
+        """Forward nothing any more."""
+        self._ends.set()
+        self._flows.set()
+        self._listener.close()
+        self._close_all()
+
+    def _close_all(self) -> None:
+        for one in list(self._sockets):
+            self._close(one)
+
+    def _close(self, one: socket.socket) -> None:
+        self._sockets.discard(one)
+        with contextlib.suppress(OSError):  # the other side may have closed it already
+            one.shutdown(socket.SHUT_RDWR)
+        one.close()
+
+    def _accept(self) -> None:
+        while not self._ends.is_set():
+            try:
+                here, _ = self._listener.accept()
+            except OSError:
+                return  # closed
+            if self._refuses:
+                here.close()
+                continue
+            try:
+                there = socket.create_connection(("127.0.0.1", self._target), timeout=_TRY_AGAIN_S)
+            except OSError:
+                here.close()  # the router is dead: so is the connection
+                continue
+            there.settimeout(None)
+            self._sockets |= {here, there}
+            for source, sink in ((here, there), (there, here)):
+                threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        try:
+            while chunk := source.recv(_CHUNK):
+                self._flows.wait()
+                sink.sendall(chunk)
+        except OSError:
+            pass  # severed, or one side died; the other must learn of it
+        finally:
+            self._close(source)
+            self._close(sink)

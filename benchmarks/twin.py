@@ -1,0 +1,14 @@
+"""An actor with a name that is not its own: ``twin.py ENDPOINT PARENT_PID``."""
+
+import sys
+import threading
+
+from udrl_actor.service import ActorService
+from udrl_launch.process import die_with_parent
+from udrl_proto.session import connect, find_run
+
+if __name__ == "__main__":
+    die_with_parent(int(sys.argv[2]))
+    with connect(sys.argv[1], 10.0) as session:
+        hello = find_run(session, None, 10.0)
+        ActorService(session, hello, "twin", 4, threading.Event()).run()

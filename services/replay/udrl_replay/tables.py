@@ -1,0 +1,67 @@
+"""The tables of a run's file, and the seal that every row carries.
+
+SQLite notices a file that is torn or out of order, not a number that has become another one. So
+each row has a seal: a digest of its columns, those aside that have a checksum of their own. All
+columns are documented in ``docs/operations.md``.
+"""
+
+import hashlib
+from collections.abc import Iterable
+
+SCHEMA = 2
+
+#: Large columns stand last: whoever reads what stands before them does not read them.
+TABLES = """
+CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL, seal BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE commands (
+    id INTEGER PRIMARY KEY, cancelled INTEGER NOT NULL, body BLOB NOT NULL, seal BLOB NOT NULL);
+CREATE TABLE episodes (
+    id INTEGER PRIMARY KEY, episode_return REAL NOT NULL, length INTEGER NOT NULL,
+    digest BLOB NOT NULL, admitted INTEGER, evicted INTEGER, checksum BLOB NOT NULL,
+    seal BLOB NOT NULL, body BLOB NOT NULL);
+CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
+CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
+CREATE TABLE iterations (
+    iteration INTEGER PRIMARY KEY, commands INTEGER NOT NULL, env_steps INTEGER NOT NULL,
+    eval_env_steps INTEGER NOT NULL, wall_s REAL NOT NULL, return_min REAL NOT NULL,
+    return_mean REAL NOT NULL, return_max REAL NOT NULL, explored_return REAL,
+    weights_version INTEGER NOT NULL, seal BLOB NOT NULL);
+CREATE TABLE evaluations (
+    iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
+    desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
+    mean REAL NOT NULL, std REAL NOT NULL, ci95_low REAL NOT NULL, ci95_high REAL NOT NULL,
+    episodes INTEGER NOT NULL, seal BLOB NOT NULL, PRIMARY KEY (iteration, closing)) WITHOUT ROWID;
+CREATE TABLE versions (
+    version INTEGER PRIMARY KEY, digest BLOB NOT NULL, loss REAL NOT NULL, train_s REAL NOT NULL,
+    checksum BLOB NOT NULL, seal BLOB NOT NULL, weights BLOB, optimizer BLOB);
+"""
+
+#: What the seal of each table's rows covers, the row's key first.
+SEALED = {
+    "facts": "name, value",
+    "commands": "id, cancelled, body",
+    "episodes": "id, episode_return, length, digest, admitted, evicted, checksum",
+    "iterations": "iteration, commands, env_steps, eval_env_steps, wall_s, return_min, "
+    "return_mean, return_max, explored_return, weights_version",
+    "evaluations": "iteration, closing, env_steps, desired_return, desired_horizon, mean, std, "
+    "ci95_low, ci95_high, episodes",
+    "versions": "version, digest, loss, train_s, checksum",
+}
+
+Value = int | float | str | bytes | None
+
+
+def seal(*values: Value) -> bytes:
+    """Return the seal of a row's values; SQLite may have made floats of integers."""
+    plain = [float(v) if isinstance(v, int) else v for v in values]
+    return sha256(repr(plain).encode())[:16]
+
+
+def sha256(blob: bytes) -> bytes:
+    """Return the SHA-256 of a large value."""
+    return hashlib.sha256(blob).digest()
+
+
+def marks(values: Iterable[object]) -> str:
+    """Return the placeholders of an SQL statement for some values."""
+    return ", ".join("?" for _ in values)
