@@ -12,7 +12,7 @@ ARGS ?=
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: train test test-slow lint format types bench setup setup-dev clean
+.PHONY: train test test-slow lint format types bench chaos setup setup-dev clean
 
 train: setup  ## Train LunarLander until it lands.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 100 $(ARGS)
@@ -37,6 +37,9 @@ types: setup-dev  ## The type checker.
 
 bench: setup-dev  ## Speed: the whole system beside the limit of its parts (docs/performance.md).
 	$(VENV)/bin/python benchmarks/speed.py $(ARGS)
+
+chaos: setup-dev  ## Faults in real runs, and what they cost (docs/reliability.md).
+	$(VENV)/bin/python benchmarks/chaos.py $(ARGS)
 
 setup: $(VENV)/.installed
 setup-dev: $(VENV)/.installed-dev

@@ -227,10 +227,9 @@ def _measure(run: DisturbedRun, fault: Fault, start: float, end: float) -> Injec
     back = run.lines(rf"^({gone}) \S+ is here", end) if gone else []
     if back:
         found.reconnected = back[min(peers, len(back)) - 1].at - end
-    before = [m for m in run.moments if m.at <= end]
     after = [m for m in run.moments if m.at > end]
-    if before and after:
-        accepted, iteration = before[-1].accepted, before[-1].iteration
+    if after:
+        accepted, iteration = after[0].accepted, after[0].iteration
         found.next_episode = next((m.at - end for m in after if m.accepted > accepted), None)
         found.next_iteration = next((m.at - end for m in after if m.iteration > iteration), None)
     return found

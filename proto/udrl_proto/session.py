@@ -54,6 +54,12 @@ def _config(mode: str) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
+        # By default a client looks for a router that is gone after 1, 3, 7, 11 s.
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 1.5,
+        },
         # Silent losses are reported for shared memory when a receiver is descheduled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,

@@ -7,8 +7,23 @@ from pathlib import Path
 
 import pytest
 
+from udrl.config import Budget
+from udrl.errors import StoreError
+from udrl_launch.local import Threads
+from udrl_launch.settings import Fleet, Settings
 from udrl_proto.messages import Status
-from whole_run import SMALL, Cli, arguments, assert_conserved, digests, live_status, small
+from udrl_replay.creation import create, write_config
+from whole_run import (
+    SMALL,
+    Cli,
+    arguments,
+    assert_conserved,
+    digests,
+    free_port,
+    live_status,
+    small,
+    wait_for,
+)
 
 BUDGET = 6000
 
@@ -49,3 +64,28 @@ def test_run_whose_disk_is_full_stops_and_goes_on_with_more_space(
     status = cli(*arguments(SMALL, BUDGET, run_dir), "--resume").status()
     assert_conserved(status)
     assert digests(status) == digests(run(small(), BUDGET))
+
+
+@pytest.mark.parametrize("more_pages", [4, 10, 20, 40])
+def test_store_that_may_not_grow_keeps_its_ledgers(
+    more_pages: int, run: Callable[..., Status], tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    settings = Settings(small(), Budget(max_env_steps=BUDGET), Fleet(actors=1, envs_per_actor=4))
+    store = create(run_dir, settings.config)
+    write_config(run_dir, settings.config, settings.budget)
+    (pages,) = store._db.execute("PRAGMA page_count").fetchone()
+    store._db.execute(f"PRAGMA max_page_count = {pages + more_pages}")
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    services = Threads(run_dir, store, settings, endpoint, insecure=False)
+    try:
+        with pytest.raises(StoreError, match="disk is full; nothing acknowledged is lost"):
+            wait_for(services.check, "the end of the run")
+    finally:
+        services.end()
+    stopped = live_status(run_dir)
+    assert stopped is not None
+    assert stopped.state == "running"
+    assert_conserved(stopped)
+    resumed = run(small(), BUDGET, run_dir=run_dir, go_on=True)
+    assert digests(resumed) == digests(run(small(), BUDGET))

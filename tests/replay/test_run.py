@@ -536,6 +536,43 @@ def test_failed_closing_evaluation_is_tried_again(make_run: MakeRun, reopened: M
     assert result(run) == reference(0, 20)
 
 
+def vanish(run: Run, *actors: str) -> set[int]:
+    """Let actors get commands and vanish, one after the other; return what the last one held."""
+    for name in actors:
+        run.dealer.join(join(name), 0.0)
+        request = CommandsRequest(actor=name, wanted=100)
+        held = run.dealer.deal(request, run.progress.latest_version, 0.0)
+        with run.store.transaction():
+            run.lose(name)
+            run.save()
+    return {command.id for command in held}
+
+
+def test_command_that_ends_its_actors_stops_the_run_and_is_named(
+    make_run: MakeRun, reopened: MakeRun, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = make_run(max_env_steps=20)
+    assert vanish(run, "a", "b", "c") == {0, 1, 2, 3}
+    assert "command 3 was held by 3 actors that vanished and is now carried out" in caplog.text
+    assert vanish(run, "d", "e") == {0}
+    before = run.progress.state
+    assert vanish(run, "f") == {0}
+    assert (before, run.progress.state) == ("running", "failed")
+    assert run.progress.problem == (
+        "command 0 ended three actors that carried out nothing else: its environment hangs or "
+        "crashes; reproduce it with: udrl reproduce RUN_DIR 0"
+    )
+    run = reopened(run)
+    finish(run)
+    assert result(run) == reference(0, 20)
+
+
+def test_end_of_an_actor_that_never_joined_is_no_news(make_run: MakeRun) -> None:
+    run = make_run()
+    run.lose("stranger")
+    assert run.progress.state == "running"
+
+
 def test_run_that_is_only_looked_at_writes_nothing(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(max_env_steps=20)
     finish(run)

@@ -205,6 +205,8 @@ class Run:
                 )
 
     def _give_up(self, command_id: int, why: str) -> None:
+        if self.progress.state == "failed":
+            return
         self.progress.state = "failed"
         self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
         log.error("%s", RunFailed(self.progress.problem))
