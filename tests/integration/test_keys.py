@@ -12,7 +12,18 @@ from udrl.errors import ConfigError, UdrlError
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import status_of
 from udrl_proto.messages import Status
-from whole_run import SMALL, TOY, Cli, arguments, digests, live_status, small, toy, wait_for
+from whole_run import (
+    SMALL,
+    TOY,
+    Cli,
+    arguments,
+    digests,
+    kill_at,
+    live_status,
+    small,
+    toy,
+    wait_for,
+)
 
 BUDGET = 3000
 
@@ -49,6 +60,17 @@ def test_services_that_have_only_their_own_keys_equal_one_process(
     status = live_status(run_dir)
     assert status is not None
     assert digests(status) == digests(run(small(), BUDGET))
+
+
+def test_killed_services_come_back_with_their_keys(
+    cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    given = arguments(SMALL, 2 * BUDGET, run_dir)
+    process = cli(*given, "--actors", "1", "--keys", str(keys_dir))
+    kill_at(process, run_dir, "replay", 1)
+    kill_at(process, run_dir, "actor", 4)
+    assert digests(process.status()) == digests(run(small(), 2 * BUDGET))
 
 
 def test_status_of_a_live_run_needs_an_observers_key(
