@@ -48,11 +48,11 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(PIP_INSTALL) --editable '.[box2d,plot]'
+	$(PIP_INSTALL) --editable '.[box2d,plot,secure]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[box2d,plot,dev]'
+	$(PIP_INSTALL) --editable '.[box2d,plot,secure,dev]'
 	touch $@
 
 clean:

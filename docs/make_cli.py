@@ -30,7 +30,8 @@ _HEAD = """\
 
 - `ENV` is a Gymnasium id, registered (`LunarLander-v3`) or importable (`package.module:Env-v0`).
 - `RUN_DIR` is the [directory of a run](operations.md#the-run-directory).
-- An endpoint is `tcp/HOST:PORT`, e.g. `tcp/127.0.0.1:7447`.
+- An endpoint is `tcp/HOST:PORT`, e.g. `tcp/127.0.0.1:7447`; with [`--keys`](operations.md#keys)
+  it is `tls/HOST:PORT`.
 
 Every command has `--help`, and `udrl --version` prints the version. Results go to standard output;
 progress, logs and errors go to standard error. An error is one line that names the value, what was
@@ -46,13 +47,22 @@ _TYPES = {"float": "NUMBER", "float range": "NUMBER", "integer range": "INTEGER"
 
 def page() -> str:
     """Return the text of ``docs/cli.md``."""
-    commands = cli.commands.items()
+    commands = list(_commands("", cli))
     index = "\n".join(
-        f"| [`udrl {name}`](#udrl-{name}) | {_prose(command)[0]} |" for name, command in commands
+        f"| [`udrl {name}`](#udrl-{name.replace(' ', '-')}) | {_prose(command)[0]} |"
+        for name, command in commands
     )
     sections = [_HEAD.format(about=str(cli.help).strip(), index=index)]
     sections += ["\n".join(_section(name, command)) for name, command in commands]
     return "\n".join(sections)
+
+
+def _commands(prefix: str, group: click.Group) -> Iterator[tuple[str, click.Command]]:
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from _commands(f"{prefix}{name} ", command)
+        else:
+            yield prefix + name, command
 
 
 def _section(name: str, command: click.Command) -> Iterator[str]:
@@ -61,7 +71,7 @@ def _section(name: str, command: click.Command) -> Iterator[str]:
     usage = ["udrl", name]
     for param in command.params:
         if isinstance(param, click.Argument):
-            metavar = str(param.name).upper()
+            metavar = param.metavar or str(param.name).upper()
             usage.append(metavar if param.required else f"[{metavar}]")
     usage += [_signature(option) for option in options if option.required]
     yield f"## udrl {name}\n"

@@ -1,11 +1,13 @@
 import importlib
 import warnings
 from importlib.util import find_spec
+from pathlib import Path
 
 import hypothesis
 import pytest
 
 from udrl.numerics import use_one_thread
+from udrl_launch import authority
 
 # Box2D's types warn while it is imported; as an error, such a warning kills the interpreter.
 if find_spec("Box2D") is not None:
@@ -21,3 +23,19 @@ hypothesis.settings.load_profile("udrl")
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
     use_one_thread()
+
+
+@pytest.fixture(scope="session")
+def keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys for all roles."""
+    folder = tmp_path_factory.mktemp("keys")
+    authority.create(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def foreign_keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys for all roles, of an authority that nobody here trusts."""
+    folder = tmp_path_factory.mktemp("foreign")
+    authority.create(folder)
+    return folder

@@ -71,6 +71,9 @@ def check_udrl(words: list[str]) -> None:
         assert name in ("--help", "-h", "--version"), name
         return
     command = cli.commands[name]
+    while isinstance(command, click.Group):
+        name, *arguments = arguments
+        command = command.commands[name]
     if not arguments:
         return  # a mention of the command
     try:
@@ -80,7 +83,7 @@ def check_udrl(words: list[str]) -> None:
     given = context.params
     for endpoint in (given.get("listen"), given.get("connect")):
         if endpoint is not None:
-            check_endpoint(endpoint)
+            check_endpoint(endpoint, secure=given.get("keys") is not None)
     if "assignments" in given:
         settings = {*Config.__struct_fields__, *Budget.__struct_fields__, *Fleet.__struct_fields__}
         options = {n: v for n, v in given.items() if n in settings}

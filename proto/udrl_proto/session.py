@@ -11,33 +11,58 @@ import zenoh
 
 from udrl.errors import ConfigError, Interrupted, Unreachable
 from udrl_proto import PROTOCOL, keys
+from udrl_proto.access import access_control
 from udrl_proto.codec import decode, encode
+from udrl_proto.credentials import Credentials
 from udrl_proto.messages import Hello, HelloRequest
 
 log = logging.getLogger("udrl")
 
-_ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9a-fA-F:]+\]|[^:/\s\[\]]+):(?P<port>\d+)")
+_ENDPOINT = re.compile(
+    r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:]+\]|[^:/\s\[\]]+):(?P<port>\d+)"
+)
 
 #: A hung or cut-off service is noticed after this many milliseconds.
 LEASE_MS = 2000
 
 
-def check_endpoint(endpoint: str) -> str:
+def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
     """Return an endpoint as it came.
 
+    Args:
+        endpoint: what was given.
+        secure: whether keys were given.
+
     Raises:
-        ConfigError: it is not one.
+        ConfigError: it is not one, or of the other kind.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 0 < int(match["port"]) < 65536:
-        raise ConfigError(f"endpoint {endpoint!r}: expected tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+        raise ConfigError(
+            f"endpoint {endpoint!r}: expected tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447, or with "
+            f"--keys tls/HOST:PORT"
+        )
+    if match["protocol"] == "tls" and not secure:
+        raise ConfigError(
+            f"endpoint {endpoint!r} needs keys; add --keys DIR (`udrl keys create DIR` makes "
+            f"them), or use tcp/ where nobody has to be authenticated"
+        )
+    if match["protocol"] == "tcp" and secure:
+        raise ConfigError(
+            f"endpoint {endpoint!r} would not use the keys, and nothing would be encrypted; with "
+            f"--keys give it as tls/{endpoint.removeprefix('tcp/')}"
+        )
     return endpoint
 
 
-def _is_loopback(endpoint: str) -> bool:
+def _host_and_port(endpoint: str) -> tuple[str, int]:
     match = _ENDPOINT.fullmatch(endpoint)
     assert match is not None
-    host = match["host"].strip("[]")
+    return match["host"].strip("[]"), int(match["port"])
+
+
+def _is_loopback(endpoint: str) -> bool:
+    host, _ = _host_and_port(endpoint)
     if host == "localhost":
         return True
     try:
@@ -46,8 +71,9 @@ def _is_loopback(endpoint: str) -> bool:
         return False
 
 
-def _config(mode: str) -> zenoh.Config:
+def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
     config = zenoh.Config()
+    tls = {} if credentials is None else credentials.settings()
     for path, value in {
         "mode": mode,
         # Peers are named, never searched for: scouting costs 0.5 s and crosses site borders.
@@ -63,28 +89,37 @@ def _config(mode: str) -> zenoh.Config:
         # Silent losses are reported for shared memory when a receiver is descheduled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        **tls,
     }.items():
         config.insert_json5(path, json.dumps(value))
     return config
 
 
-def listen(endpoint: str, *, insecure: bool = False) -> zenoh.Session:
+def listen(
+    endpoint: str, *, insecure: bool = False, credentials: Credentials | None = None
+) -> zenoh.Session:
     """Open a session that is the router of a run.
 
     Args:
         endpoint: where others connect to.
         insecure: allow an endpoint beyond loopback although nobody is authenticated.
+        credentials: let in only who has a certificate of the same authority, and let each do only
+            what its role may (:mod:`udrl_proto.access`).
 
     Raises:
         ConfigError: the endpoint is malformed, in use, or would let strangers in.
     """
-    if not _is_loopback(check_endpoint(endpoint)) and not insecure:
+    check_endpoint(endpoint, secure=credentials is not None)
+    if credentials is None and not insecure and not _is_loopback(endpoint):
         raise ConfigError(
             f"endpoint {endpoint!r} can be reached from other machines and nobody would be "
-            f"authenticated; listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
+            f"authenticated; make keys (`udrl keys create DIR`) and give --keys DIR with "
+            f"tls/HOST:PORT, listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
         )
-    config = _config("router")
+    config = _config("router", credentials)
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    if credentials is not None:
+        config.insert_json5("access_control", json.dumps(access_control()))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -93,16 +128,22 @@ def listen(endpoint: str, *, insecure: bool = False) -> zenoh.Session:
         ) from error
 
 
-def connect(endpoint: str, patience_s: float, stop: threading.Event | None = None) -> zenoh.Session:
+def connect(
+    endpoint: str,
+    patience_s: float,
+    stop: threading.Event | None = None,
+    credentials: Credentials | None = None,
+) -> zenoh.Session:
     """Open a session with the router at an endpoint, trying again until it is there.
 
     Raises:
-        ConfigError: the endpoint is malformed.
+        ConfigError: the endpoint is malformed, or one side does not trust the other's keys.
         Unreachable: nobody answers within ``patience_s`` seconds.
         Interrupted: ``stop`` was set meanwhile.
     """
-    config = _config("client")
-    config.insert_json5("connect/endpoints", json.dumps([check_endpoint(endpoint)]))
+    check_endpoint(endpoint, secure=credentials is not None)
+    config = _config("client", credentials)
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     config.insert_json5("connect/timeout_ms", "1000")
     began = time.monotonic()
     stop = stop or threading.Event()
@@ -111,6 +152,8 @@ def connect(endpoint: str, patience_s: float, stop: threading.Event | None = Non
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
+            if credentials is not None:
+                credentials.examine(*_host_and_port(endpoint))
             waited = time.monotonic() - began
             if waited >= patience_s:
                 raise Unreachable(

@@ -30,6 +30,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
         go_on: bool = False,
         in_process: bool = True,
         stop_return: float | None = None,
+        keys: Path | None = None,
     ) -> Status:
         nonlocal number
         number += 1
@@ -44,6 +45,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
             threading.Event(),
             go_on=go_on,
             in_process=in_process,
+            keys=keys,
         )
         assert_conserved(status)
         return status

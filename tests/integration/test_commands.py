@@ -84,8 +84,10 @@ def test_status_of_a_live_run_by_its_endpoint(cli: Callable[..., Cli], tmp_path:
     assert [actor.environments for actor in status.actors] == [16]
 
 
-@pytest.mark.parametrize("name", ["train", "replay", "learner", "actor", "evaluate", "status"])
+@pytest.mark.parametrize(
+    "name", ["train", "replay", "learner", "actor", "evaluate", "status", "keys create"]
+)
 def test_help_of_each_command_has_an_example(name: str, cli: Callable[..., Cli]) -> None:
-    code, out, _ = cli(name, "--help").finish()
+    code, out, _ = cli(*name.split(), "--help").finish()
     assert code == 0
     assert "Example: udrl" in " ".join(out.split())

@@ -77,7 +77,7 @@ def test_store_that_may_not_grow_keeps_its_ledgers(
     (pages,) = store._db.execute("PRAGMA page_count").fetchone()
     store._db.execute(f"PRAGMA max_page_count = {pages + more_pages}")
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    services = Threads(run_dir, store, settings, endpoint, insecure=False)
+    services = Threads(run_dir, store, settings, endpoint, insecure=False, keys=None)
     try:
         with pytest.raises(StoreError, match="disk is full; nothing acknowledged is lost"):
             wait_for(services.check, "the end of the run")

@@ -29,6 +29,15 @@ from udrl_proto.messages import Hello
 )
 def test_endpoint_is_returned_as_it_came(endpoint: str) -> None:
     assert sessions.check_endpoint(endpoint) == endpoint
+    secured = endpoint.replace("tcp", "tls")
+    assert sessions.check_endpoint(secured, secure=True) == secured
+
+
+def test_endpoint_of_the_other_kind_is_refused_with_the_remedy() -> None:
+    with pytest.raises(ConfigError, match=r"'tls/a:1' needs keys; add --keys DIR"):
+        sessions.check_endpoint("tls/a:1")
+    with pytest.raises(ConfigError, match=r"'tcp/a:1' would not .* give it as tls/a:1$"):
+        sessions.check_endpoint("tcp/a:1", secure=True)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +54,6 @@ def test_endpoint_is_returned_as_it_came(endpoint: str) -> None:
         "tcp/::1:7447",
         "tcp/a b:7447",
         "udp/127.0.0.1:7447",
-        "tls/127.0.0.1:7447",
         "tcp/127.0.0.1:7447?x=1",
         "tcp/127.0.0.1:7447\n",
         "http://127.0.0.1:7447",

@@ -6,6 +6,7 @@ import click
 
 import udrl
 from udrl.errors import UdrlError
+from udrl_launch.commands.keys import keys
 from udrl_launch.commands.looking import evaluate, reproduce, status
 from udrl_launch.commands.services import actor, learner, replay
 from udrl_launch.commands.training import train
@@ -33,5 +34,5 @@ def cli() -> None:
     """Upside-Down Reinforcement Learning, exact and distributed."""
 
 
-for command in (train, replay, learner, actor, evaluate, reproduce, status):
+for command in (train, replay, learner, actor, evaluate, reproduce, status, keys):
     cli.add_command(command)

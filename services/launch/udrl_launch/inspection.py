@@ -20,9 +20,8 @@ from udrl.errors import StoreError, UdrlError
 from udrl.evaluation import Evaluation, summarise
 from udrl.numerics import use_one_thread
 from udrl.replay import ReplayBuffer
-from udrl_launch.roles import ENDPOINT_FILE
+from udrl_launch.roles import ENDPOINT_FILE, Address, connected
 from udrl_proto import keys
-from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Status, StatusRequest
 from udrl_replay.reporting import Throughput, Waits, status
@@ -36,26 +35,30 @@ _ANSWER_S = 3.0
 _SHOW_S = 60.0
 
 
-def status_at(endpoint: str, run_id: str | None) -> Status:
+def status_at(address: Address) -> Status:
     """Return the status of a run that is being worked on.
 
     Raises:
         Unreachable: nobody answers there.
+        ConfigError: the endpoint or the keys cannot be used, or the run must be named.
     """
-    with sessions.connect(endpoint, _ANSWER_S) as session:
-        hello = sessions.find_run(session, run_id, _ANSWER_S)
+    with connected("observer", address) as (session, hello):
         asker = Asker(session, hello.run_id, "udrl status", patience_s=_ANSWER_S)
         return asker.ask(keys.STATUS, StatusRequest(), Status)
 
 
-def status_of(run_dir: Path) -> Status:
-    """Return the status of a run by its directory, whether somebody works on it or not."""
+def status_of(run_dir: Path, keys_dir: Path | None = None) -> Status:
+    """Return the status of a run by its directory, whether somebody works on it or not.
+
+    Raises:
+        StoreError: there is no run, or it is damaged.
+    """
     try:
         where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))
         os.kill(int(where["pid"]), 0)  # raises unless the service that wrote the file is there
         with closing(Store(run_dir, read_only=True)) as store:
             run_id = store.fact("hello", Hello).run_id
-        return status_at(str(where["endpoint"]), run_id)
+        return status_at(Address(str(where["endpoint"]), run_id, _ANSWER_S, keys_dir))
     except (OSError, ValueError, KeyError, TypeError, UdrlError) as error:
         log.debug("no live status: %s", error)
         return read_status(run_dir)

@@ -9,6 +9,8 @@ from typing import Protocol
 from udrl_launch import roles
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Supervisor
+from udrl_proto.access import REPLAY
+from udrl_proto.credentials import load
 from udrl_replay.store import Store
 
 #: Seconds that freshly started services look for the replay service.
@@ -43,11 +45,16 @@ class Processes:
         endpoint: str,
         *,
         insecure: bool,
+        keys: Path | None,
     ) -> None:
         fleet, environment = settings.fleet, settings.config.environment
         store.close()
         self._supervisor = Supervisor(run_dir / "logs")
-        start = self._supervisor.start
+        secured = ("--keys", str(keys)) if keys else ()
+
+        def start(name: str, *arguments: str) -> None:
+            self._supervisor.start(name, *arguments, *secured)
+
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
             "--listen", endpoint, *(["--insecure"] if insecure else []),
@@ -85,6 +92,7 @@ class Threads:
         endpoint: str,
         *,
         insecure: bool,
+        keys: Path | None,
     ) -> None:
         fleet = settings.fleet
         self._stop = threading.Event()
@@ -100,9 +108,10 @@ class Threads:
                 self._stop,
                 listen=endpoint,
                 insecure=insecure,
+                credentials=load(keys, REPLAY) if keys else None,
             ),
         )
-        address = roles.Address(endpoint, patience_s=float(_PATIENCE_S))
+        address = roles.Address(endpoint, patience_s=float(_PATIENCE_S), keys=keys)
         self._start("learner", partial(roles.learner, address, self._stop))
         for number in range(1, fleet.actors + 1):
             self._start(

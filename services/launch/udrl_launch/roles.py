@@ -20,6 +20,7 @@ from udrl.errors import RunFailed
 from udrl_actor.service import ActorService
 from udrl_learner.service import LearnerService
 from udrl_proto import session as sessions
+from udrl_proto.credentials import Credentials, load
 from udrl_proto.messages import Hello
 from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
@@ -36,11 +37,13 @@ class Address(NamedTuple):
         endpoint: of its router.
         run_id: which one, where the router carries several.
         patience_s: seconds to try until somebody answers.
+        keys: folder with the keys that a service proves its role with; None: nobody is asked.
     """
 
     endpoint: str
     run_id: str | None = None
     patience_s: float = 3.0
+    keys: Path | None = None
 
 
 def replay(
@@ -52,6 +55,7 @@ def replay(
     listen: str | None = None,
     connect: str | None = None,
     insecure: bool = False,
+    credentials: Credentials | None = None,
 ) -> None:
     """Serve a run until it has ended; either host its router or use one.
 
@@ -64,9 +68,9 @@ def replay(
         endpoint = listen or connect
         assert endpoint is not None
         session = (
-            sessions.listen(endpoint, insecure=insecure)
+            sessions.listen(endpoint, insecure=insecure, credentials=credentials)
             if listen
-            else sessions.connect(endpoint, Address(endpoint).patience_s, stop)
+            else sessions.connect(endpoint, Address(endpoint).patience_s, stop, credentials)
         )
         with session:
             where = {"endpoint": endpoint, "pid": os.getpid()}
@@ -83,7 +87,7 @@ def replay(
 
 def learner(address: Address, stop: threading.Event) -> None:
     """Train the run at an address until it has ended."""
-    with _connected(address, stop) as (session, hello):
+    with connected("learner", address, stop) as (session, hello):
         LearnerService(session, hello, unique_name("learner"), stop).run()
 
 
@@ -101,14 +105,25 @@ def actor(
     # The courier's thread must get the interpreter soon while the loop steps environments: at the
     # default of 5 ms a query takes 5 ms instead of 0.2.
     sys.setswitchinterval(0.0005)
-    with _connected(address, stop) as (session, hello):
+    with connected("actor", address, stop) as (session, hello):
         ActorService(session, hello, unique_name("actor"), environments, stop, hang_s).run()
 
 
 @contextmanager
-def _connected(address: Address, stop: threading.Event) -> Iterator[tuple[zenoh.Session, Hello]]:
-    with sessions.connect(address.endpoint, address.patience_s, stop) as session:
-        yield session, sessions.find_run(session, address.run_id, address.patience_s, stop)
+def connected(
+    role: str, address: Address, stop: threading.Event | None = None
+) -> Iterator[tuple[zenoh.Session, Hello]]:
+    """Connect to a run in a role, and find it.
+
+    Raises:
+        ConfigError: the endpoint or the keys cannot be used, or the run must be named.
+        Unreachable: nobody, or no such run, answers in time.
+        Interrupted: ``stop`` was set meanwhile.
+    """
+    endpoint, run_id, patience_s, keys = address
+    credentials = load(keys, role) if keys else None
+    with sessions.connect(endpoint, patience_s, stop, credentials) as session:
+        yield session, sessions.find_run(session, run_id, patience_s, stop)
 
 
 def unique_name(role: str) -> str:

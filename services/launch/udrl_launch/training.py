@@ -9,10 +9,13 @@ from udrl.errors import Interrupted, Unreachable
 from udrl_launch.display import Display
 from udrl_launch.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
+from udrl_launch.roles import Address, connected
 from udrl_launch.settings import Settings
-from udrl_proto import keys
+from udrl_proto import keys as verbs
 from udrl_proto import session as sessions
+from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
+from udrl_proto.credentials import load
 from udrl_proto.messages import Status, StatusRequest
 from udrl_replay.creation import create, exists, resume, write_config
 from udrl_replay.run import Run
@@ -35,6 +38,7 @@ def train(
     allow_inexact: bool = False,
     listen: str | None = None,
     insecure: bool = False,
+    keys: Path | None = None,
     display: Display | None = None,
 ) -> Status:
     """Train an agent and return the final status of its run.
@@ -47,7 +51,8 @@ def train(
         in_process: all services in this process, as threads; else a process each.
         allow_inexact: accept actors of other numerics classes.
         listen: the endpoint of the run; None: a free port of the loopback interface.
-        insecure: allow ``listen`` to be beyond loopback.
+        insecure: allow ``listen`` to be beyond loopback without keys.
+        keys: folder with the keys of all roles (``udrl keys create``); None: nobody is asked.
         display: shows the progress.
 
     Raises:
@@ -55,7 +60,11 @@ def train(
         Interrupted: ``stop`` was set.
     """
     config, budget, _ = settings
-    endpoint = sessions.check_endpoint(listen) if listen else f"tcp/127.0.0.1:{free_port()}"
+    endpoint = listen or f"{'tls' if keys else 'tcp'}/127.0.0.1:{free_port()}"
+    sessions.check_endpoint(endpoint, secure=keys is not None)
+    if keys is not None:
+        for role in ROLES:
+            load(keys, role)
     if go_on and exists(run_dir):
         store = resume(run_dir, config, allow_inexact=allow_inexact)
     else:
@@ -65,9 +74,9 @@ def train(
         store.close()
         return read_status(run_dir)
     kind = Threads if in_process else Processes
-    services: Local = kind(run_dir, store, settings, endpoint, insecure=insecure)
+    services: Local = kind(run_dir, store, settings, endpoint, insecure=insecure, keys=keys)
     try:
-        _watch(services, endpoint, stop, display)
+        _watch(services, Address(endpoint, patience_s=_START_S, keys=keys), stop, display)
     finally:
         services.end()
     if stop.is_set():
@@ -77,18 +86,19 @@ def train(
     return read_status(run_dir)
 
 
-def _watch(services: Local, endpoint: str, stop: threading.Event, display: Display | None) -> None:
+def _watch(
+    services: Local, address: Address, stop: threading.Event, display: Display | None
+) -> None:
     """Show the status until the services are done or ``stop`` is set."""
     give_up = _GiveUp(services, stop)
-    with sessions.connect(endpoint, _START_S, give_up) as session:
-        hello = sessions.find_run(session, None, _START_S, give_up)
+    with connected("observer", address, give_up) as (session, hello):
         asker = Asker(session, hello.run_id, "the display", give_up)
         while not stop.wait(_POLL_S):
             services.check()
             if services.done:
                 return
             try:
-                status = asker.ask(keys.STATUS, StatusRequest(), Status)
+                status = asker.ask(verbs.STATUS, StatusRequest(), Status)
             except (Unreachable, Interrupted) as error:
                 log.debug("no status: %s", error)
                 continue

@@ -9,8 +9,10 @@ import msgspec
 
 from udrl.errors import ConfigError, EnvironmentFault
 from udrl_launch import inspection
-from udrl_launch.commands.options import RUN, RUN_DIR
+from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
 from udrl_launch.display import panel
+from udrl_launch.roles import Address
+from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 
 
@@ -94,18 +96,24 @@ def reproduce(run_dir: Path, command_id: int) -> int:
 @click.argument("run_dir", type=RUN_DIR, required=False)
 @click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@KEYS
 @RUN
-def status(run_dir: Path | None, connect: str | None, as_json: bool, run_id: str | None) -> int:
+def status(
+    run_dir: Path | None, connect: str | None, as_json: bool, keys: Path | None, run_id: str | None
+) -> int:
     """Say how a run is doing, by its directory or its endpoint.
 
     Example: udrl status runs/mine
     """
     if (run_dir is None) == (connect is None):
         raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+    if keys is not None:
+        load(keys, "observer")
     if run_dir is not None:
-        found = inspection.status_of(run_dir)
+        found = inspection.status_of(run_dir, keys)
     else:
-        found = inspection.status_at(check_endpoint(connect or ""), run_id)
+        endpoint = check_endpoint(connect or "", secure=keys is not None)
+        found = inspection.status_at(Address(endpoint, run_id, keys=keys))
     if as_json:
         click.echo(msgspec.json.encode(found).decode())
     else:

@@ -64,6 +64,11 @@ def new_run_dir(settings: Settings) -> Path:
 PARENT = click.option("--parent", type=int, hidden=True)
 PATIENCE = click.option("--patience", type=click.FloatRange(0), default=3.0, show_default=True,
                          help="Seconds to look for the run.")  # fmt: skip
+KEYS = click.option(
+    "--keys", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    help="Authenticate and encrypt with these keys (`udrl keys create DIR`); endpoints are then "
+    "tls/HOST:PORT.",
+)  # fmt: skip
 RUN = click.option(
     "--run", "run_id", metavar="RUN_ID", help="Which run, where a router carries several."
 )

@@ -15,6 +15,7 @@ from udrl.errors import ConfigError, InexactArithmetic
 from udrl.numerics import STRICT_MKL
 from udrl_launch import roles
 from udrl_launch.commands.options import (
+    KEYS,
     PARENT,
     PATIENCE,
     RUN,
@@ -25,6 +26,8 @@ from udrl_launch.commands.options import (
 )
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Settings
+from udrl_proto.access import REPLAY
+from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 from udrl_replay.creation import create, exists, resume, write_config
 
@@ -48,6 +51,7 @@ def _as_service(parent: int | None, service: Callable[[threading.Event], None]) 
 @click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
 @click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
 @click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@KEYS
 @click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
 @PARENT
 def replay(
@@ -57,6 +61,7 @@ def replay(
     run_dir: Path | None,
     resume: bool,
     insecure: bool,
+    keys: Path | None,
     allow_inexact: bool,
     parent: int | None,
     **given: Any,
@@ -67,7 +72,8 @@ def replay(
     """
     if (listen is None) == (connect is None):
         raise ConfigError("give either --listen ENDPOINT or --connect ENDPOINT")
-    check_endpoint(listen or connect or "")
+    check_endpoint(listen or connect or "", secure=keys is not None)
+    credentials = load(keys, REPLAY) if keys else None
     settings = gather_settings(env, given, run_dir, go_on=resume)
     run_dir = run_dir or new_run_dir(settings)
 
@@ -75,8 +81,9 @@ def replay(
         log.info("the run's directory is %s", run_dir)
         store = _open(run_dir, settings, go_on=resume, allow_inexact=allow_inexact)
         roles.replay(
-            run_dir, store, settings.budget, stop, listen=listen, connect=connect, insecure=insecure
-        )
+            run_dir, store, settings.budget, stop, listen=listen, connect=connect,
+            insecure=insecure, credentials=credentials,
+        )  # fmt: skip
 
     return _as_service(parent, service)
 
@@ -97,15 +104,20 @@ def _open(run_dir: Path, settings: Settings, *, go_on: bool, allow_inexact: bool
     required=True,
     help="Where the run is, e.g. tcp/127.0.0.1:7447.",
 )
+@KEYS
 @PATIENCE
 @RUN
 @PARENT
-def learner(connect: str, patience: float, run_id: str | None, parent: int | None) -> int:
+def learner(
+    connect: str, keys: Path | None, patience: float, run_id: str | None, parent: int | None
+) -> int:
     """Start the learner of a run.
 
     Example: udrl learner --connect tcp/127.0.0.1:7447
     """
-    address = roles.Address(check_endpoint(connect), run_id, patience)
+    address = roles.Address(
+        check_endpoint(connect, secure=keys is not None), run_id, patience, keys
+    )
     return _as_service(parent, partial(roles.learner, address))
 
 
@@ -121,6 +133,7 @@ def learner(connect: str, patience: float, run_id: str | None, parent: int | Non
 @click.option("--nice", type=click.IntRange(0, 19), default=0, help="Yield to other processes.")
 @click.option("--hang-timeout", type=click.FloatRange(1), default=60.0, show_default=True,
               help="Seconds of one round of steps after which the process ends.")  # fmt: skip
+@KEYS
 @PATIENCE
 @RUN
 @PARENT
@@ -129,6 +142,7 @@ def actor(
     envs: int,
     nice: int,
     hang_timeout: float,
+    keys: Path | None,
     patience: float,
     run_id: str | None,
     parent: int | None,
@@ -138,7 +152,9 @@ def actor(
     Example: udrl actor --connect tcp/127.0.0.1:7447 --envs 16
     """
     os.nice(nice)
-    address = roles.Address(check_endpoint(connect), run_id, patience)
+    address = roles.Address(
+        check_endpoint(connect, secure=keys is not None), run_id, patience, keys
+    )
     code = _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))
     if code == InexactArithmetic.exit_code and not STRICT_MKL.items() <= os.environ.items():
         log.warning("starting again with slower arithmetic that is exact")

@@ -10,7 +10,13 @@ import msgspec
 
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch import inspection
-from udrl_launch.commands.options import RUN_DIR, gather_settings, new_run_dir, settings_options
+from udrl_launch.commands.options import (
+    KEYS,
+    RUN_DIR,
+    gather_settings,
+    new_run_dir,
+    settings_options,
+)
 from udrl_launch.curve import draw
 from udrl_launch.display import Display
 from udrl_launch.process import log_to_stderr, run_service
@@ -35,6 +41,7 @@ log = logging.getLogger("udrl")
     help="Endpoint, e.g. tcp/127.0.0.1:7447. Default: a free loopback port.",
 )
 @click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@KEYS
 @click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
 @click.option(
     "--json", "as_json", is_flag=True, help="End with the final status as a line of JSON."
@@ -46,6 +53,7 @@ def train(
     in_process: bool,
     listen: str | None,
     insecure: bool,
+    keys: Path | None,
     allow_inexact: bool,
     as_json: bool,
     **given: Any,
@@ -65,7 +73,8 @@ def train(
         with Display() as display:
             status = run_training(
                 settings, run_dir, stop, go_on=resume, in_process=in_process,
-                allow_inexact=allow_inexact, listen=listen, insecure=insecure, display=display,
+                allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
+                display=display,
             )  # fmt: skip
         _finish(run_dir, status)
         if as_json:

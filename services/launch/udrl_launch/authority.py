@@ -1,0 +1,164 @@
+"""Making keys: a private authority, and a certificate for each role of a run.
+
+Importing this needs the extra ``secure``.
+"""
+
+import ipaddress
+import os
+import re
+import secrets
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from udrl.errors import ConfigError
+from udrl_proto.access import REPLAY, ROLES
+from udrl_proto.credentials import CA, CERTIFICATE, KEY
+
+#: Where the authority itself is kept, beside the roles' folders; it goes to no other machine.
+AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
+
+_ALWAYS = ("localhost", "127.0.0.1", "::1")
+_LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
+_HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(?:\.{_LABEL})*")
+#: Clocks of machines differ: a certificate is valid a little before it was made.
+_CLOCKS_DIFFER = timedelta(hours=1)
+
+
+def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta(365)) -> None:
+    """Make an authority, and a folder with key and certificate for each role.
+
+    Args:
+        folder: where; it must not exist, or be empty.
+        hosts: names and IP addresses by which others reach the replay service; those of the
+            loopback interface are always among them.
+        valid: how long everything is.
+
+    Raises:
+        ConfigError: a host is none, or the folder holds something or cannot be written.
+    """
+    names = [_alternative(host) for host in dict.fromkeys((*_ALWAYS, *hosts))]
+    authority = _Authority(valid)
+    files = {
+        Path(AUTHORITY, CA): authority.certificate,
+        Path(AUTHORITY, AUTHORITY_KEY): _pem(authority.key),
+    }
+    for role in ROLES:
+        key = ec.generate_private_key(ec.SECP256R1())
+        files[Path(role, CA)] = authority.certificate
+        files[Path(role, CERTIFICATE)] = authority.issue(
+            role, key.public_key(), names if role == REPLAY else []
+        )
+        files[Path(role, KEY)] = _pem(key)
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise ConfigError(
+                f"{folder} is not empty, and keys are never overwritten; name another folder, or "
+                f"remove this one first"
+            )
+        _write(folder, files)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot write keys to {folder}: {error.strerror}; name another folder"
+        ) from error
+
+
+class _Authority:
+    """Issues certificates; nobody else's are trusted by those who hold one."""
+
+    def __init__(self, valid: timedelta) -> None:
+        self.key = ec.generate_private_key(ec.SECP256R1())
+        now = datetime.now(UTC)
+        self._valid = now - _CLOCKS_DIFFER, now + valid
+        # Names differ, so that one authority is never taken for another with the same name.
+        self._name = _name(f"udrl authority {secrets.token_hex(4)}")
+        self.certificate = self._signed(
+            self._builder(self._name, self.key.public_key())
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(signs_certificates=True), critical=True)
+        )
+
+    def issue(
+        self, role: str, key: ec.EllipticCurvePublicKey, names: list[x509.GeneralName]
+    ) -> bytes:
+        """Return a certificate, in PEM; only one with names is good for a server."""
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        builder = self._builder(_name(role), key)
+        if names:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        return self._signed(
+            builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs_certificates=False), critical=True)
+        )
+
+    def _builder(
+        self, subject: x509.Name, key: ec.EllipticCurvePublicKey
+    ) -> x509.CertificateBuilder:
+        ours = self.key.public_key()
+        return (
+            x509.CertificateBuilder()
+            .subject_name(subject)
+            .issuer_name(self._name)
+            .public_key(key)
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(self._valid[0])
+            .not_valid_after(self._valid[1])
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(ours), critical=False)
+        )
+
+    def _signed(self, builder: x509.CertificateBuilder) -> bytes:
+        return builder.sign(self.key, SHA256()).public_bytes(Encoding.PEM)
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _alternative(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        if _HOST.fullmatch(host):
+            return x509.DNSName(host)
+    raise ConfigError(
+        f"--host {host!r}: expected a host name or an IP address without a port, e.g. "
+        f"replay.example.org or 10.0.0.1"
+    )
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _write(folder: Path, files: dict[Path, bytes]) -> None:
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path, content in files.items():
+        (folder / path).parent.mkdir(mode=0o700, exist_ok=True)
+        mode = 0o600 if path.name in (KEY, AUTHORITY_KEY) else 0o644
+        with os.fdopen(
+            os.open(folder / path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb"
+        ) as file:
+            file.write(content)

@@ -1,0 +1,116 @@
+"""Runs with keys give what runs without give, and show nobody a key."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from test_bad_input import free_port
+from test_commands import toml
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch.cli import cli as command_line
+from udrl_launch.inspection import status_of
+from udrl_proto.messages import Status
+from whole_run import (
+    SMALL,
+    TOY,
+    Cli,
+    arguments,
+    digests,
+    kill_at,
+    live_status,
+    small,
+    toy,
+    wait_for,
+)
+
+BUDGET = 3000
+
+
+def secrets_of(keys_dir: Path) -> list[str]:
+    """Return a line of each private key."""
+    files = [*keys_dir.rglob("key.pem"), *keys_dir.rglob("ca.key")]
+    assert len(files) == 5
+    return [file.read_text().splitlines()[1] for file in files]
+
+
+def test_run_with_keys_equals_one_without(run: Callable[..., Status], keys_dir: Path) -> None:
+    assert digests(run(small(), BUDGET, actors=2, keys=keys_dir)) == digests(run(small(), BUDGET))
+
+
+def test_services_that_have_only_their_own_keys_equal_one_process(
+    cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
+) -> None:
+    port, run_dir = free_port(), tmp_path / "run"
+    config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
+    # Beyond loopback, and without --insecure.
+    replay = cli(
+        "replay", "CartPole-v1", "--listen", f"tls/0.0.0.0:{port}", "--run-dir", str(run_dir),
+        "--config", str(config), "--keys", str(keys_dir / "replay"),
+    )  # fmt: skip
+    others = [
+        cli(role, "--connect", f"tls/localhost:{port}", "--keys", str(keys_dir / role))
+        for role in ("learner", "actor")
+    ]
+    for process in (replay, *others):
+        code, out, error = process.finish()
+        assert code == 0, error
+        assert not [secret for secret in secrets_of(keys_dir) if secret in out + error]
+    status = live_status(run_dir)
+    assert status is not None
+    assert digests(status) == digests(run(small(), BUDGET))
+
+
+def test_killed_services_come_back_with_their_keys(
+    cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    given = arguments(SMALL, 2 * BUDGET, run_dir)
+    process = cli(*given, "--actors", "1", "--keys", str(keys_dir))
+    kill_at(process, run_dir, "replay", 1)
+    kill_at(process, run_dir, "actor", 4)
+    assert digests(process.status()) == digests(run(small(), 2 * BUDGET))
+
+
+def test_status_of_a_live_run_needs_an_observers_key(
+    cli: Callable[..., Cli], keys_dir: Path, foreign_keys_dir: Path, tmp_path: Path
+) -> None:
+    endpoint, run_dir = f"tls/127.0.0.1:{free_port()}", tmp_path / "run"
+    cli(
+        *arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1",
+        "--keys", str(keys_dir),
+    )  # fmt: skip
+
+    def actors() -> list[int]:
+        try:
+            return [a.environments for a in status_of(run_dir, keys_dir / "observer").actors]
+        except UdrlError:  # there is no run yet
+            return []
+
+    wait_for(lambda: actors() == [16], "an actor")
+    assert status_of(run_dir).actors == ()  # without a key it is what the store says
+    status = cli("status", "--connect", endpoint, "--keys", str(keys_dir), "--json").status()
+    assert status.state == "running"
+    for keys, remedy in [
+        ((), "add --keys DIR"),
+        (("--keys", str(foreign_keys_dir)), "same `udrl keys create`"),
+        (("--keys", str(keys_dir / "actor")), "'observer' is needed"),
+    ]:
+        result = CliRunner().invoke(command_line, ["status", "--connect", endpoint, *keys])
+        assert isinstance(result.exception, ConfigError)
+        assert remedy in str(result.exception)
+    logs = "".join(path.read_text() for path in (run_dir / "logs").iterdir())
+    assert logs
+    assert not [secret for secret in secrets_of(keys_dir) if secret in logs]
+
+
+def test_keys_that_cannot_be_used_are_refused_before_anything_is_written(
+    run: Callable[..., Status], keys_dir: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    with pytest.raises(ConfigError, match=r"nowhere.ca\.pem: No such file"):
+        run(toy(), 100, run_dir=run_dir, keys=tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="'actor', 'replay' is needed"):
+        run(toy(), 100, run_dir=run_dir, keys=keys_dir / "actor")
+    assert not run_dir.exists()

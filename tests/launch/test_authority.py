@@ -1,0 +1,93 @@
+"""``udrl keys create``: what it makes, and what it refuses."""
+
+import stat
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from udrl.errors import ConfigError
+from udrl_launch import authority
+from udrl_launch.cli import cli
+from udrl_proto.access import ROLES
+from udrl_proto.credentials import load
+
+
+def certificate(folder: Path, role: str) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((folder / role / "cert.pem").read_bytes())
+
+
+def test_command_makes_keys_for_each_role(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "keys"
+    result = CliRunner().invoke(cli, ["keys", "create", str(folder), "--days", "10"])
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in folder.iterdir()} == {"ca", *ROLES}
+    assert all(f"{folder / role}: " in result.output for role in ROLES)
+    assert "stays here" in result.output
+    now = datetime.now(UTC)
+    for role in ROLES:
+        load(folder, role)
+        left = certificate(folder, role).not_valid_after_utc - now
+        assert timedelta(days=9, hours=23) < left <= timedelta(days=10)
+
+
+def test_private_keys_are_for_their_owner_only_and_all_different(tmp_path: Path) -> None:
+    authority.create(tmp_path / "keys")
+    private = [*tmp_path.rglob("key.pem"), *tmp_path.rglob("ca.key")]
+    assert len({path.read_bytes() for path in private}) == len(ROLES) + 1
+    assert {stat.S_IMODE(path.stat().st_mode) for path in private} == {0o600}
+    folders = [path for path in tmp_path.rglob("*") if path.is_dir()]
+    assert {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
+    assert [path.parent.name for path in tmp_path.rglob("ca.key")] == ["ca"]
+
+
+def test_only_the_replay_service_gets_a_servers_certificate(tmp_path: Path) -> None:
+    authority.create(tmp_path, ["replay.example.org", "10.0.0.1", "fd00::1", "localhost"])
+    for role in ROLES:
+        found = certificate(tmp_path, role).extensions
+        purposes = found.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert (ExtendedKeyUsageOID.SERVER_AUTH in purposes) == (role == "replay")
+        assert ExtendedKeyUsageOID.CLIENT_AUTH in purposes
+        assert not found.get_extension_for_class(x509.BasicConstraints).value.ca
+    names = (
+        certificate(tmp_path, "replay")
+        .extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        .value
+    )
+    assert [str(name.value) for name in names] == [
+        "localhost", "127.0.0.1", "::1", "replay.example.org", "10.0.0.1", "fd00::1",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("host", ["", "a b", "tls/a:1", "a:1", "-a", "a..b", "ä", "a" * 64, "*.a"])
+def test_host_that_is_none_is_named_and_nothing_is_written(host: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--host .*: expected a host name or an IP address"):
+        authority.create(tmp_path / "keys", [host])
+    assert not (tmp_path / "keys").exists()
+
+
+def test_keys_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
+    authority.create(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
+    with pytest.raises(ConfigError, match=r"is not empty.*never overwritten.*another folder"):
+        authority.create(tmp_path)
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
+
+
+def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "keys"):
+        with pytest.raises(ConfigError, match=rf"cannot write keys to {folder}: Not a directory"):
+            authority.create(folder)
+
+
+def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "udrl_launch.authority")
+    monkeypatch.delattr("udrl_launch.authority")
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(ConfigError, match=r'keys needs .*pip install "udrl\[secure\]"'):
+        cli(["keys", "create", str(tmp_path / "keys")], standalone_mode=False)

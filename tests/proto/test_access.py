@@ -1,0 +1,364 @@
+"""Who has no key gets in nowhere, and who has one does what its role may, and nothing else."""
+
+import json
+import queue
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tests.markdown import section
+from udrl.errors import ConfigError, Unreachable
+from udrl_launch import authority
+from udrl_proto import keys
+from udrl_proto import session as sessions
+from udrl_proto.access import RIGHTS, ROLES
+from udrl_proto.credentials import Credentials, load
+from whole_run import wait_for
+
+DEADLINE_S = 10.0
+
+#: Written out here once more, so that no slip in the table goes unseen.
+MAY_ASK = {
+    "learner": {"hello", "join", "changes", "episodes", "version", "state"},
+    "actor": {"hello", "join", "commands", "episode", "failure", "weights"},
+    "observer": {"hello", "status", "weights"},
+    "replay": set(),
+}
+
+Connect = Callable[..., zenoh.Session]
+
+
+@pytest.fixture
+def secure_endpoint(endpoint: str) -> str:
+    return endpoint.replace("tcp", "tls")
+
+
+class Replay:
+    """Stands for the replay service: hosts the router, answers every verb."""
+
+    def __init__(self, endpoint: str, credentials: Credentials | None) -> None:
+        self.session = sessions.listen(endpoint, credentials=credentials)
+        self.asked: list[str] = []
+        self.heard: list[tuple[str, str]] = []
+        self.tokens: queue.Queue[str] = queue.Queue()
+        for verb in keys.VERBS:
+            key = keys.key("run", verb)
+            self.session.declare_queryable(key, partial(self._answer, key), complete=True)
+        self.session.declare_subscriber("**", self._hear)
+        self.session.liveliness().declare_subscriber(keys.alive("run", "*", "*"), self._note)
+
+    def _answer(self, key: str, query: zenoh.Query) -> None:
+        with query:
+            self.asked.append(key)
+            query.reply(key, b"replay")
+
+    def _note(self, token: zenoh.Sample) -> None:
+        if token.kind == zenoh.SampleKind.PUT:
+            self.tokens.put(str(token.key_expr))
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.heard.append((str(sample.key_expr), sample.payload.to_string()))
+
+
+@pytest.fixture
+def replay(secure_endpoint: str, keys_dir: Path) -> Iterator[Replay]:
+    one = Replay(secure_endpoint, load(keys_dir, "replay"))
+    with one.session:
+        yield one
+
+
+@pytest.fixture
+def connect(replay: Replay, secure_endpoint: str, keys_dir: Path) -> Iterator[Connect]:
+    """Connect with a role's key."""
+    with ExitStack() as stack:
+
+        def client(role: str) -> zenoh.Session:
+            credentials = load(keys_dir, role)
+            session = sessions.connect(secure_endpoint, DEADLINE_S, credentials=credentials)
+            return stack.enter_context(session)
+
+        yield client
+
+
+def ask(session: zenoh.Session, verb: str) -> list[str]:
+    """Return who answers a query, of all that could."""
+    replies = session.get(
+        keys.key("run", verb),
+        timeout=DEADLINE_S,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
+    return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+
+
+class Heard:
+    """What a subscriber was sent; one that waits for a certain message is woken by it."""
+
+    def __init__(self, session: zenoh.Session, *expressions: str) -> None:
+        self.messages: list[tuple[str, str]] = []
+        self._changed = threading.Condition()
+        for expression in expressions:
+            session.declare_subscriber(expression, self._note)
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        with self._changed:
+            self.messages.append((str(sample.key_expr), sample.payload.to_string()))
+            self._changed.notify_all()
+
+    def wait_for(self, text: str) -> None:
+        with self._changed:
+            there = self._changed.wait_for(
+                lambda: any(text == message for _, message in self.messages), DEADLINE_S
+            )
+        assert there, f"{text!r} did not come; there is {self.messages}"
+
+
+# Getting in.
+
+
+def raw(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
+    """Return settings that no program of ours would use."""
+    config = zenoh.Config()
+    given = {f"transport/link/tls/{name}": str(value) for name, value in tls.items()}
+    for name, value in {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": 1000,
+        "connect/exit_on_failure": True,
+        "listen/endpoints": [],
+        **given,
+    }.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def test_without_a_certificate_nobody_gets_in(
+    replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
+) -> None:
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(raw(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
+    with pytest.raises(Unreachable, match="nobody answers"):
+        sessions.connect(secure_endpoint.replace("tls", "tcp"), patience_s=0.1)
+    assert ask(connect("actor"), keys.HELLO) == ["replay"]
+
+
+def test_key_of_another_authority_is_refused_by_both_sides(
+    replay: Replay, secure_endpoint: str, keys_dir: Path, foreign_keys_dir: Path
+) -> None:
+    foreign = load(foreign_keys_dir, "actor")
+    with pytest.raises(ConfigError, match=r"not trusted.*same `udrl keys create`"):
+        sessions.connect(secure_endpoint, DEADLINE_S, credentials=foreign)
+    # One that would trust this server is not trusted by it.
+    foreign = foreign._replace(ca=keys_dir / "actor" / "ca.pem")
+    with pytest.raises(ConfigError, match=r"does not trust .*cert\.pem .*same `udrl keys create`"):
+        sessions.connect(secure_endpoint, DEADLINE_S, credentials=foreign)
+
+
+@pytest.mark.parametrize("role", list(RIGHTS))
+def test_only_the_replay_service_can_be_a_server(
+    role: str, secure_endpoint: str, keys_dir: Path
+) -> None:
+    with (
+        sessions.listen(secure_endpoint, credentials=load(keys_dir, role)),
+        pytest.raises(ConfigError, match="is not trusted"),
+    ):
+        sessions.connect(secure_endpoint, DEADLINE_S, credentials=load(keys_dir, "learner"))
+
+
+def test_server_of_another_name_is_refused(secure_endpoint: str, keys_dir: Path) -> None:
+    everywhere = secure_endpoint.replace("127.0.0.1", "0.0.0.0")
+    other = secure_endpoint.replace("127.0.0.1", "127.0.0.2")
+    with (
+        sessions.listen(everywhere, credentials=load(keys_dir, "replay")),
+        pytest.raises(ConfigError, match=r"not trusted.*mismatch.* --host 127\.0\.0\.2"),
+    ):
+        sessions.connect(other, DEADLINE_S, credentials=load(keys_dir, "actor"))
+
+
+def test_nobody_at_a_secure_endpoint_is_said_in_time(secure_endpoint: str, keys_dir: Path) -> None:
+    with pytest.raises(Unreachable, match="nobody answers"):
+        sessions.connect(secure_endpoint, 0.1, credentials=load(keys_dir, "actor"))
+
+
+def test_link_is_closed_when_the_keys_expire(secure_endpoint: str, tmp_path: Path) -> None:
+    authority.create(tmp_path, valid=timedelta(seconds=4))
+    with (
+        sessions.listen(secure_endpoint, credentials=load(tmp_path, "replay")),
+        sessions.connect(secure_endpoint, 3, credentials=load(tmp_path, "actor")) as client,
+    ):
+        assert list(client.info.routers_zid())
+        wait_for(lambda: not list(client.info.routers_zid()), "the end of the link")
+    with pytest.raises(ConfigError, match="expired"):
+        load(tmp_path, "actor")
+
+
+# Asking and answering.
+
+
+@pytest.mark.parametrize("role", MAY_ASK)
+def test_role_gets_answers_to_its_own_verbs_only(
+    role: str, replay: Replay, connect: Connect
+) -> None:
+    client = connect(role)
+    assert {verb for verb in keys.VERBS if ask(client, verb)} == MAY_ASK[role]
+    assert replay.asked == [keys.key("run", verb) for verb in keys.VERBS if verb in MAY_ASK[role]]
+
+
+@pytest.mark.parametrize("expression", ["udrl/**", "udrl/1/run/*", "**", "udrl/*/*/st*"])
+def test_wildcards_open_nothing(expression: str, replay: Replay, connect: Connect) -> None:
+    client = connect("actor")
+    expression = expression.replace("st*", "st$*")
+    assert list(client.get(expression, timeout=DEADLINE_S, target=zenoh.QueryTarget.ALL)) == []
+    assert len(list(client.get(keys.every_hello(), timeout=DEADLINE_S))) == 1
+    assert replay.asked == [keys.key("run", keys.HELLO)]
+
+
+def pose_as_replay(thief: zenoh.Session) -> list[str]:
+    """Answer every verb; return where the questions will be noted."""
+    stolen: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            stolen.append(str(query.key_expr))
+            query.reply(query.key_expr, b"thief")
+
+    for expression in [*(keys.key("run", verb) for verb in keys.VERBS), "udrl/**"]:
+        thief.declare_queryable(expression, answer, complete=True)
+    # What was declared before this token is known to the router when the token is.
+    thief.liveliness().declare_token(keys.alive("run", "actor", "thief"))
+    return stolen
+
+
+def test_nobody_answers_in_the_replay_services_place(replay: Replay, connect: Connect) -> None:
+    stolen = pose_as_replay(connect("actor"))
+    assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
+    for role, verbs in MAY_ASK.items():
+        victim = connect(role)
+        for verb in verbs:
+            assert ask(victim, verb) == ["replay"]
+    assert stolen == []
+
+
+def test_peer_with_an_actors_key_may_no_more_than_a_client(
+    replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
+) -> None:
+    own = load(keys_dir, "actor")
+    tls = {
+        "root_ca_certificate": own.ca,
+        "connect_certificate": own.certificate,
+        "connect_private_key": own.key,
+    }
+    config = raw(secure_endpoint, mode="peer", **tls)
+    config.insert_json5("transport/link/tls/enable_mtls", "true")
+    with zenoh.open(config) as thief:
+        stolen = pose_as_replay(thief)
+        assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
+        assert ask(connect("learner"), keys.STATE) == ["replay"]
+        assert stolen == []
+
+
+def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
+    """The control: what the tests above see refused is possible where nobody is asked."""
+    replay = Replay(endpoint, None)
+    with (
+        replay.session,
+        sessions.connect(endpoint, DEADLINE_S) as thief,
+        sessions.connect(endpoint, DEADLINE_S) as victim,
+    ):
+        stolen = pose_as_replay(thief)
+        replay.tokens.get(timeout=DEADLINE_S)
+        assert "thief" in ask(victim, keys.STATE)
+        assert stolen
+
+
+# Publishing and being here.
+
+
+@pytest.mark.parametrize("mallory", ["actor", "observer", "replay"])
+def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connect: Connect) -> None:
+    heard = Heard(connect("actor"), keys.key("run", keys.NEW_WEIGHTS))
+    thief = connect(mallory)
+    for name in (keys.NEW_WEIGHTS, keys.PROGRESS, keys.EPISODE):
+        thief.put(keys.key("run", name), b"false")
+    thief.delete(keys.key("run", keys.NEW_WEIGHTS))
+    ask(thief, keys.HELLO)  # when this ends the router has seen what was sent before
+    connect("learner").put(keys.key("run", keys.NEW_WEIGHTS), b"true")
+    heard.wait_for("true")
+    expected = [(keys.key("run", keys.NEW_WEIGHTS), "true")]
+    assert heard.messages == expected
+    assert replay.heard == expected
+
+
+def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> None:
+    progress, weights = (keys.key("run", name) for name in (keys.PROGRESS, keys.NEW_WEIGHTS))
+    everything = ("udrl/**", progress, weights)
+    learner, actor = connect("learner"), connect("actor")
+    of_learner, of_actor = Heard(learner, *everything), Heard(actor, *everything)
+    of_observer = Heard(connect("observer"), *everything)
+    for client in (learner, actor):
+        ask(client, keys.HELLO)  # when this ends the router knows the subscriptions
+    replay.session.put(weights, b"weights")
+    replay.session.put(progress, b"progress")
+    of_actor.wait_for("weights")
+    of_learner.wait_for("progress")
+    assert {key for key, _ in of_actor.messages} == {weights}
+    assert {key for key, _ in of_learner.messages} == {progress}
+    assert of_observer.messages == []
+
+
+def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> None:
+    learner = connect("learner")
+    heard = Heard(connect("learner"), keys.key("run", keys.PROGRESS))
+    learner.put(keys.key("run", keys.PROGRESS), b"false")
+    ask(learner, keys.HELLO)
+    replay.session.put(keys.key("run", keys.PROGRESS), b"true")
+    heard.wait_for("true")
+    assert heard.messages == [(keys.key("run", keys.PROGRESS), "true")]
+
+
+@pytest.mark.parametrize(("role", "other"), [("actor", "learner"), ("learner", "actor")])
+def test_role_is_here_under_its_own_name_only(
+    role: str, other: str, replay: Replay, connect: Connect
+) -> None:
+    client = connect(role)
+    client.liveliness().declare_token(keys.alive("run", other, "one"))
+    client.liveliness().declare_token(keys.alive("run", role, "two"))
+    assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", role, "two")
+    # Nor does it see who else is here.
+    assert list(connect(other).liveliness().get("udrl/**", timeout=DEADLINE_S)) == []
+    assert replay.tokens.empty()
+
+
+# The table.
+
+
+def test_table_of_rights_is_documented() -> None:
+    found = {}
+    for line in section("docs/protocol.md", "## Who may do what").splitlines():
+        if line.startswith("| `"):
+            cells = [re.findall(r"`([^`]+)`", cell) for cell in line.strip("|").split("|")]
+            (role,), asks, hears, says, tokens = cells
+            found[role] = set(asks), set(hears), set(says), tokens
+    assert found == {
+        role: (
+            set(rights.asks),
+            set(rights.hears),
+            set(rights.says),
+            [f"alive/{role}/*"] if rights.joins else [],
+        )
+        for role, rights in RIGHTS.items()
+    }
+
+
+def test_every_verb_is_somebodys() -> None:
+    assert {verb for rights in RIGHTS.values() for verb in rights.asks} == set(keys.VERBS)
+    assert set(ROLES) == set(MAY_ASK)

@@ -1,0 +1,127 @@
+"""Keys that do not fit are named, with the remedy, before anybody is talked to."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from udrl.errors import ConfigError
+from udrl_launch import authority
+from udrl_proto.access import ROLES
+from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
+
+
+@pytest.fixture
+def folder(keys_dir: Path, tmp_path: Path) -> Path:
+    """The actor's own folder, a copy."""
+    return shutil.copytree(keys_dir / "actor", tmp_path / "mine")
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_whole_folder_and_own_folder_are_the_same(role: str, keys_dir: Path) -> None:
+    assert load(keys_dir, role) == load(keys_dir / role, role)
+
+
+def test_copied_folder_may_have_any_name(folder: Path) -> None:
+    assert load(folder, "actor").key == folder / KEY
+
+
+@pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
+def test_missing_file_is_named(name: str, folder: Path) -> None:
+    (folder / name).unlink()
+    with pytest.raises(ConfigError, match=rf"{name}: No such file.*`udrl keys create`.*actor$"):
+        load(folder, "actor")
+
+
+@pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
+def test_unreadable_file_is_named(name: str, folder: Path) -> None:
+    (folder / name).unlink()
+    (folder / name).mkdir()  # no mode keeps root from reading
+    with pytest.raises(ConfigError, match=rf"{name}: Is a directory.*`udrl keys create`"):
+        load(folder, "actor")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\x00", b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"]
+)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [(CA, "a certificate"), (CERTIFICATE, "a certificate"), (KEY, "a private key")],
+)
+def test_damaged_file_is_named(name: str, kind: str, content: bytes, folder: Path) -> None:
+    (folder / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"{name}: not {kind} in PEM.*copy it again"):
+        load(folder, "actor")
+
+
+def test_key_of_another_certificate_is_named(folder: Path, keys_dir: Path) -> None:
+    shutil.copy(keys_dir / "learner" / KEY, folder)
+    with pytest.raises(ConfigError, match=r"key\.pem is not the key of .*cert\.pem; copy both"):
+        load(folder, "actor")
+
+
+def test_certificate_of_another_authority_is_named(folder: Path, foreign_keys_dir: Path) -> None:
+    shutil.copy(foreign_keys_dir / "actor" / CA, folder)
+    with pytest.raises(ConfigError, match=r"cert\.pem was not issued by .*ca\.pem; copy both"):
+        load(folder, "actor")
+
+
+def test_certificate_of_another_role_is_named(folder: Path) -> None:
+    with pytest.raises(ConfigError, match=r"for the role 'actor', 'learner' is needed.*folder"):
+        load(folder, "learner")
+
+
+def _until_a_minute_ago(folder: Path) -> None:
+    authority.create(folder, valid=timedelta(minutes=-1))
+
+
+def _from_tomorrow(folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(authority, "_CLOCKS_DIFFER", timedelta(days=-1))
+        authority.create(folder, valid=timedelta(days=2))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (_until_a_minute_ago, "expired at 20.*UTC; make new keys"),
+        (_from_tomorrow, "valid from 20.*clock here says 20.*set it right"),
+    ],
+)
+def test_certificate_that_is_not_valid_now_is_named(
+    make: Callable[[Path], None], said: str, tmp_path: Path
+) -> None:
+    make(tmp_path)
+    with pytest.raises(ConfigError, match=rf"ca\.pem.*{said}"):
+        load(tmp_path, "actor")
+
+
+def test_key_that_others_can_read_is_warned_of(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    load(folder, "actor")
+    assert caplog.messages == []
+    (folder / KEY).chmod(0o640)
+    load(folder, "actor")
+    assert caplog.messages == [f"{folder / KEY} can be read by others; chmod 600 it"]
+
+
+def test_settings_hold_paths_only(folder: Path) -> None:
+    config = zenoh.Config()
+    for name, value in load(folder, "actor").settings().items():
+        config.insert_json5(name, json.dumps(value))
+    assert str(folder / KEY) in str(config)
+    assert (folder / KEY).read_text().splitlines()[1] not in str(config)
+
+
+def test_missing_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "udrl_proto.certificates", raising=False)
+    monkeypatch.delattr("udrl_proto.certificates", raising=False)
+    monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)
+    with pytest.raises(ConfigError, match=r'--keys needs .*pip install "udrl\[secure\]"'):
+        load(folder, "actor")
