@@ -7,6 +7,9 @@ From these::
 
     limit = cores / (step + inference + update x updates per env step)
 
+The same parts are then timed in one process per core at once: cores share caches, memory, clock and
+perhaps execution units, so that what all of them do together is less than so many times one.
+
 Run it on an otherwise idle machine: ``make bench``.
 """
 
@@ -41,8 +44,9 @@ from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 from udrl_launch.inspection import load_agent, status_of
-from udrl_proto.codec import LARGEST, decode, decode_episode
+from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
+from udrl_replay.run import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -73,8 +77,12 @@ def main() -> None:
     parser.add_argument("--lead", type=int)
     parser.add_argument("--actors", type=int)
     parser.add_argument("--envs-per-actor", type=int)
+    parser.add_argument("--parts", type=Path, metavar="RUN_DIR", help="time a run's parts only")
     options = parser.parse_args()
     use_one_thread()
+    if options.parts:
+        print(json.dumps(_parts(*_recorded(options.parts))))
+        return
     print(f"machine: {_machine()}")
     rows = [measure(options, Path(folder)) for folder in _folders(options.repeats)]
     for name in rows[0]:
@@ -101,15 +109,14 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     run_dir = folder / "run"
     status, replay_cpu = _train(options, run_dir)
     window = _window(run_dir)
-    with closing(Store(run_dir, read_only=True)) as store:
-        config = store.fact("hello", Hello).config
-        held = [p.entry.id for p in store.buffer(status["iteration"])]
-        bodies = [store.episode_bodies([i], LARGEST)[0] for i in held]
-    episodes = [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in bodies]
-    parts = _parts(config, episodes)
+    config, episodes = _recorded(run_dir)
     cores = os.cpu_count() or 1
     per_step = config.n_updates_per_iter * window.iterations / window.steps
-    limit = cores / (parts.step + parts.inference + parts.update * per_step)
+
+    def limit(parts: Parts) -> float:
+        return cores / (parts.step + parts.inference + parts.update * per_step)
+
+    parts, busy = _time_parts(run_dir, 1), _time_parts(run_dir, cores)
     system = window.steps / window.seconds
     return {
         "bare environment step, us": parts.step * 1e6,
@@ -117,14 +124,19 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "inference, us per row (full call)": parts.inference * 1e6,
         "update, ms": parts.update * 1e3,
         "updates per env step": per_step,
-        "limit, env steps/s": limit,
+        "limit, env steps/s": limit(parts),
         "system, env steps/s": system,
-        "system / limit": system / limit,
+        "system / limit": system / limit(parts),
+        "bare environment step while every core makes them, us": busy.step * 1e6,
+        "update while every core makes them, ms": busy.update * 1e3,
+        "limit while every core is busy, env steps/s": limit(busy),
+        "system / limit while every core is busy": system / limit(busy),
         "reference implementation (1 core), env steps/s": _reference_speed(config),
         "replay service, CPU ms per episode (start-up included)": 1e3
          * replay_cpu / status["episodes"]["delivered"],
-        "episode on the wire, bytes per env step": sum(map(len, bodies))
-        / sum(e.length for e in episodes),
+        "episode on the wire, bytes per env step": sum(
+            len(encode_episode(e, "actor")) for e in episodes
+        ) / sum(e.length for e in episodes),
         "weights, bytes per iteration": len(load_agent(run_dir).weights),
         "weights trained to weights acting, ms": 1e3 * status["weights_lag_s"],
     }  # fmt: skip
@@ -173,6 +185,25 @@ def _window(run_dir: Path) -> Window:
     return Window(
         float(rows[-1]["wall_s"]) - float(rows[0]["wall_s"]), total[-1] - total[0], len(rows) - 1
     )
+
+
+def _recorded(run_dir: Path) -> tuple[Config, list[Episode]]:
+    """Return a run's settings and the episodes in its buffer."""
+    with closing(Store(run_dir, read_only=True)) as store:
+        config = store.fact("hello", Hello).config
+        held = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
+        bodies = [store.episode_bodies([i], LARGEST)[0] for i in held]
+    return config, [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in bodies]
+
+
+def _time_parts(run_dir: Path, processes: int) -> Parts:
+    """Return the mean of what so many processes find that time the parts at once."""
+    command = [sys.executable, __file__, "--parts", str(run_dir)]
+    running = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)
+    ]
+    found = [Parts(*json.loads(process.communicate()[0])) for process in running]
+    return Parts(*map(statistics.fmean, zip(*found, strict=True)))
 
 
 def _parts(config: Config, episodes: list[Episode]) -> Parts:
