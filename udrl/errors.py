@@ -18,6 +18,7 @@
     │   ├── OtherConfiguration       it belongs to another configuration
     │   └── DamagedStore             its content is not what was written
     ├── RunFailed                the run cannot go on
+    │   └── Deceived                 an actor lied, and the run has learned from it
     └── Interrupted              a wait that ended because the process was told to stop
 
 A message names the value, what was expected, and the remedy. ``exit_code`` is what a command ends
@@ -113,6 +114,12 @@ class RunFailed(UdrlError):
     """The run cannot go on, whoever works on it."""
 
     exit_code = 9
+
+
+class Deceived(RunFailed):
+    """An actor lied, and the run has learned from its episodes."""
+
+    exit_code = 10
 
 
 class Interrupted(UdrlError):

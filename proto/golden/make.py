@@ -22,6 +22,7 @@ from udrl_proto.codec import decode, encode, encode_array, encode_episode
 from udrl_proto.messages import (
     Acknowledged,
     ActorStatus,
+    AuditStatus,
     BufferStatus,
     ChangesReply,
     ChangesRequest,
@@ -42,6 +43,7 @@ from udrl_proto.messages import (
     Message,
     Problem,
     Progress,
+    Quarantined,
     StateReply,
     StateRequest,
     Status,
@@ -119,6 +121,11 @@ ACTOR = ActorStatus(
     running=12,
     last_seen_s=0.125,
 )
+AUDIT = AuditStatus(rate=0.125, agreed=11, open=2, disputed=0)
+QUARANTINED = Quarantined(
+    id="actor-9",
+    why="its episode of command 5000003 differs from that of two others",
+)
 WAITING = Waiting(who="actor actor-1", on="learner", why="weights version 6", seconds=0.25)
 
 #: One example of every message type.
@@ -188,6 +195,8 @@ EXAMPLES: tuple[Message, ...] = (
     ACTOR,
     WAITING,
     EVALUATION,
+    AUDIT,
+    QUARANTINED,
     Status(
         run_id="cartpole-v1-seed7-20260102-030405-678901",
         state="running",
@@ -217,6 +226,8 @@ EXAMPLES: tuple[Message, ...] = (
         actors=(ACTOR,),
         waiting=(WAITING,),
         problem="",
+        audit=AUDIT,
+        quarantined=(QUARANTINED,),
     ),
 )
 

@@ -324,6 +324,22 @@ class EvaluationStatus(Message, frozen=True, kw_only=True):
     episodes: Number
 
 
+class AuditStatus(Message, frozen=True, kw_only=True):
+    """Episodes that a second actor makes again, to compare."""
+
+    rate: float
+    agreed: Number
+    open: Number
+    disputed: Number
+
+
+class Quarantined(Message, frozen=True, kw_only=True):
+    """An actor that nothing is taken from any more."""
+
+    id: Name
+    why: Text
+
+
 class Status(Message, frozen=True, kw_only=True):
     """How a run is doing; every name is explained in ``docs/metrics.md``."""
 
@@ -355,3 +371,5 @@ class Status(Message, frozen=True, kw_only=True):
     actors: tuple[ActorStatus, ...]
     waiting: tuple[Waiting, ...]
     problem: Text
+    audit: AuditStatus
+    quarantined: tuple[Quarantined, ...]

@@ -31,6 +31,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
         in_process: bool = True,
         stop_return: float | None = None,
         keys: Path | None = None,
+        audit: float = 0.0,
     ) -> Status:
         nonlocal number
         number += 1
@@ -46,6 +47,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
             go_on=go_on,
             in_process=in_process,
             keys=keys,
+            audit=audit,
         )
         assert_conserved(status)
         return status

@@ -8,10 +8,12 @@ from rich.console import Console
 
 from udrl_launch.display import Display, duration, line, panel
 from udrl_proto.messages import (
+    AuditStatus,
     BufferStatus,
     CommandLedger,
     EpisodeLedger,
     EvaluationStatus,
+    Quarantined,
     Status,
     Waiting,
 )
@@ -31,7 +33,7 @@ STATUS = Status(
     ),
     closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
-    problem="",
+    problem="", audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
 )  # fmt: skip
 
 
@@ -52,6 +54,19 @@ def test_line_before_anything_is_known() -> None:
     assert "evaluation none yet; buffer empty" in text
     assert "left" not in text
     assert "waits" not in text
+
+
+def test_panel_names_the_quarantined_and_what_is_audited() -> None:
+    watched = msgspec.structs.replace(
+        STATUS,
+        audit=AuditStatus(rate=0.25, agreed=31, open=4, disputed=1),
+        quarantined=(Quarantined(id="actor-9", why="its episode of command 7 differs"),),
+    )
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(watched))
+    assert "25 % of the episodes; 31 agreed, 4 open, 1 disputed" in capture.get()
+    assert "actor-9: its episode of command 7 differs" in capture.get()
 
 
 @pytest.mark.parametrize("width", [40, 120])

@@ -89,8 +89,16 @@ def panel(status: Status) -> Table:
         "time": f"{duration(status.wall_s)}"
         + (f", left {duration(status.time_left_s)}" if status.time_left_s is not None else ""),
     }
+    if status.audit.rate:
+        audit = status.audit
+        rows["audit"] = (
+            f"{audit.rate:.0%} of the episodes; {audit.agreed} agreed, {audit.open} open, "
+            f"{audit.disputed} disputed"
+        ).replace("%", " %", 1)
     for name, value in rows.items():
         table.add_row(name, Text(value))
+    for actor in status.quarantined:
+        table.add_row("quarantined", Text(f"{actor.id}: {actor.why}"))
     for wait in _long(status):
         table.add_row("waiting", f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)")
     return table

@@ -46,6 +46,7 @@ class Processes:
         *,
         insecure: bool,
         keys: Path | None,
+        audit: float = 0.0,
     ) -> None:
         fleet, environment = settings.fleet, settings.config.environment
         store.close()
@@ -57,7 +58,7 @@ class Processes:
 
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
-            "--listen", endpoint, *(["--insecure"] if insecure else []),
+            "--listen", endpoint, *(["--insecure"] if insecure else []), "--audit", str(audit),
         )  # fmt: skip
         start("learner", "learner", "--connect", endpoint, "--patience", _PATIENCE_S)
         envs = str(fleet.envs_per_actor)
@@ -93,6 +94,7 @@ class Threads:
         *,
         insecure: bool,
         keys: Path | None,
+        audit: float = 0.0,
     ) -> None:
         fleet = settings.fleet
         self._stop = threading.Event()
@@ -109,6 +111,7 @@ class Threads:
                 listen=endpoint,
                 insecure=insecure,
                 credentials=load(keys, REPLAY) if keys else None,
+                audit=audit,
             ),
         )
         address = roles.Address(endpoint, patience_s=float(_PATIENCE_S), keys=keys)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import zenoh
 
 from udrl.config import Budget
-from udrl.errors import RunFailed
+from udrl.errors import Deceived, RunFailed
 from udrl_actor.service import ActorService
 from udrl_learner.service import LearnerService
 from udrl_proto import session as sessions
@@ -56,13 +56,14 @@ def replay(
     connect: str | None = None,
     insecure: bool = False,
     credentials: Credentials | None = None,
+    audit: float = 0.0,
 ) -> None:
     """Serve a run until it has ended; either host its router or use one.
 
     Raises:
         ConfigError: the endpoint cannot be used.
         StoreError: the run's file cannot be written.
-        RunFailed: the run cannot go on.
+        RunFailed: the run cannot go on, or an actor lied (Deceived).
     """
     with closing(store):
         endpoint = listen or connect
@@ -76,13 +77,14 @@ def replay(
             where = {"endpoint": endpoint, "pid": os.getpid()}
             endpoint_file = run_dir / ENDPOINT_FILE
             endpoint_file.write_text(json.dumps(where), encoding="utf-8")
-            service = ReplayService(session, store, budget, run_dir)
+            service = ReplayService(session, store, budget, run_dir, audit)
             try:
                 service.serve(stop)
             finally:
                 endpoint_file.unlink(missing_ok=True)
-            if service.run.progress.state == "failed":
-                raise RunFailed(service.run.progress.problem)
+            progress = service.run.progress
+            if progress.state == "failed":
+                raise (Deceived if progress.deceived else RunFailed)(progress.problem)
 
 
 def learner(address: Address, stop: threading.Event) -> None:

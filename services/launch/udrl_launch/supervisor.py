@@ -14,7 +14,7 @@ from udrl.errors import RunFailed
 log = logging.getLogger("udrl")
 
 #: Exit codes that starting again would only repeat (``docs/operations.md``).
-FINAL_CODES = frozenset({2, 4, 7, 8, 9})
+FINAL_CODES = frozenset({2, 4, 7, 8, 9, 10})
 
 #: A child that ended so often within ``_PERIOD_S`` seconds is given up.
 _MAX_RESTARTS = 5

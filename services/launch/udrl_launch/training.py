@@ -3,6 +3,7 @@
 import logging
 import socket
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 from udrl.errors import Interrupted, Unreachable
@@ -39,6 +40,7 @@ def train(
     listen: str | None = None,
     insecure: bool = False,
     keys: Path | None = None,
+    audit: float = 0.0,
     display: Display | None = None,
 ) -> Status:
     """Train an agent and return the final status of its run.
@@ -53,6 +55,7 @@ def train(
         listen: the endpoint of the run; None: a free port of the loopback interface.
         insecure: allow ``listen`` to be beyond loopback without keys.
         keys: folder with the keys of all roles (``udrl keys create``); None: nobody is asked.
+        audit: share of the episodes that a second actor makes again, 0 to 1.
         display: shows the progress.
 
     Raises:
@@ -69,12 +72,16 @@ def train(
         store = resume(run_dir, config, allow_inexact=allow_inexact)
     else:
         store = create(run_dir, config, allow_inexact=allow_inexact)
-    write_config(run_dir, config, budget)
-    if Run(store, budget).progress.state == "ended":
-        store.close()
-        return read_status(run_dir)
+    with ExitStack() as unless_it_goes_on:
+        unless_it_goes_on.callback(store.close)
+        write_config(run_dir, config, budget)
+        if Run(store, budget).progress.state == "ended":
+            return read_status(run_dir)
+        unless_it_goes_on.pop_all()
     kind = Threads if in_process else Processes
-    services: Local = kind(run_dir, store, settings, endpoint, insecure=insecure, keys=keys)
+    services: Local = kind(
+        run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
+    )
     try:
         _watch(services, Address(endpoint, patience_s=_START_S, keys=keys), stop, display)
     finally:

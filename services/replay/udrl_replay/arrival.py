@@ -1,5 +1,7 @@
 """Checking an episode that arrives, before the run sees it."""
 
+from typing import NamedTuple
+
 import msgspec
 import numpy as np
 
@@ -26,6 +28,13 @@ class Arrival(msgspec.Struct, frozen=True, kw_only=True):
     entry: Entry
     digest: bytes
     body: bytes
+
+
+class Malformed(NamedTuple):
+    """An episode that is not well formed, and who sent it."""
+
+    actor: str
+    error: InvalidMessage
 
 
 def inspect(message: EpisodeMessage, spec: EnvironmentSpec) -> Arrival:

@@ -10,10 +10,12 @@ from udrl.digests import replay_digest
 from udrl.errors import StoreError
 from udrl_proto.messages import (
     ActorStatus,
+    AuditStatus,
     BufferStatus,
     CommandLedger,
     EpisodeLedger,
     EvaluationStatus,
+    Quarantined,
     Status,
     Waiting,
 )
@@ -169,6 +171,13 @@ def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: fl
         actors=actors,
         waiting=waits.list(now),
         problem=progress.problem,
+        audit=AuditStatus(
+            rate=progress.audit,
+            agreed=progress.agreed,
+            open=len(run.auditor.open),
+            disputed=sum(a.is_disputed for a in run.auditor.open.values()),
+        ),
+        quarantined=tuple(Quarantined(id=n, why=w) for n, w in run.quarantined.items()),
     )
 
 

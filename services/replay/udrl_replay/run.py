@@ -14,16 +14,20 @@ import msgspec
 
 from udrl.commands import CLOSING, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
-from udrl.errors import Refused, RunFailed
+from udrl.errors import Deceived, Refused, RunFailed
 from udrl.evaluation import summarise
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
-from udrl_proto.messages import FailureMessage, Hello
+from udrl_proto.messages import CommandsRequest, FailureMessage, Hello
 from udrl_replay.arrival import Arrival
-from udrl_replay.dealing import SUSPICIOUS, Dealer
+from udrl_replay.auditing import OFFENCES, Auditor, Offences
+from udrl_replay.dealing import MAX_DEALT, SUSPICIOUS, Dealer
 from udrl_replay.store import EvaluationRow, Store, Version
 
 log = logging.getLogger("udrl")
+
+#: Quarantined actors that are remembered; the oldest goes first.
+MOST_QUARANTINED = 1000
 
 State = Literal["running", "closing", "ended", "failed"]
 
@@ -44,6 +48,9 @@ class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         latest_version: the newest weights version; 0: none yet.
         best_version: the version with the best evaluation; 0: none yet.
         exact: whether the result is still a function of the configuration alone.
+        deceived: the run failed because episodes of an actor that lied have entered it.
+        audit: share of the episodes that a second actor makes again.
+        agreed: those that it made alike.
     """
 
     state: State = "running"
@@ -64,6 +71,9 @@ class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     exact: bool = True
     inexact_reason: str = ""
     problem: str = ""
+    deceived: bool = False
+    audit: float = 0.0
+    agreed: int = 0
 
 
 class Run:
@@ -72,15 +82,23 @@ class Run:
     Args:
         store: its file.
         budget: when it ends; may differ from the one it was started with.
+        audit: share of the episodes that a second actor makes again, 0 to 1.
+
+    Raises:
+        Deceived: it was stopped because an actor had lied.
     """
 
-    def __init__(self, store: Store, budget: Budget) -> None:
+    def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
         self.store = store
         self.budget = budget
         self.hello = store.fact("hello", Hello)
         self.config = self.hello.config
         self.progress = store.fact("progress", Progress)
         self.dealer = Dealer()
+        self.auditor = Auditor(audit)
+        self.quarantined = store.fact("quarantined", dict[str, str], {})
+        self._offences = Offences()
+        self._entered = store.fact("entered", dict[str, int], {})
         self._sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
         self._began = time.monotonic() - self.progress.wall_s
         held = store.buffer(self.progress.iteration)
@@ -92,6 +110,9 @@ class Run:
         self._open = {c.id: c for c in outstanding}
         if store.read_only:
             return
+        if self.progress.deceived:
+            raise Deceived(self.progress.problem)
+        self.progress.audit = audit
         with store.transaction():
             if self.progress.issued == 0:
                 self._issue(self._sampler.warm_up())
@@ -131,14 +152,21 @@ class Run:
         self.progress.delivered += 1
         self.dealer.hear(arrival.actor, now)
         command_id = arrival.entry.id
+        if arrival.actor in self.quarantined:
+            self.progress.rejected += 1
+            raise self.refusal(arrival.actor)
         item = self.dealer.outstanding.get(command_id)
         if item is None:
+            if self.auditor.asked(arrival.actor, command_id):
+                return self._compare(arrival)
             return self._accept_again(arrival)
         if arrival.entry.length > item.command.max_steps:
+            self.offend(arrival.actor, f"an episode longer than command {command_id} allows")
             raise self.reject(
                 f"episode {command_id} has {arrival.entry.length} steps, its command allows "
                 f"{item.command.max_steps}"
             )
+        self._begin_audit(item.command, arrival)
         self.dealer.remove(command_id, now)
         self.store.add_episode(arrival.entry, arrival.digest, arrival.body)
         self.progress.accepted += 1
@@ -161,6 +189,7 @@ class Run:
             return "duplicate"
         if command_id in self._open or index >= CLOSING or iteration > self.progress.iteration:
             raise self.reject(f"command {command_id} is cancelled or unknown; drop the episode")
+        self.offend(arrival.actor, f"an episode of command {command_id}, which was never issued")
         raise self.reject(f"command {command_id} was never issued; drop the episode")
 
     def _is_done(self, iteration: int, index: int) -> bool:
@@ -190,6 +219,7 @@ class Run:
 
     def lose(self, actor: str) -> None:
         """Note that an actor is gone, perhaps through a command that it held."""
+        self.auditor.leave(actor)
         for item in self.dealer.leave(actor):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:
@@ -210,6 +240,82 @@ class Run:
         self.progress.state = "failed"
         self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
         log.error("%s", RunFailed(self.progress.problem))
+
+    # Whom to believe.
+
+    def deal(self, request: CommandsRequest, now: float) -> list[Command]:
+        """Return commands for an actor that has joined; those to be checked come first."""
+        join = self.dealer.actors[request.actor].join
+        again = self.auditor.assign(
+            join.id, join.numerics_class, request.running, min(request.wanted, MAX_DEALT)
+        )
+        rest = msgspec.structs.replace(request, wanted=request.wanted - len(again))
+        return again + self.dealer.deal(rest, self.progress.latest_version, now)
+
+    def _begin_audit(self, command: Command, arrival: Arrival) -> None:
+        """Remember who brings an episode, and perhaps have it made again."""
+        name = arrival.actor
+        if self.auditor.rate and name not in self._entered:
+            self._entered[name] = command.iteration
+            self.store.set_fact("entered", self._entered)
+        if name in self.dealer.actors:
+            numerics_class = self.dealer.actors[name].join.numerics_class
+            self.auditor.consider(command, name, numerics_class, arrival.digest)
+
+    def _compare(self, arrival: Arrival) -> Literal["duplicate"]:
+        """Take in an episode that was asked for to check another actor's."""
+        self.progress.duplicate += 1
+        command_id = arrival.entry.id
+        verdict = self.auditor.compare(arrival.actor, command_id, arrival.digest)
+        if verdict is None and command_id in self.auditor.open:
+            log.warning("actors differ on command %d; a third will decide who lied", command_id)
+        elif verdict is None:
+            self.progress.agreed += 1
+        elif verdict.liar is None:
+            self.auditor.stop()
+            self.progress.audit = 0.0
+            self.mark_inexact(
+                f"three actors carried out command {command_id} and all their episodes differ; the "
+                f"environment {self.config.environment} or their machines are not deterministic; "
+                f"nothing is audited any more"
+            )
+        else:
+            self._convict(verdict.liar, command_id)
+        return "duplicate"
+
+    def _convict(self, liar: str, command_id: int) -> None:
+        why = f"its episode of command {command_id} differs from that of two others"
+        self.quarantine(liar, why)
+        if liar in self._entered and self.progress.state not in ("ended", "failed"):
+            self.progress.state = "failed"
+            self.progress.deceived = True
+            self.progress.problem = (
+                f"actor {liar} lied: {why}. Since iteration {self._entered[liar]} the run has "
+                f"learned from its episodes; start a new run without it, in another --run-dir"
+            )
+            log.error("%s", self.progress.problem)
+
+    def offend(self, actor: str, what: str) -> None:
+        """Note that an actor delivered what it may not; too often is once too many."""
+        if actor not in self.quarantined and self._offences.add(actor):
+            self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
+
+    def quarantine(self, actor: str, why: str) -> None:
+        """Take nothing from an actor any more."""
+        log.warning("actor %s is quarantined: %s", actor, why)
+        self.quarantined[actor] = why[:1000]
+        if len(self.quarantined) > MOST_QUARANTINED:
+            del self.quarantined[next(iter(self.quarantined))]
+        self.store.set_fact("quarantined", self.quarantined)
+        self.lose(actor)
+
+    def refusal(self, actor: str) -> Refused:
+        """Return what a quarantined actor is told."""
+        return Refused(
+            "quarantined",
+            f"actor {actor} is quarantined: {self.quarantined[actor]}; repair or remove it, then "
+            f"start it again",
+        )
 
     # Iterations.
 
@@ -415,6 +521,7 @@ class Run:
         # A run that is resumed after its end takes its cancelled commands up again.
         wanted = [*self._open.values(), *self.store.commands(cancelled=True)]
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
+        needed |= self.auditor.versions
         self.store.drop_weights(v for v in self.store.versions_kept() if v not in needed)
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.

@@ -19,7 +19,7 @@ import zenoh
 from udrl.checkpoint import decode_state
 from udrl.config import Budget
 from udrl.digests import tensors_digest
-from udrl.errors import InvalidData, Refused
+from udrl.errors import InvalidData, InvalidMessage, Refused
 from udrl_proto import keys
 from udrl_proto.answering import Question, Verb, serve
 from udrl_proto.codec import LARGEST, PAGE, encode
@@ -50,7 +50,7 @@ from udrl_proto.messages import (
     Weights,
     WeightsRequest,
 )
-from udrl_replay.arrival import Arrival, inspect
+from udrl_replay.arrival import Arrival, Malformed, inspect
 from udrl_replay.reporting import MetricsFile, Throughput, Waits, status
 from udrl_replay.run import Run
 from udrl_replay.store import Store, Version
@@ -92,10 +92,18 @@ class ReplayService:
         store: the run.
         budget: when it ends.
         run_dir: where ``metrics.csv`` goes.
+        audit: share of the episodes that a second actor makes again, 0 to 1.
     """
 
-    def __init__(self, session: zenoh.Session, store: Store, budget: Budget, run_dir: Path) -> None:
-        self.run = Run(store, budget)
+    def __init__(
+        self,
+        session: zenoh.Session,
+        store: Store,
+        budget: Budget,
+        run_dir: Path,
+        audit: float = 0.0,
+    ) -> None:
+        self.run = Run(store, budget, audit)
         self._session = session
         self._store = store
         self._metrics = MetricsFile(run_dir, store)
@@ -165,8 +173,11 @@ class ReplayService:
             )
             return _Delivery(message, version)
 
-        def arrive(message: EpisodeMessage) -> Arrival:
-            return inspect(message, spec)
+        def arrive(message: EpisodeMessage) -> Arrival | Malformed:
+            try:
+                return inspect(message, spec)
+            except InvalidMessage as error:
+                return Malformed(message.actor, error)
 
         steps = spec.max_episode_steps * (4 * spec.observation_size + 8)
         return {
@@ -226,7 +237,10 @@ class ReplayService:
             self._session.put(keys.key(run.hello.run_id, keys.PROGRESS), news)
 
     def _reply(self, question: Question, now: float) -> Message:
-        request = question.request
+        request: Any = question.request
+        if isinstance(request, Malformed):
+            self.run.offend(request.actor, str(request.error))
+            request = request.error
         if isinstance(request, InvalidData):
             if question.verb == keys.EPISODE:
                 self.run.progress.delivered += 1
@@ -284,6 +298,8 @@ class ReplayService:
                 )
             self.run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
         if request.role == "actor":
+            if request.id in self.run.quarantined:
+                raise self.run.refusal(request.id)
             self.run.dealer.join(request, now)
         log.info("%s %s joined from %s", request.role, request.id, request.host)
         return JoinReply()
@@ -292,9 +308,11 @@ class ReplayService:
         run, who = self.run, f"actor {request.actor}"
         if run.progress.state in ("ended", "failed"):
             return CommandsReply(ended=True)
+        if request.actor in run.quarantined:
+            raise run.refusal(request.actor)
         if request.actor not in run.dealer.actors:
             raise Refused("join_first", f"actor {request.actor} has not joined; send join first")
-        commands = run.dealer.deal(request, run.progress.latest_version, now)
+        commands = run.deal(request, now)
         if commands:
             self._waits.end(who)
             newest = max(c.weights_version for c in commands)

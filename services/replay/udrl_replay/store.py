@@ -202,14 +202,16 @@ class Store:
 
     # Facts: named values, as JSON.
 
-    def fact(self, name: str, kind: type[Fact]) -> Fact:
-        """Return a named value.
+    def fact(self, name: str, kind: type[Fact], default: Fact | None = None) -> Fact:
+        """Return a named value; the default if it was never set.
 
         Raises:
-            DamagedStore: it is missing or of another kind.
+            DamagedStore: it is missing and there is no default, or it is of another kind.
         """
         rows = self._rows("SELECT value FROM facts WHERE name = ?", (name,))
         if not rows:
+            if default is not None:
+                return default
             raise self._damaged(f"fact {name!r} is missing")
         try:
             return msgspec.json.decode(rows[0][0], type=kind)

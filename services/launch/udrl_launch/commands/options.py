@@ -69,6 +69,10 @@ KEYS = click.option(
     help="Authenticate and encrypt with these keys (`udrl keys create DIR`); endpoints are then "
     "tls/HOST:PORT.",
 )  # fmt: skip
+AUDIT = click.option(
+    "--audit", type=click.FloatRange(0, 1), default=0.0, metavar="RATE",
+    help="Share of the episodes that a second actor makes again, to find out who lies.",
+)  # fmt: skip
 RUN = click.option(
     "--run", "run_id", metavar="RUN_ID", help="Which run, where a router carries several."
 )

@@ -15,6 +15,7 @@ from udrl.errors import ConfigError, InexactArithmetic
 from udrl.numerics import STRICT_MKL
 from udrl_launch import roles
 from udrl_launch.commands.options import (
+    AUDIT,
     KEYS,
     PARENT,
     PATIENCE,
@@ -53,6 +54,7 @@ def _as_service(parent: int | None, service: Callable[[threading.Event], None]) 
 @click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
 @KEYS
 @click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@AUDIT
 @PARENT
 def replay(
     env: str,
@@ -63,6 +65,7 @@ def replay(
     insecure: bool,
     keys: Path | None,
     allow_inexact: bool,
+    audit: float,
     parent: int | None,
     **given: Any,
 ) -> int:
@@ -82,7 +85,7 @@ def replay(
         store = _open(run_dir, settings, go_on=resume, allow_inexact=allow_inexact)
         roles.replay(
             run_dir, store, settings.budget, stop, listen=listen, connect=connect,
-            insecure=insecure, credentials=credentials,
+            insecure=insecure, credentials=credentials, audit=audit,
         )  # fmt: skip
 
     return _as_service(parent, service)

@@ -11,6 +11,7 @@ import msgspec
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch import inspection
 from udrl_launch.commands.options import (
+    AUDIT,
     KEYS,
     RUN_DIR,
     gather_settings,
@@ -43,6 +44,7 @@ log = logging.getLogger("udrl")
 @click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
 @KEYS
 @click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@AUDIT
 @click.option(
     "--json", "as_json", is_flag=True, help="End with the final status as a line of JSON."
 )
@@ -55,6 +57,7 @@ def train(
     insecure: bool,
     keys: Path | None,
     allow_inexact: bool,
+    audit: float,
     as_json: bool,
     **given: Any,
 ) -> int:
@@ -74,7 +77,7 @@ def train(
             status = run_training(
                 settings, run_dir, stop, go_on=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
-                display=display,
+                audit=audit, display=display,
             )  # fmt: skip
         _finish(run_dir, status)
         if as_json:

@@ -1,0 +1,63 @@
+"""An actor that lies about its episodes is found among honest ones, over the wire."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import udrl_actor.courier
+from udrl.config import Budget
+from udrl.episode import Episode
+from udrl.errors import Deceived, UdrlError
+from udrl_launch.inspection import status_of
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from udrl_proto.codec import encode_episode
+from udrl_proto.messages import Status
+from whole_run import assert_conserved, digests, toy
+
+BUDGET = 600
+FLEET = Fleet(actors=3, envs_per_actor=2)
+
+
+def test_honest_actors_agree_and_the_result_stays(run: Callable[..., Status]) -> None:
+    audited = run(toy(lead=2), BUDGET, actors=3, audit=0.5)
+    assert audited.audit.rate == 0.5
+    assert audited.audit.agreed > 20
+    assert audited.audit.disputed == 0
+    assert audited.quarantined == ()
+    assert audited.exact
+    assert_conserved(audited)
+    assert digests(audited) == digests(run(toy(lead=2), BUDGET))
+
+
+def test_liar_ends_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    liars: list[str] = []
+    lock = threading.Lock()
+
+    def lie(episode: Episode, actor: str) -> bytes:
+        with lock:
+            if not liars:
+                liars.append(actor)
+        if actor == liars[0]:
+            episode = replace(episode, rewards=episode.rewards + 1)
+        return encode_episode(episode, actor)
+
+    monkeypatch.setattr(udrl_actor.courier, "encode_episode", lie)
+    settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
+
+    def go(*, go_on: bool) -> None:
+        train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
+              go_on=go_on)  # fmt: skip
+
+    with pytest.raises(UdrlError, match=r"lied|quarantined"):
+        go(go_on=False)
+    status = status_of(tmp_path / "run")
+    assert status.state == "failed"
+    assert [actor.id for actor in status.quarantined] == liars
+    assert f"actor {liars[0]} lied" in status.problem
+    assert_conserved(status)
+    with pytest.raises(Deceived, match=liars[0]):
+        go(go_on=True)

@@ -1,0 +1,234 @@
+"""Spot checks and quarantine: who lies is found, who does not is left alone; results stay."""
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.replay.synthetic import (
+    arrive,
+    episode,
+    join,
+    reference,
+    result,
+    train_next,
+    weights_of,
+    work,
+)
+from udrl.commands import Command
+from udrl.config import Budget
+from udrl.errors import Deceived, Refused
+from udrl_proto.messages import CommandsRequest
+from udrl_replay.auditing import MOST_OPEN, OFFENCES, Auditor, Offences, Verdict
+from udrl_replay.run import MOST_QUARANTINED, Run
+from udrl_replay.store import Store
+
+
+def command(number: int) -> Command:
+    return Command(
+        id=number, kind="explore", desired_return=1.0, desired_horizon=2, environment_seed=3,
+        stream_key=bytes(16), weights_version=number % 7, max_steps=4,
+    )  # fmt: skip
+
+
+def audited(*digests: tuple[str, bytes]) -> Verdict | None:
+    """Return the verdict over one command that actors deliver in this order."""
+    auditor = Auditor(1.0)
+    (first, digest), *others = digests
+    auditor.consider(command(5), first, "c", digest)
+    verdict = None
+    for name, other in others:
+        assert [c.id for c in auditor.assign(name, "c", (), 9)] == [5]
+        verdict = auditor.compare(name, 5, other)
+    return verdict
+
+
+def test_two_that_agree_need_no_third() -> None:
+    auditor = Auditor(1.0)
+    auditor.consider(command(5), "a", "c", b"x")
+    assert auditor.versions == {5}
+    assert auditor.assign("b", "c", (), 9) == [command(5)]
+    assert auditor.asked("b", 5)
+    assert not auditor.asked("a", 5)
+    assert auditor.compare("b", 5, b"x") is None
+    assert (auditor.open, auditor.versions) == ({}, set())
+
+
+@pytest.mark.parametrize(("digests", "liar"), [("xyx", "b"), ("xyy", "a")])
+def test_third_decides_between_two(digests: str, liar: str) -> None:
+    made = zip("abc", (d.encode() for d in digests), strict=True)
+    assert audited(*made) == Verdict(5, liar)
+
+
+def test_three_that_differ_decide_nothing() -> None:
+    assert audited(("a", b"x"), ("b", b"y"), ("c", b"z")) == Verdict(5, None)
+
+
+def test_nobody_checks_himself_or_another_class() -> None:
+    auditor = Auditor(1.0)
+    auditor.consider(command(5), "a", "c", b"x")
+    assert auditor.assign("a", "c", (), 9) == []
+    assert auditor.assign("b", "other", (), 9) == []
+    assert auditor.assign("b", "c", (), 0) == []
+    assert len(auditor.assign("b", "c", (), 9)) == 1
+    assert auditor.assign("d", "c", (), 9) == [], "one at a time"
+
+
+def test_what_an_actor_lost_goes_to_another() -> None:
+    auditor = Auditor(1.0)
+    auditor.consider(command(5), "a", "c", b"x")
+    auditor.assign("b", "c", (), 9)
+    assert auditor.assign("b", "c", {5}, 9) == [], "it holds it still"
+    assert len(auditor.assign("b", "c", (), 9)) == 1, "it lost it and may have it again"
+    auditor.leave("b")
+    assert len(auditor.assign("d", "c", (), 9)) == 1
+
+
+def test_rate_is_the_share_that_is_checked() -> None:
+    numbers = iter([0.0, 0.24, 0.25, 0.9])
+    auditor = Auditor(0.25, lambda: next(numbers))
+    for i in range(4):
+        auditor.consider(command(i), "a", "c", b"x")
+    assert set(auditor.open) == {0, 1}
+
+
+def test_open_audits_are_bounded() -> None:
+    auditor = Auditor(1.0)
+    for i in range(MOST_OPEN + 10):
+        auditor.consider(command(i), "a", "c", b"x")
+    assert len(auditor.open) == MOST_OPEN
+    auditor.stop()
+    auditor.consider(command(1), "a", "c", b"x")
+    assert not auditor.open
+
+
+def test_offences_are_counted_by_actor_and_their_memory_is_bounded() -> None:
+    offences = Offences()
+    assert [offences.add("a") for _ in range(OFFENCES)] == [False] * (OFFENCES - 1) + [True]
+    for i in range(5000):
+        assert not offences.add(f"b{i}")
+    assert len(offences._of) <= 1000
+    assert offences.add("a"), "who offends most is not forgotten for others"
+
+
+# In a run.
+
+
+def deliver(run: Run, name: str, made: Command, *, lies: bool = False) -> str:
+    with run.store.transaction():
+        reply = run.accept(arrive(episode(made, weights_of(run, made), lies), name), 0.0)
+        run.save()
+    return reply
+
+
+def ask(run: Run, name: str, wanted: int = 1) -> list[Command]:
+    return run.deal(CommandsRequest(actor=name, wanted=wanted), 0.0)
+
+
+@pytest.fixture
+def audited_run(make_run: Callable[..., Run]) -> Run:
+    run = make_run()
+    run.auditor = Auditor(1.0)
+    for name in "abc":
+        run.dealer.join(join(name), 0.0)
+    return run
+
+
+def test_audit_changes_no_result(audited_run: Run, make_run: Callable[..., Run]) -> None:
+    run = audited_run
+    run.budget = Budget(max_env_steps=40)
+    while run.progress.state != "ended":
+        if run.awaits_version() is not None:
+            with run.store.transaction():
+                run.add_version(train_next(run), 0.0)
+        for name in "abc":
+            for made in ask(run, name, wanted=4):
+                deliver(run, name, made)
+    assert run.progress.agreed > 10
+    assert run.progress.exact
+    assert result(run) == reference(0, 40)
+    progress = run.progress
+    assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
+
+
+def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: Run, tmp_path: Path) -> None:
+    run = audited_run
+    (made,) = ask(run, "a")
+    assert deliver(run, "a", made, lies=True) == "accepted"
+    for name in "bc":
+        assert ask(run, name) == [made], "checks come before other work"
+        assert deliver(run, name, made) == "duplicate"
+    assert run.progress.state == "failed"
+    assert "actor a lied: its episode of command 0 differs" in run.progress.problem
+    assert "Since iteration 0" in run.progress.problem
+    assert set(run.quarantined) == {"a"}
+    run.store.close()
+    with closing(Store(tmp_path)) as store, pytest.raises(Deceived, match="actor a lied"):
+        Run(store, run.budget)
+    assert Deceived.exit_code == 10
+
+
+def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
+    audited_run: Run, reopened: Callable[..., Run]
+) -> None:
+    run = audited_run
+    (made,) = ask(run, "a")
+    deliver(run, "a", made)
+    ask(run, "b")
+    deliver(run, "b", made, lies=True)
+    ask(run, "c")
+    deliver(run, "c", made)
+    assert run.progress.state == "running"
+    assert set(run.quarantined) == {"b"}
+    assert "b" not in run.dealer.actors
+    (other,) = ask(run, "a")
+    with pytest.raises(Refused, match="quarantined") as refused:
+        deliver(run, "b", other)
+    assert refused.value.code == "quarantined"
+    assert set(reopened(run).quarantined) == {"b"}
+
+
+def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: Run) -> None:
+    run = audited_run
+    (made,) = ask(run, "a")
+    for name, weights in zip("abc", (b"1", b"2", b"3"), strict=True):
+        if name != "a":
+            assert ask(run, name) == [made]
+        with run.store.transaction():
+            run.accept(arrive(episode(made, weights), name), 0.0)
+    assert not run.quarantined
+    assert not run.progress.exact
+    assert "not deterministic" in run.progress.inexact_reason
+    assert run.auditor.rate == 0
+
+
+def test_repeated_offender_is_quarantined(make_run: Callable[..., Run]) -> None:
+    run = make_run()
+    work(run)  # the warm-up
+    with run.store.transaction():
+        run.add_version(train_next(run), 0.0)
+    run.dealer.join(join("a"), 0.0)
+    (made,) = ask(run, "a")
+    unknown = command(999)  # of the warm-up, which had fewer
+    for _ in range(OFFENCES):
+        with pytest.raises(Refused, match="never issued"), run.store.transaction():
+            run.accept(arrive(episode(unknown, b""), "a"), 0.0)
+    assert "10 invalid episodes" in run.quarantined["a"]
+    with pytest.raises(Refused, match="quarantined"):
+        deliver(run, "a", made)
+    assert run.progress.rejected == OFFENCES + 1
+    run.dealer.join(join("b"), 0.0)
+    assert ask(run, "b") == [made], "its commands go to others"
+    assert deliver(run, "b", made) == "accepted"
+
+
+def test_quarantine_is_bounded(make_run: Callable[..., Run], tmp_path: Path) -> None:
+    run = make_run()
+    with run.store.transaction():
+        for i in range(MOST_QUARANTINED + 1):
+            run.quarantined[f"a{i}"] = "x"
+        run.quarantine("last", "y" * 5000)
+    assert len(run.quarantined) <= MOST_QUARANTINED + 1
+    assert "a0" not in run.quarantined
+    assert len(run.quarantined["last"]) == 1000
