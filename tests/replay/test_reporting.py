@@ -207,3 +207,10 @@ def test_metrics_of_a_resumed_run_are_those_of_one_that_never_stopped(
     after = lines(tmp_path)
     assert after[: len(before)] == before
     assert len(after) == run.progress.iteration + 1
+
+
+def test_waits_are_bounded() -> None:
+    waits = Waits()
+    for i in range(20_000):
+        waits.begin(f"learner {i}", "actors", "iteration 1", 0.0)
+    assert len(waits.list(1.0)) == 10_000

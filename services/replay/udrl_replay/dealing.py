@@ -25,6 +25,8 @@ STRAGGLER = 3.0
 MAX_DEALT = 4096
 #: Seconds after which an actor without a liveliness token that says nothing is forgotten.
 SILENCE_S = 30.0
+#: Actors that may have joined at once; each costs a little memory.
+MOST_ACTORS = 10_000
 #: Actors that vanished while they held a command, after which it is carried out alone.
 SUSPICIOUS = 3
 

@@ -29,6 +29,8 @@ COLUMNS = (
 )  # fmt: skip
 
 _WINDOW_S = 10.0
+#: Waits that are remembered; who waits need not have joined.
+_MOST_WAITS = 10_000
 
 
 class MetricsFile:
@@ -89,6 +91,8 @@ class Waits:
         held = self._waits.get(who)
         if held is None or held[:2] != (on, why):
             self._waits[who] = on, why, now
+            if len(self._waits) > _MOST_WAITS:
+                del self._waits[next(iter(self._waits))]
 
     def end(self, who: str) -> None:
         """Note that somebody no longer waits."""

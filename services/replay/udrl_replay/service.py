@@ -51,6 +51,7 @@ from udrl_proto.messages import (
     WeightsRequest,
 )
 from udrl_replay.arrival import Arrival, Malformed, inspect
+from udrl_replay.dealing import MOST_ACTORS
 from udrl_replay.reporting import MetricsFile, Throughput, Waits, status
 from udrl_replay.run import Run
 from udrl_replay.store import Store, Version
@@ -222,6 +223,7 @@ class ReplayService:
             snapshot = msgspec.json.encode(run.progress)
             for name in silent:
                 run.lose(name)
+                self._waits.end(f"actor {name}")
             for item in group:
                 if isinstance(item, _Presence):
                     self._note_presence(item, now)
@@ -300,6 +302,12 @@ class ReplayService:
         if request.role == "actor":
             if request.id in self.run.quarantined:
                 raise self.run.refusal(request.id)
+            if len(self.run.dealer.actors) >= MOST_ACTORS:
+                raise Refused(
+                    "too_many_actors",
+                    f"{MOST_ACTORS} actors have joined, which is the most; give fewer actors more "
+                    f"environments (--envs)",
+                )
             self.run.dealer.join(request, now)
         log.info("%s %s joined from %s", request.role, request.id, request.host)
         return JoinReply()

@@ -1,0 +1,107 @@
+"""Fuzz every decoder and every queryable.
+
+::
+
+    .venv/bin/python -m pip install --editable '.[fuzz]'
+    .venv/bin/python -m tests.fuzz coverage --inputs 1000000
+    .venv/bin/python -m tests.fuzz hypothesis --inputs 1000000
+
+``coverage`` mutates honest questions, guided by the branches of our code that they reach;
+``hypothesis`` draws messages from the types of the protocol. Either ends with an error at the
+first input that raises, hangs for five seconds, takes more than a gigabyte, unbalances a ledger,
+or is accepted though it is invalid; and prints how many were answered and refused otherwise.
+"""
+
+import argparse
+import resource
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+
+def main() -> None:
+    """Fuzz as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("engine", choices=("coverage", "hypothesis"))
+    parser.add_argument("--inputs", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    began = time.monotonic()
+    if options.engine == "coverage":
+        by_coverage(options.inputs, options.seed)
+    else:
+        by_type(options.inputs, options.seed)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{time.monotonic() - began:,.0f} s, at most {memory:,.0f} MiB", flush=True)
+
+
+def by_coverage(inputs: int, seed: int) -> None:
+    """Let libFuzzer mutate; it ends the process at the first input that fails."""
+    import atexit
+
+    import atheris
+
+    with atheris.instrument_imports(include=["udrl", "udrl_proto", "udrl_replay"]):
+        from tests.fuzz.world import Target, honest_questions, read_as_everything
+
+    target = Target(honest_questions())
+
+    def one(data: bytes) -> None:
+        target(data)
+        read_as_everything(data[1:])
+
+    with TemporaryDirectory() as corpus:
+        for number, data in enumerate(target.seeds()):
+            (Path(corpus) / str(number)).write_bytes(data)
+        # libFuzzer ends the process itself when it is done.
+        began = time.monotonic()
+        atexit.register(lambda: print(
+            f"{target.accepted:,} answered, {target.refused:,} refused, "
+            f"{time.monotonic() - began:,.0f} s", flush=True))  # fmt: skip
+        atheris.Setup(
+            [sys.argv[0], f"-runs={inputs}", f"-seed={seed}", "-timeout=5", "-rss_limit_mb=1024",
+             "-max_len=8192", "-print_final_stats=1", corpus],
+            one,
+        )  # fmt: skip
+        atheris.Fuzz()
+
+
+def by_type(inputs: int, seed: int) -> None:
+    """Draw messages of every kind, with values of every kind."""
+    import hypothesis
+    from hypothesis import strategies as st
+
+    from tests.fuzz.world import Target, honest_questions, read_as_everything
+    from tests.proto.strategies import messages
+    from udrl_proto import keys
+    from udrl_proto.codec import encode
+
+    target = Target(honest_questions())
+    verbs = target.kinds()
+    drawn = st.sampled_from(keys.VERBS).flatmap(
+        lambda verb: messages(verbs[verb]).map(
+            lambda message: bytes([keys.VERBS.index(verb)]) + encode(message)
+        )
+    )
+    known = st.sampled_from(target.seeds())
+    changed = st.tuples(known, st.integers(0, 8191), st.binary(max_size=12)).map(
+        lambda given: given[0][: given[1]] + given[2] + given[0][given[1] + len(given[2]) :]
+    )
+
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=inputs, deadline=5000, database=None, phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )  # fmt: skip
+    @hypothesis.given(drawn | changed)
+    def knock(data: bytes) -> None:
+        target(data)
+        read_as_everything(data[1:])
+
+    knock()
+    print(f"{target.accepted:,} answered, {target.refused:,} refused", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,330 @@
+"""A run whose every door can be knocked at without a network: whatever bytes come, what must hold.
+
+The queryables are those of the replay service, declared on a session that only remembers them. What
+is asked of each input: one answer, which is a message of the protocol; ledgers that balance; no
+exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
+"""
+
+import logging
+import queue
+import tempfile
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+import zenoh
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.checkpoint import encode_optimizer, encode_weights
+from udrl.commands import Command
+from udrl.config import Budget, Config
+from udrl.errors import InvalidData
+from udrl.segments import Experience
+from udrl.training import TrainingState, train, untrained
+from udrl_proto import keys
+from udrl_proto.answering import serve
+from udrl_proto.codec import decode, decode_episode, encode, encode_episode
+from udrl_proto.messages import (
+    Acknowledged,
+    ChangesReply,
+    ChangesRequest,
+    CommandsReply,
+    CommandsRequest,
+    EpisodeMessage,
+    EpisodeReply,
+    EpisodesReply,
+    EpisodesRequest,
+    FailureMessage,
+    Hello,
+    HelloRequest,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Problem,
+    Progress,
+    StateReply,
+    StateRequest,
+    Status,
+    StatusRequest,
+    VersionMessage,
+    VersionReply,
+    Weights,
+    WeightsRequest,
+)
+from udrl_replay.creation import create
+from udrl_replay.service import ReplayService
+
+CONFIG = Config(
+    environment="Figure2-v0", lead=2, batch_size=4, hidden=(2, 2), n_warm_up_episodes=3,
+    n_episodes_per_iter=3, n_updates_per_iter=2, replay_size=6, last_few=2, eval_every=20,
+    eval_episodes=2, segments="all",
+)  # fmt: skip
+
+REPLIES: dict[str, type[Message]] = {
+    keys.HELLO: Hello,
+    keys.JOIN: JoinReply,
+    keys.COMMANDS: CommandsReply,
+    keys.EPISODE: EpisodeReply,
+    keys.FAILURE: Acknowledged,
+    keys.CHANGES: ChangesReply,
+    keys.EPISODES: EpisodesReply,
+    keys.VERSION: VersionReply,
+    keys.STATE: StateReply,
+    keys.WEIGHTS: Weights,
+    keys.STATUS: Status,
+}
+
+#: Where a file is synced at once.
+_MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+class Query:
+    """What Zenoh hands to a queryable."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.replies: list[bytes] = []
+        self.problems: list[bytes] = []
+        self.dropped = False
+
+    @property
+    def payload(self) -> "Query":
+        return self
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+    def __enter__(self) -> "Query":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def reply(self, _: str, data: bytes) -> None:
+        self.replies.append(data)
+
+    def reply_err(self, data: bytes, *, encoding: object) -> None:
+        self.problems.append(data)
+
+    def drop(self) -> None:
+        self.dropped = True
+
+
+class _Session:
+    """A session that remembers what is declared, and sends nothing."""
+
+    def __init__(self) -> None:
+        self.receivers: dict[str, Callable[[Any], None]] = {}
+
+    def declare_queryable(self, key: str, receiver: Callable[[Any], None], **_: object) -> None:
+        self.receivers[keys.parse(key)[2]] = receiver
+
+    def put(self, key: str, data: bytes) -> None:
+        assert keys.parse(key)[2] == keys.PROGRESS
+        decode(data, Progress)
+
+
+class World:
+    """One run, and a way to ask it anything."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(dir=_MEMORY)
+        run_dir = Path(self._folder.name)
+        self._store = create(run_dir, CONFIG)
+        self._session = _Session()
+        session = cast(zenoh.Session, self._session)
+        budget = Budget(max_env_steps=2**53)
+        self.service = ReplayService(session, self._store, budget, run_dir, audit=0.2)
+        self.spec = self.service.run.hello.environment
+        inbox: queue.Queue[Any] = self.service._inbox
+        serve(session, self.service.run.hello.run_id, self.service._verbs(), inbox)
+
+    def close(self) -> None:
+        """Forget the run."""
+        self._store.close()
+        self._folder.cleanup()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has failed, so that most of it cannot be reached any more."""
+        return self.service.run.progress.state != "running"
+
+    def knock(self, verb: str, data: bytes) -> Message:
+        """Ask with any bytes and return the answer, after checking all that must hold."""
+        query = Query(data)
+        accepted = self.service.run.progress.accepted
+        self._session.receivers[verb](query)
+        self.service._answer(self.service._next_group())
+        assert not query.dropped
+        assert len(query.replies) + len(query.problems) == 1, "one question, one answer"
+        self._check_ledgers()
+        if query.problems:
+            return decode(query.problems[0], Problem)
+        if self.service.run.progress.accepted > accepted:
+            self._check_accepted(data)
+        return decode(query.replies[0], REPLIES[verb], 1 << 30)
+
+    def _check_ledgers(self) -> None:
+        progress, outstanding = self.service.run.progress, self.service.run.dealer.outstanding
+        assert progress.issued == progress.accepted + progress.cancelled + len(outstanding)
+        assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
+
+    def _check_accepted(self, data: bytes) -> None:
+        """Read an accepted episode by the page alone."""
+        fields = msgpack.unpackb(data, strict_map_key=True)
+        length = fields["rewards"]["shape"][0]
+        assert 1 <= length <= self.spec.max_episode_steps
+        assert fields["observations"]["shape"] == [length, self.spec.observation_size]
+        assert fields["actions"]["shape"] == [length]
+        for name, dtype in (("observations", "<f4"), ("actions", "|u1"), ("rewards", "<f4")):
+            array = fields[name]
+            assert array["dtype"] == dtype
+            values = np.frombuffer(array["data"], dtype)
+            assert len(values) == np.prod(array["shape"])
+            assert np.isfinite(values).all()
+        actions = np.frombuffer(fields["actions"]["data"], "|u1")
+        assert actions.max() < self.spec.n_actions
+        assert fields["terminated"] or fields["truncated"]
+
+
+def honest_questions() -> list[tuple[str, bytes]]:
+    """Return what a learner and an actor ask in a run's first iterations, as the bytes they send.
+
+    A fresh world that is asked these in order accepts them all.
+    """
+    logging.getLogger("udrl").setLevel(logging.CRITICAL)
+    world, asked = World(), []
+    generator = EpisodeGenerator(CONFIG, 4)
+    states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
+
+    def ask(verb: str, request: Message | bytes) -> Message:
+        data = request if isinstance(request, bytes) else encode(request)
+        asked.append((verb, data))
+        answer = world.knock(verb, data)
+        assert not isinstance(answer, Problem), answer
+        return answer
+
+    def act() -> None:
+        request = CommandsRequest(actor="actor-1", wanted=4)
+        commands = cast(CommandsReply, ask(keys.COMMANDS, request)).commands
+        by_version: dict[int, list[Command]] = {}
+        for command in commands:
+            by_version.setdefault(command.weights_version, []).append(command)
+        for version, together in by_version.items():
+            behavior = states[version].behavior if version else None
+            for episode in generate_episodes(generator, together, behavior):
+                ask(keys.EPISODE, encode_episode(episode, "actor-1"))
+
+    ask(keys.HELLO, HelloRequest())
+    ask(
+        keys.JOIN,
+        JoinRequest(
+            role="actor",
+            id="actor-1",
+            host="h",
+            pid=1,
+            software="0",
+            environments=4,
+            numerics_class="c",
+            environment=world.spec,
+        ),
+    )
+    ask(keys.JOIN, JoinRequest(role="learner", id="learner-1", host="h", pid=1, software="0",
+                               numerics_class="c"))  # fmt: skip
+    act()
+    for version in (1, 2):
+        ids = cast(
+            ChangesReply, ask(keys.CHANGES, ChangesRequest(learner="learner-1", version=version))
+        ).ids
+        ask(keys.EPISODES, EpisodesRequest(ids=ids))
+        ask(keys.STATE, StateRequest(learner="learner-1"))
+        states.append(_train(world, version, states))
+        state = states[version]
+        ask(keys.VERSION, VersionMessage(
+            learner="learner-1", version=version, weights=encode_weights(state.behavior),
+            optimizer=encode_optimizer(state), loss=state.loss, train_s=0.1))  # fmt: skip
+        ask(keys.WEIGHTS, WeightsRequest(version="latest"))
+        act()
+        act()
+    held = next(iter(world.service.run.dealer.outstanding))
+    ask(keys.FAILURE, FailureMessage(actor="actor-1", command_id=held, error="no fuel"))
+    ask(keys.STATUS, StatusRequest())
+    generator.close()
+    world.close()
+    return asked
+
+
+def _train(world: World, version: int, states: list[TrainingState]) -> TrainingState:
+    experience = Experience(CONFIG, world.spec)
+    ids = [p.entry.id for p in world._store.buffer(version - 1)]
+    for body in world._store.episode_bodies(ids, 1 << 30):
+        experience.add(decode_episode(decode(body, EpisodeMessage)))
+    state = deepcopy(states[-1])
+    train(state, experience.by_rank(ids), CONFIG)
+    return state
+
+
+class Target:
+    """What a fuzzer calls with one input after another."""
+
+    #: Inputs after which a new run is begun, so that no state is out of reach for long.
+    PERIOD = 5000
+
+    def __init__(self, questions: list[tuple[str, bytes]]) -> None:
+        self._questions = questions
+        self._world: World | None = None
+        self._left = 0
+        self.accepted = self.refused = 0
+
+    @staticmethod
+    def kinds() -> dict[str, type[Message]]:
+        """Return the message that each verb expects."""
+        world = World()
+        kinds = {name: verb.kind for name, verb in world.service._verbs().items()}
+        world.close()
+        return kinds
+
+    def seeds(self) -> list[bytes]:
+        """Return inputs to begin with: a byte for the verb, then the payload."""
+        return [bytes([keys.VERBS.index(verb)]) + data for verb, data in self._questions]
+
+    def __call__(self, data: bytes) -> None:
+        """Knock with one input."""
+        if self._left == 0 or self._world is None or self._world.is_over:
+            self._begin()
+        self._left -= 1
+        assert self._world is not None
+        verb = keys.VERBS[(data[0] if data else 0) % len(keys.VERBS)]
+        answer = self._world.knock(verb, data[1:])
+        if isinstance(answer, Problem):
+            self.refused += 1
+        else:
+            self.accepted += 1
+
+    def _begin(self) -> None:
+        if self._world is not None:
+            self._world.close()
+        self._world = World()
+        self._left = self.PERIOD
+        # Runs are met at their beginning and at three places on their way, in turn.
+        skip = (self.accepted + self.refused) // self.PERIOD % 4
+        for verb, data in self._questions[: len(self._questions) * skip // 4]:
+            self._world.knock(verb, data)
+
+    def close(self) -> None:
+        """End."""
+        if self._world is not None:
+            self._world.close()
+
+
+def read_as_everything(data: bytes) -> None:
+    """Read bytes as every message: each gives one that says the same again, or is refused."""
+    for kind in Message.__subclasses__():
+        try:
+            message = decode(data, kind)
+        except InvalidData:
+            continue
+        assert encode(decode(encode(message), kind)) == encode(message)
