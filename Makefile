@@ -12,7 +12,7 @@ ARGS ?=
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: train test test-slow lint format types bench chaos fuzz setup setup-dev clean
+.PHONY: train test test-slow lint format types bench chaos soak fuzz setup setup-dev clean
 
 train: setup  ## Train LunarLander until it lands.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 100 $(ARGS)
@@ -40,6 +40,9 @@ bench: setup-dev  ## Speed: the whole system beside the limit of its parts (docs
 
 chaos: setup-dev  ## Faults in real runs, and what they cost (docs/reliability.md).
 	$(VENV)/bin/python benchmarks/chaos.py $(ARGS)
+
+soak: setup-dev  ## Half an hour of a run: memory, descriptors, threads (docs/reliability.md).
+	$(VENV)/bin/python benchmarks/soak.py $(ARGS)
 
 fuzz: setup-dev  ## A million inputs for every decoder and queryable (SECURITY.md).
 	$(PIP_INSTALL) --editable '.[box2d,plot,secure,dev,fuzz]'
