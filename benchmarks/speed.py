@@ -7,8 +7,8 @@ From these::
 
     limit = cores / (step + inference + update x updates per env step)
 
-The same parts are then timed in one process per core at once: cores share caches, memory, clock and
-perhaps execution units, so that what all of them do together is less than so many times one.
+The same parts are then timed in one process per core at once: cores may share caches, memory, clock
+or execution units, and then all of them together do less than so many times one.
 
 Run it on an otherwise idle machine: ``make bench``.
 """
@@ -123,7 +123,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "bare environment, random actions, env steps/s per core": _random_speed(config),
         "inference, us per row (full call)": parts.inference * 1e6,
         "update, ms": parts.update * 1e3,
-        "updates per env step": per_step,
+        "updates per 1,000 env steps": per_step * 1000,
         "limit, env steps/s": limit(parts),
         "system, env steps/s": system,
         "system / limit": system / limit(parts),
