@@ -13,6 +13,7 @@ or is accepted though it is invalid; and prints how many were answered and refus
 """
 
 import argparse
+import logging
 import resource
 import sys
 import time
@@ -27,6 +28,7 @@ def main() -> None:
     parser.add_argument("--inputs", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    logging.getLogger("udrl").setLevel(logging.CRITICAL)
     began = time.monotonic()
     if options.engine == "coverage":
         by_coverage(options.inputs, options.seed)

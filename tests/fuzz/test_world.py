@@ -3,6 +3,7 @@
 ``python -m tests.fuzz`` does more of the same, guided by coverage.
 """
 
+import logging
 import random
 from collections.abc import Iterator
 
@@ -41,6 +42,12 @@ def mutated(seed: bytes, other: bytes, draw: random.Random) -> bytes:
                 cut = draw.randrange(len(other) + 1)
                 data[at:] = other[cut:]
     return bytes(data)
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog: pytest.LogCaptureFixture) -> None:
+    """Refusals by the thousand are not worth keeping."""
+    caplog.set_level(logging.CRITICAL, "udrl")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ is asked of each input: one answer, which is a message of the protocol; ledgers 
 exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
 """
 
-import logging
 import queue
 import tempfile
 from collections.abc import Callable
@@ -195,7 +194,6 @@ def honest_questions() -> list[tuple[str, bytes]]:
 
     A fresh world that is asked these in order accepts them all.
     """
-    logging.getLogger("udrl").setLevel(logging.CRITICAL)
     world, asked = World(), []
     generator = EpisodeGenerator(CONFIG, 4)
     states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
