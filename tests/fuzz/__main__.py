@@ -40,8 +40,6 @@ def main() -> None:
 
 def by_coverage(inputs: int, seed: int) -> None:
     """Let libFuzzer mutate; it ends the process at the first input that fails."""
-    import atexit
-
     import atheris
 
     with atheris.instrument_imports(include=["udrl", "udrl_proto", "udrl_replay"]):
@@ -52,15 +50,12 @@ def by_coverage(inputs: int, seed: int) -> None:
     def one(data: bytes) -> None:
         target(data)
         read_as_everything(data[1:])
+        if target.accepted + target.refused == inputs:  # libFuzzer ends the process itself
+            print(f"{target.accepted:,} answered, {target.refused:,} refused", flush=True)
 
     with TemporaryDirectory() as corpus:
         for number, data in enumerate(target.seeds()):
             (Path(corpus) / str(number)).write_bytes(data)
-        # libFuzzer ends the process itself when it is done.
-        began = time.monotonic()
-        atexit.register(lambda: print(
-            f"{target.accepted:,} answered, {target.refused:,} refused, "
-            f"{time.monotonic() - began:,.0f} s", flush=True))  # fmt: skip
         atheris.Setup(
             [sys.argv[0], f"-runs={inputs}", f"-seed={seed}", "-timeout=5", "-rss_limit_mb=1024",
              "-max_len=8192", "-print_final_stats=1", corpus],
