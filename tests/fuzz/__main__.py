@@ -20,6 +20,8 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+_MOST_MIB = 1024
+
 
 def main() -> None:
     """Fuzz as the command line says."""
@@ -36,6 +38,8 @@ def main() -> None:
         by_type(options.inputs, options.seed)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"{time.monotonic() - began:,.0f} s, at most {memory:,.0f} MiB", flush=True)
+    if memory > _MOST_MIB:
+        raise SystemExit(f"more than {_MOST_MIB} MiB of memory")
 
 
 def by_coverage(inputs: int, seed: int) -> None:
@@ -57,8 +61,8 @@ def by_coverage(inputs: int, seed: int) -> None:
         for number, data in enumerate(target.seeds()):
             (Path(corpus) / str(number)).write_bytes(data)
         atheris.Setup(
-            [sys.argv[0], f"-runs={inputs}", f"-seed={seed}", "-timeout=5", "-rss_limit_mb=1024",
-             "-max_len=8192", "-print_final_stats=1", corpus],
+            [sys.argv[0], f"-runs={inputs}", f"-seed={seed}", "-timeout=5",
+             f"-rss_limit_mb={_MOST_MIB}", "-max_len=8192", "-print_final_stats=1", corpus],
             one,
         )  # fmt: skip
         atheris.Fuzz()

@@ -92,9 +92,9 @@ def panel(status: Status) -> Table:
     if status.audit.rate:
         audit = status.audit
         rows["audit"] = (
-            f"{audit.rate:.0%} of the episodes; {audit.agreed} agreed, {audit.open} open, "
+            f"{100 * audit.rate:g} % of the episodes; {audit.agreed} agreed, {audit.open} open, "
             f"{audit.disputed} disputed"
-        ).replace("%", " %", 1)
+        )
     for name, value in rows.items():
         table.add_row(name, Text(value))
     for actor in status.quarantined:

@@ -255,7 +255,7 @@ class Run:
     def _begin_audit(self, command: Command, arrival: Arrival) -> None:
         """Remember who brings an episode, and perhaps have it made again."""
         name = arrival.actor
-        if self.auditor.rate and name not in self._entered:
+        if name not in self._entered:
             self._entered[name] = command.iteration
             self.store.set_fact("entered", self._entered)
         if name in self.dealer.actors:
