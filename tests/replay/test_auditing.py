@@ -189,6 +189,27 @@ def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
     assert set(reopened(run).quarantined) == {"b"}
 
 
+def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
+    make_run: Callable[..., Run], reopened: Callable[..., Run]
+) -> None:
+    run = make_run()
+    run.dealer.join(join("b"), 0.0)
+    (earlier,) = ask(run, "b")
+    deliver(run, "b", earlier)
+    run = reopened(run)
+    run.auditor = Auditor(1.0)
+    for name in "abc":
+        run.dealer.join(join(name), 0.0)
+    (made,) = ask(run, "a")
+    deliver(run, "a", made)
+    ask(run, "b")
+    deliver(run, "b", made, lies=True)
+    ask(run, "c")
+    deliver(run, "c", made)
+    assert run.progress.deceived
+    assert "actor b lied" in run.progress.problem
+
+
 def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: Run) -> None:
     run = audited_run
     (made,) = ask(run, "a")
