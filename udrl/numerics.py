@@ -95,7 +95,9 @@ def acting_class(config: Config, generator: EpisodeGenerator) -> str:
 
 def training_class(config: Config, spec: EnvironmentSpec) -> str:
     """Return the numerics class of training: digest of the weights after two updates."""
-    small = msgspec.structs.replace(config, n_updates_per_iter=2, replay_size=1, last_few=1)
+    small = msgspec.structs.replace(
+        config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1
+    )
     stream = _probe_stream(1000)
     length = min(_PROBE_STEPS, spec.max_episode_steps)
     observations = stream.uniforms(length * spec.observation_size).reshape(length, -1)

@@ -83,15 +83,16 @@ class Experience:
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         pages_per_episode = -(-spec.max_episode_steps // _PAGE)
-        n_pages = config.replay_size * pages_per_episode
+        n_episodes = config.replay_size + config.recent_size
+        n_pages = n_episodes * pages_per_episode
         steps = n_pages * _PAGE
         self._observations = np.empty((steps, spec.observation_size), np.float32)
         self._actions = np.empty(steps, action_dtype(spec.n_actions))
         self._earned = np.empty(steps)  # P[t]: rewards earned before step t
-        self._page_table = np.zeros((config.replay_size, pages_per_episode), np.int64)
-        self._lengths = np.zeros(config.replay_size, np.int64)
-        self._returns = np.zeros(config.replay_size)
-        self._free_slots = list(range(config.replay_size))[::-1]
+        self._page_table = np.zeros((n_episodes, pages_per_episode), np.int64)
+        self._lengths = np.zeros(n_episodes, np.int64)
+        self._returns = np.zeros(n_episodes)
+        self._free_slots = list(range(n_episodes))[::-1]
         self._free_pages = list(range(n_pages))[::-1]
         self._places: dict[int, _Place] = {}
 

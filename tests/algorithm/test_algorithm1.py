@@ -7,6 +7,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import Run, algorithm1
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
+from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import summarise
 from udrl.replay import Entry, ReplayBuffer
@@ -85,8 +86,16 @@ def test_a_larger_budget_goes_on_where_a_smaller_one_stopped() -> None:
     assert longer[: len(usual_history())] == usual_history()
 
 
-def test_the_run_is_the_papers_pseudo_code() -> None:
-    config = settings()
+@pytest.mark.parametrize("recent_size", [0, 8])
+def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
+    config = settings(recent_size=recent_size)
+
+    def held(seen: list[Episode]) -> list[Episode]:
+        """The best of all episodes ever seen, of which equals rank by age, and the newest."""
+        best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+        newest = seen[len(seen) - min(recent_size, len(seen)) :]
+        return sorted({*best, *newest}, key=lambda e: (e.episode_return, e.command_id))
+
     generator = EpisodeGenerator(config, n_environments=1)
     sample = CommandSampler(config, generator.spec.max_episode_steps)
     # 1, 2: warm-up episodes; a behavior function
@@ -96,15 +105,14 @@ def test_the_run_is_the_papers_pseudo_code() -> None:
     iteration, crossed = 0, env_steps // config.eval_every > 0
     while env_steps < BUDGET.max_env_steps:  # 3
         iteration += 1
-        # The best of all episodes ever seen, of which equals rank by age.
-        best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+        known = held(seen)
         buffer = ReplayBuffer(
-            config.replay_size, [Entry(e.episode_return, e.command_id, e.length) for e in best]
+            config.replay_size, [Entry(e.episode_return, e.command_id, e.length) for e in known]
         )
         experience = Experience(config, generator.spec)
-        for episode in best:
+        for episode in known:
             experience.add(episode)
-        train(state, experience.by_rank([e.command_id for e in best]), config)  # 4
+        train(state, experience.by_rank([e.command_id for e in known]), config)  # 4
         exploratory = sample.explore(iteration, buffer)  # 5
         new = generate_episodes(generator, exploratory, state.behavior)  # 6
         seen += new
@@ -117,13 +125,13 @@ def test_the_run_is_the_papers_pseudo_code() -> None:
         crossed = env_steps // config.eval_every > before // config.eval_every
 
     run = algorithm1(config, BUDGET, 4)
-    best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+    known = held(seen)
     assert (run.iteration, run.env_steps) == (iteration, env_steps)
     assert run.evaluations == evaluations
     assert evaluations
-    assert [entry.id for entry in run.buffer] == [e.command_id for e in best]
-    assert run.experience.ids() == {e.command_id for e in best}
-    assert set(run.digests) == {e.command_id for e in best}
+    assert [entry.id for entry in run.buffer] == [e.command_id for e in known]
+    assert run.experience.ids() == {e.command_id for e in known}
+    assert set(run.digests) == {e.command_id for e in known}
     ours, theirs = state.behavior.state_dict(), run.state.behavior.state_dict()
     assert all(bool((ours[name] == theirs[name]).all()) for name in ours)
 

@@ -9,6 +9,7 @@ from udrl.replay import Entry, ReplayBuffer
 # Few different returns, so that there are many ties; batches of episodes, as iterations bring them.
 batches = st.lists(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), max_size=6), max_size=8)
 capacities = st.integers(1, 10)
+recents = st.integers(0, 10)
 
 
 def numbered(batches: list[list[float]]) -> list[list[Entry]]:
@@ -32,24 +33,25 @@ def top_k(seen: list[Entry], k: int) -> list[Entry]:
     return left
 
 
-@given(batches, capacities)
-def test_the_buffer_is_the_top_k_of_all_episodes_seen(
-    batches: list[list[float]], capacity: int
+@given(batches, capacities, recents)
+def test_the_buffer_is_the_top_k_of_all_episodes_seen_and_the_newest(
+    batches: list[list[float]], capacity: int, recent: int
 ) -> None:
-    buffer = ReplayBuffer(capacity)
+    buffer = ReplayBuffer(capacity, recent=recent)
     seen: list[Entry] = []
     for entries in numbered(batches):
         before = [*buffer, *entries]
         evicted = buffer.admit(entries)
         seen += entries
-        assert list(buffer) == top_k(seen, capacity)
-        assert len(buffer) == min(len(seen), capacity)
+        greatest, newest = top_k(seen, capacity), seen[len(seen) - min(recent, len(seen)) :]
+        assert list(buffer.best(capacity)) == greatest
+        assert list(buffer) == sorted({*greatest, *newest})
         assert sorted([*evicted, *buffer]) == sorted(before)
         assert evicted == sorted(evicted)
 
 
 @given(batches, capacities, st.randoms(use_true_random=False))
-def test_the_order_in_which_episodes_arrive_does_not_matter(
+def test_the_order_in_which_episodes_arrive_does_not_matter_to_the_best(
     batches: list[list[float]], capacity: int, random: Random
 ) -> None:
     straight, shuffled = ReplayBuffer(capacity), ReplayBuffer(capacity)
@@ -87,6 +89,19 @@ def test_a_new_episode_that_is_not_good_enough_leaves_at_once() -> None:
     buffer.admit([Entry(1.0, 1, 1), Entry(2.0, 2, 1)])
     assert buffer.admit([Entry(0.0, 3, 1)]) == [Entry(0.0, 3, 1)]
     assert [entry.id for entry in buffer] == [1, 2]
+
+
+@given(batches, capacities, recents, st.randoms(use_true_random=False))
+def test_a_restored_buffer_goes_on_like_one_that_never_stopped(
+    batches: list[list[float]], capacity: int, recent: int, random: Random
+) -> None:
+    buffer = ReplayBuffer(capacity, recent=recent)
+    for entries in numbered(batches):
+        held = list(buffer)
+        random.shuffle(held)
+        restored = ReplayBuffer(capacity, held, recent=recent)
+        assert buffer.admit(entries) == restored.admit(entries)
+        assert list(buffer) == list(restored)
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1), (2, 3, 1)])

@@ -41,6 +41,7 @@ def config(lead: int = 0) -> Config:
         n_warm_up_episodes=4,
         n_episodes_per_iter=3,
         replay_size=5,
+        recent_size=4,
         last_few=2,
         eval_every=9,
         eval_episodes=2,
@@ -122,7 +123,9 @@ def reference(lead: int, max_env_steps: int) -> Result:
 
     def buffer(iteration: int) -> list[Episode]:
         everything = [e for done in explored[: iteration + 1] for e in done]
-        return sorted(everything, key=entry)[-settings.replay_size :]
+        best = sorted(everything, key=entry)[-settings.replay_size :]
+        newest = everything[-settings.recent_size :]
+        return sorted({e.command_id: e for e in best + newest}.values(), key=entry)
 
     def carry_out(commands: Sequence[Command]) -> list[Episode]:
         return [episode(c, weights[c.weights_version]) for c in commands]

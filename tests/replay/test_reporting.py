@@ -43,7 +43,7 @@ def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
     run = make_run(lead=1, max_env_steps=40)
     finish(run)
     seen = shown(run)
-    returns = [e.episode_return for e in run.buffer]
+    returns = [e.episode_return for e in run.buffer.best(run.config.replay_size)]
     version = run.store.version(run.progress.iteration)
     closing = run.store.last_evaluation(closing=True)
     assert version is not None

@@ -277,7 +277,8 @@ class RunMachine(RuleBasedStateMachine):
         """Return the buffer after an iteration, from all that was ever accepted."""
         end = (iteration + 1) * COMMANDS_PER_ITERATION
         admitted = sorted((e for e in self.explored if e.id < end), key=lambda e: e.id)
-        return sorted(admitted)[-config().replay_size :]
+        best, newest = sorted(admitted)[-config().replay_size :], admitted[-config().recent_size :]
+        return sorted({*best, *newest})
 
     def check_collected(self) -> None:
         """A version has arrived: nothing is kept that nobody can ask for."""

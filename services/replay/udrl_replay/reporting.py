@@ -109,7 +109,7 @@ class Waits:
 def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
     progress, dealer, config = run.progress, run.dealer, run.config
-    returns = [e.episode_return for e in run.buffer]
+    returns = [e.episode_return for e in run.buffer.best(run.config.replay_size)]
     latest = run.store.version(progress.latest_version)
     rate = throughput.per_second(now)
     left = max(0, run.budget.max_env_steps - progress.env_steps)

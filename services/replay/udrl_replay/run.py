@@ -102,7 +102,9 @@ class Run:
         self._sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
         self._began = time.monotonic() - self.progress.wall_s
         held = store.buffer(self.progress.iteration)
-        self.buffer = ReplayBuffer(self.config.replay_size, (p.entry for p in held))
+        self.buffer = ReplayBuffer(
+            self.config.replay_size, (p.entry for p in held), recent=self.config.recent_size
+        )
         self.digests = {p.entry.id: p.digest for p in held}
         outstanding = store.commands(cancelled=False)
         arrived = store.pending_ids()
@@ -350,7 +352,7 @@ class Run:
 
         if evaluated:
             self._note_evaluation(iteration, evaluated, closing=False)
-        returns = [e.episode_return for e in self.buffer]
+        returns = [e.episode_return for e in self.buffer.best(self.config.replay_size)]
         self.store.add_iteration(
             iteration,
             len(ids),

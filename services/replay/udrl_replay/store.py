@@ -101,7 +101,7 @@ class Store:
         if not self.read_only:
             ((verdict,),) = self._rows("PRAGMA integrity_check(1)")
             if verdict != "ok":
-                raise self._damaged(verdict)
+                raise self._damaged(" ".join(verdict.split()))  # SQLite's may have several lines
         schema = self.fact("schema", int)
         if schema != SCHEMA:
             raise OtherConfiguration(
