@@ -20,8 +20,9 @@ from udrl.commands import Command
 from udrl.config import Budget
 from udrl.errors import Deceived, Refused
 from udrl_proto.messages import CommandsRequest
-from udrl_replay.auditing import MOST_OPEN, OFFENCES, Auditor, Offences, Verdict
-from udrl_replay.run import MOST_QUARANTINED, Run
+from udrl_replay.auditing import MOST_OPEN, Auditor, Verdict
+from udrl_replay.quarantine import OFFENCES
+from udrl_replay.run import Run
 from udrl_replay.store import Store
 
 
@@ -103,15 +104,6 @@ def test_open_audits_are_bounded() -> None:
     assert not auditor.open
 
 
-def test_offences_are_counted_by_actor_and_their_memory_is_bounded() -> None:
-    offences = Offences()
-    assert [offences.add("a") for _ in range(OFFENCES)] == [False] * (OFFENCES - 1) + [True]
-    for i in range(5000):
-        assert not offences.add(f"b{i}")
-    assert len(offences._of) <= 1000
-    assert offences.add("a"), "who offends most is not forgotten for others"
-
-
 # In a run.
 
 
@@ -162,7 +154,7 @@ def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: Run, tmp_path: Pat
     assert run.progress.state == "failed"
     assert "actor a lied: its episode of command 0 differs" in run.progress.problem
     assert "Since iteration 0" in run.progress.problem
-    assert set(run.quarantined) == {"a"}
+    assert set(run.quarantined.reasons) == {"a"}
     run.store.close()
     with closing(Store(tmp_path)) as store, pytest.raises(Deceived, match="actor a lied"):
         Run(store, run.budget)
@@ -180,13 +172,13 @@ def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
     ask(run, "c")
     deliver(run, "c", made)
     assert run.progress.state == "running"
-    assert set(run.quarantined) == {"b"}
+    assert set(run.quarantined.reasons) == {"b"}
     assert "b" not in run.dealer.actors
     (other,) = ask(run, "a")
     with pytest.raises(Refused, match="quarantined") as refused:
         deliver(run, "b", other)
     assert refused.value.code == "quarantined"
-    assert set(reopened(run).quarantined) == {"b"}
+    assert set(reopened(run).quarantined.reasons) == {"b"}
 
 
 def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
@@ -218,7 +210,7 @@ def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: Run)
             assert ask(run, name) == [made]
         with run.store.transaction():
             run.accept(arrive(episode(made, weights), name), 0.0)
-    assert not run.quarantined
+    assert not run.quarantined.reasons
     assert not run.progress.exact
     assert "not deterministic" in run.progress.inexact_reason
     assert run.auditor.rate == 0
@@ -235,21 +227,10 @@ def test_repeated_offender_is_quarantined(make_run: Callable[..., Run]) -> None:
     for _ in range(OFFENCES):
         with pytest.raises(Refused, match="never issued"), run.store.transaction():
             run.accept(arrive(episode(unknown, b""), "a"), 0.0)
-    assert "10 invalid episodes" in run.quarantined["a"]
+    assert "10 invalid episodes" in run.quarantined.reasons["a"]
     with pytest.raises(Refused, match="quarantined"):
         deliver(run, "a", made)
     assert run.progress.rejected == OFFENCES + 1
     run.dealer.join(join("b"), 0.0)
     assert ask(run, "b") == [made], "its commands go to others"
     assert deliver(run, "b", made) == "accepted"
-
-
-def test_quarantine_is_bounded(make_run: Callable[..., Run], tmp_path: Path) -> None:
-    run = make_run()
-    with run.store.transaction():
-        for i in range(MOST_QUARANTINED + 1):
-            run.quarantined[f"a{i}"] = "x"
-        run.quarantine("last", "y" * 5000)
-    assert len(run.quarantined) <= MOST_QUARANTINED + 1
-    assert "a0" not in run.quarantined
-    assert len(run.quarantined["last"]) == 1000

@@ -1,4 +1,4 @@
-"""Whom to believe: spot checks of what actors deliver, and quarantine of those who deceive.
+"""Whom to believe: spot checks of what actors deliver.
 
 An episode is a pure function of its command, so another actor of the same numerics class must
 deliver the same bytes. A random share of commands is carried out again by a second actor; where the
@@ -16,10 +16,6 @@ from udrl.commands import Command
 
 #: Audits that are open at once; while there are so many no new ones begin.
 MOST_OPEN = 256
-#: Invalid deliveries after which an actor is quarantined.
-OFFENCES = 10
-#: Actors whose offences are counted at once.
-_MOST_COUNTED = 1000
 
 
 @dataclass
@@ -132,17 +128,3 @@ class Auditor:
     def versions(self) -> set[int]:
         """Weights versions that open audits need."""
         return {audit.command.weights_version for audit in self.open.values()}
-
-
-class Offences:
-    """Counts invalid deliveries by actor."""
-
-    def __init__(self) -> None:
-        self._of: Counter[str] = Counter()
-
-    def add(self, actor: str) -> bool:
-        """Count one and say whether it is one too many."""
-        if actor not in self._of and len(self._of) >= _MOST_COUNTED:
-            del self._of[min(self._of, key=self._of.__getitem__)]
-        self._of[actor] += 1
-        return self._of[actor] >= OFFENCES

@@ -181,7 +181,7 @@ def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: fl
             open=len(run.auditor.open),
             disputed=sum(a.is_disputed for a in run.auditor.open.values()),
         ),
-        quarantined=tuple(Quarantined(id=n, why=w) for n, w in run.quarantined.items()),
+        quarantined=tuple(Quarantined(id=n, why=w) for n, w in run.quarantined.reasons.items()),
     )
 
 

@@ -20,14 +20,12 @@ from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage, Hello
 from udrl_replay.arrival import Arrival
-from udrl_replay.auditing import OFFENCES, Auditor, Offences
+from udrl_replay.auditing import Auditor
 from udrl_replay.dealing import MAX_DEALT, SUSPICIOUS, Dealer
+from udrl_replay.quarantine import OFFENCES, Quarantine
 from udrl_replay.store import EvaluationRow, Store, Version
 
 log = logging.getLogger("udrl")
-
-#: Quarantined actors that are remembered; the oldest goes first.
-MOST_QUARANTINED = 1000
 
 State = Literal["running", "closing", "ended", "failed"]
 
@@ -96,8 +94,7 @@ class Run:
         self.progress = store.fact("progress", Progress)
         self.dealer = Dealer()
         self.auditor = Auditor(audit)
-        self.quarantined = store.fact("quarantined", dict[str, str], {})
-        self._offences = Offences()
+        self.quarantined = Quarantine(store)
         self._entered = store.fact("entered", dict[str, int], {})
         self._sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
         self._began = time.monotonic() - self.progress.wall_s
@@ -156,7 +153,7 @@ class Run:
         command_id = arrival.entry.id
         if arrival.actor in self.quarantined:
             self.progress.rejected += 1
-            raise self.refusal(arrival.actor)
+            raise self.quarantined.refusal(arrival.actor)
         item = self.dealer.outstanding.get(command_id)
         if item is None:
             if self.auditor.asked(arrival.actor, command_id):
@@ -299,25 +296,13 @@ class Run:
 
     def offend(self, actor: str, what: str) -> None:
         """Note that an actor delivered what it may not; too often is once too many."""
-        if actor not in self.quarantined and self._offences.add(actor):
+        if self.quarantined.count(actor):
             self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
 
     def quarantine(self, actor: str, why: str) -> None:
-        """Take nothing from an actor any more."""
-        log.warning("actor %s is quarantined: %s", actor, why)
-        self.quarantined[actor] = why[:1000]
-        if len(self.quarantined) > MOST_QUARANTINED:
-            del self.quarantined[next(iter(self.quarantined))]
-        self.store.set_fact("quarantined", self.quarantined)
+        """Take nothing from an actor any more, and give what it holds to others."""
+        self.quarantined.add(actor, why)
         self.lose(actor)
-
-    def refusal(self, actor: str) -> Refused:
-        """Return what a quarantined actor is told."""
-        return Refused(
-            "quarantined",
-            f"actor {actor} is quarantined: {self.quarantined[actor]}; repair or remove it, then "
-            f"start it again",
-        )
 
     # Iterations.
 

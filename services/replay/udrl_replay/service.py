@@ -301,7 +301,7 @@ class ReplayService:
             self.run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
         if request.role == "actor":
             if request.id in self.run.quarantined:
-                raise self.run.refusal(request.id)
+                raise self.run.quarantined.refusal(request.id)
             if len(self.run.dealer.actors) >= MOST_ACTORS:
                 raise Refused(
                     "too_many_actors",
@@ -317,7 +317,7 @@ class ReplayService:
         if run.progress.state in ("ended", "failed"):
             return CommandsReply(ended=True)
         if request.actor in run.quarantined:
-            raise run.refusal(request.actor)
+            raise run.quarantined.refusal(request.actor)
         if request.actor not in run.dealer.actors:
             raise Refused("join_first", f"actor {request.actor} has not joined; send join first")
         commands = run.deal(request, now)

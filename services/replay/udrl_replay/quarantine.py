@@ -1,0 +1,58 @@
+"""Actors from which nothing is taken any more, and what they did."""
+
+import logging
+from collections import Counter
+
+from udrl.errors import Refused
+from udrl_replay.store import Store
+
+log = logging.getLogger("udrl")
+
+#: Invalid deliveries after which an actor is quarantined.
+OFFENCES = 10
+#: Actors whose offences are counted at once.
+_MOST_COUNTED = 1000
+#: Quarantined actors that are remembered; the oldest goes first.
+_MOST_REMEMBERED = 1000
+
+
+class Quarantine:
+    """Who is shut out of a run, kept in its store; offences that do not yet lead there are memory.
+
+    Attributes:
+        reasons: by actor, why it is shut out.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._offences: Counter[str] = Counter()
+        self.reasons = store.fact("quarantined", dict[str, str], {})
+
+    def __contains__(self, actor: str) -> bool:
+        return actor in self.reasons
+
+    def add(self, actor: str, why: str) -> None:
+        """Shut an actor out."""
+        log.warning("actor %s is quarantined: %s", actor, why)
+        self.reasons[actor] = why[:1000]
+        if len(self.reasons) > _MOST_REMEMBERED:
+            del self.reasons[next(iter(self.reasons))]
+        self._store.set_fact("quarantined", self.reasons)
+
+    def count(self, actor: str) -> bool:
+        """Count an offence and say whether it is one too many."""
+        if actor in self.reasons:
+            return False
+        counts = self._offences
+        if actor not in counts and len(counts) >= _MOST_COUNTED:
+            del counts[min(counts, key=counts.__getitem__)]
+        counts[actor] += 1
+        return counts[actor] >= OFFENCES
+
+    def refusal(self, actor: str) -> Refused:
+        """Return what a quarantined actor is told."""
+        return Refused(
+            "quarantined",
+            f"actor {actor} is quarantined: {self.reasons[actor]}; repair or remove it, then "
+            f"start it again",
+        )

@@ -1,0 +1,47 @@
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.replay.synthetic import create
+from udrl_replay.quarantine import OFFENCES, Quarantine
+from udrl_replay.store import Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with closing(create(tmp_path)) as made:
+        yield made
+
+
+def test_offences_are_counted_by_actor_and_their_memory_is_bounded(store: Store) -> None:
+    quarantine = Quarantine(store)
+    assert [quarantine.count("a") for _ in range(OFFENCES)] == [False] * (OFFENCES - 1) + [True]
+    for i in range(5000):
+        assert not quarantine.count(f"b{i}")
+    assert len(quarantine._offences) <= 1000
+    assert quarantine.count("a"), "who offends most is not forgotten for others"
+
+
+def test_who_is_shut_out_is_remembered_by_the_store_and_told_why(store: Store) -> None:
+    quarantine = Quarantine(store)
+    assert "a" not in quarantine
+    quarantine.add("a", "it lied")
+    again = Quarantine(store)
+    assert "a" in again
+    assert not again.count("a"), "what it does now does not count any more"
+    refusal = again.refusal("a")
+    assert refusal.code == "quarantined"
+    assert "it lied" in str(refusal)
+
+
+def test_what_is_remembered_is_bounded(store: Store) -> None:
+    quarantine = Quarantine(store)
+    with store.transaction():
+        for i in range(1001):
+            quarantine.add(f"a{i}", "x")
+        quarantine.add("last", "y" * 5000)
+    assert len(quarantine.reasons) == 1000
+    assert "a0" not in quarantine
+    assert len(quarantine.reasons["last"]) == 1000
