@@ -86,7 +86,7 @@ def algorithm1(
 
     # 1: initialise replay buffer with warm-up episodes using random actions
     run = Run(
-        ReplayBuffer(config.replay_size, recent=config.recent_size),
+        ReplayBuffer(config),
         untrained(config, generator.spec),  # 2: initialise a behavior function
         Experience(config, generator.spec),
     )

@@ -50,6 +50,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         n_updates_per_iter: gradient steps in an iteration.
         n_warm_up_episodes: episodes of random actions before the first iteration.
         replay_size: episodes that the replay buffer holds (2.3.1).
+        max_age: iterations after which an episode leaves the replay buffer; None, as in the paper:
+            never.
         recent_size: newest episodes that the replay buffer holds besides, whatever they returned;
             0 is the paper's.
         return_scale: factor on the desired return at the network's input.
@@ -79,6 +81,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     n_updates_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 100
     n_warm_up_episodes: Annotated[int, Meta(ge=1, le=100_000)] = 50
     replay_size: Annotated[int, Meta(ge=1, le=1_000_000)] = 500
+    max_age: PositiveInt | None = None
     recent_size: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     return_scale: Scale = 0.025
 

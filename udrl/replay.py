@@ -1,14 +1,17 @@
 """Section 2.3.1: the replay buffer keeps the episodes with the highest returns.
 
-On request it keeps the newest ones too, whatever they returned. Elites alone are all good, so a
-behavior function cannot learn from them what distinguishes a good return from a bad one, and
-imitates them instead of obeying; what the agent did last is the contrast that it needs.
+Two settings that are not in the paper change what "all episodes" are. With an age limit the best of
+the last iterations are kept: elites of all times are lucky ones in the end, imitated long after the
+agent could have replaced them, and learned by heart. And the newest can be kept whatever they
+returned, which holds the agent near what it does and shows it what the best ones did otherwise.
 """
 
 import bisect
 import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
+
+from udrl.config import COMMANDS_PER_ITERATION, Config
 
 
 class Entry(NamedTuple):
@@ -18,21 +21,27 @@ class Entry(NamedTuple):
     id: int
     length: int
 
+    @property
+    def iteration(self) -> int:
+        """The iteration that the episode was made in."""
+        return self.id // COMMANDS_PER_ITERATION
+
 
 class ReplayBuffer:
-    """The greatest of all entries that were ever admitted, and the newest, in increasing order.
+    """The greatest of all entries that were admitted, and the newest, in increasing order.
 
     It ranks episodes; who needs their steps keeps them (:class:`udrl.segments.Experience`).
 
     Args:
-        capacity: how many of the greatest it keeps.
+        config: ``replay_size``, how many of the greatest it keeps; ``recent_size``, how many of the
+            newest, those among the greatest counted; ``max_age``, for how many iterations.
         entries: what it holds at first.
-        recent: how many of the newest it keeps, those among the greatest counted; 0 is the paper's.
     """
 
-    def __init__(self, capacity: int, entries: Iterable[Entry] = (), *, recent: int = 0) -> None:
-        self.capacity = capacity
-        self.recent = recent
+    def __init__(self, config: Config, entries: Iterable[Entry] = ()) -> None:
+        self._capacity = config.replay_size
+        self._recent = config.recent_size
+        self._max_age = config.max_age
         self._entries = sorted(entries)
 
     def __len__(self) -> int:
@@ -45,11 +54,17 @@ class ReplayBuffer:
         """Add entries and return those that had to leave, least first; some may be new ones."""
         for entry in entries:
             bisect.insort(self._entries, entry)
-        surplus = max(0, len(self._entries) - self.capacity)
-        lesser, greatest = self._entries[:surplus], self._entries[surplus:]
-        newest = set(heapq.nlargest(self.recent, (entry.id for entry in self._entries)))
-        self._entries = [entry for entry in lesser if entry.id in newest] + greatest
-        return [entry for entry in lesser if entry.id not in newest]
+        before, self._entries = self._entries, self._kept(self._entries)
+        kept = set(self._entries)
+        return [entry for entry in before if entry not in kept]
+
+    def _kept(self, entries: list[Entry]) -> list[Entry]:
+        if self._max_age is not None and entries:
+            oldest = max(entry.iteration for entry in entries) - self._max_age
+            entries = [entry for entry in entries if entry.iteration > oldest]
+        surplus = max(0, len(entries) - self._capacity)
+        newest = set(heapq.nlargest(self._recent, (entry.id for entry in entries)))
+        return [entry for entry in entries[:surplus] if entry.id in newest] + entries[surplus:]
 
     def best(self, n: int) -> Sequence[Entry]:
         """Return the last ``n`` entries, or all when there are fewer."""

@@ -72,6 +72,7 @@ CONFIG = Config(
     n_updates_per_iter=100,
     n_warm_up_episodes=30,
     replay_size=300,
+    max_age=50,
     recent_size=100,
     return_scale=0.02,
     hidden=(32, 64, 64),

@@ -142,7 +142,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     env = make_environment(config)
     spec = specify(env, config)
     one, other = (initialise(settings(environment, seed=seed), spec) for seed in (1, 2))
-    buffer = ReplayBuffer(2, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
+    buffer = ReplayBuffer(config, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
     sample = CommandSampler(config, spec.max_episode_steps)
     evaluation = sample.evaluate(2, buffer)
     orders: list[Order] = []

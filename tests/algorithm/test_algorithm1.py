@@ -106,9 +106,8 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
     while env_steps < BUDGET.max_env_steps:  # 3
         iteration += 1
         known = held(seen)
-        buffer = ReplayBuffer(
-            config.replay_size, [Entry(e.episode_return, e.command_id, e.length) for e in known]
-        )
+        entries = [Entry(e.episode_return, e.command_id, e.length) for e in known]
+        buffer = ReplayBuffer(config, entries)
         experience = Experience(config, generator.spec)
         for episode in known:
             experience.add(episode)

@@ -31,7 +31,8 @@ def sampler(**values: Any) -> CommandSampler:
 def buffer_of(returns: Sequence[float], lengths: Sequence[int] = ()) -> ReplayBuffer:
     lengths = lengths or [1] * len(returns)
     entries = zip(returns, range(len(returns)), lengths, strict=True)
-    return ReplayBuffer(len(returns), [Entry(*entry) for entry in entries])
+    config = settings(replay_size=len(returns), last_few=1)
+    return ReplayBuffer(config, [Entry(*entry) for entry in entries])
 
 
 def desired_returns(commands: list[Command]) -> list[float]:

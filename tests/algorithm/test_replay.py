@@ -4,22 +4,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from udrl.config import COMMANDS_PER_ITERATION, Config, build
 from udrl.replay import Entry, ReplayBuffer
 
 # Few different returns, so that there are many ties; batches of episodes, as iterations bring them.
 batches = st.lists(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), max_size=6), max_size=8)
 capacities = st.integers(1, 10)
 recents = st.integers(0, 10)
+ages = st.none() | st.integers(1, 4)
+
+
+def settings(replay_size: int, recent_size: int = 0, max_age: int | None = None) -> Config:
+    values = {"replay_size": replay_size, "recent_size": recent_size, "max_age": max_age}
+    return build(Config, {"environment": "CartPole-v1", "last_few": 1, **values})
 
 
 def numbered(batches: list[list[float]]) -> list[list[Entry]]:
-    """Entries with increasing ids, in batches."""
-    entries: list[list[Entry]] = []
-    n = 0
-    for returns in batches:
-        entries.append([Entry(r, n + i, length=1) for i, r in enumerate(returns)])
-        n += len(returns)
-    return entries
+    """Entries with increasing ids; each batch is an iteration."""
+    return [
+        [Entry(r, n * COMMANDS_PER_ITERATION + i, length=1) for i, r in enumerate(returns)]
+        for n, returns in enumerate(batches)
+    ]
 
 
 def top_k(seen: list[Entry], k: int) -> list[Entry]:
@@ -37,7 +42,7 @@ def top_k(seen: list[Entry], k: int) -> list[Entry]:
 def test_the_buffer_is_the_top_k_of_all_episodes_seen_and_the_newest(
     batches: list[list[float]], capacity: int, recent: int
 ) -> None:
-    buffer = ReplayBuffer(capacity, recent=recent)
+    buffer = ReplayBuffer(settings(capacity, recent))
     seen: list[Entry] = []
     for entries in numbered(batches):
         before = [*buffer, *entries]
@@ -50,11 +55,27 @@ def test_the_buffer_is_the_top_k_of_all_episodes_seen_and_the_newest(
         assert evicted == sorted(evicted)
 
 
+@given(batches, capacities, recents, st.integers(1, 4))
+def test_with_an_age_limit_the_best_of_the_last_iterations_are_kept(
+    batches: list[list[float]], capacity: int, recent: int, max_age: int
+) -> None:
+    buffer = ReplayBuffer(settings(capacity, recent, max_age))
+    held: list[Entry] = []
+    for n, entries in enumerate(numbered(batches)):
+        held += entries
+        if entries:  # an iteration without episodes says nothing of the time
+            held = [e for e in held if n - e.id // COMMANDS_PER_ITERATION < max_age]
+        newest = held[len(held) - min(recent, len(held)) :]
+        held = [e for e in held if e in newest or e in top_k(held, capacity)]
+        buffer.admit(entries)
+        assert list(buffer) == sorted(held)
+
+
 @given(batches, capacities, st.randoms(use_true_random=False))
 def test_the_order_in_which_episodes_arrive_does_not_matter_to_the_best(
     batches: list[list[float]], capacity: int, random: Random
 ) -> None:
-    straight, shuffled = ReplayBuffer(capacity), ReplayBuffer(capacity)
+    straight, shuffled = ReplayBuffer(settings(capacity)), ReplayBuffer(settings(capacity))
     entries = [entry for batch in numbered(batches) for entry in batch]
     straight.admit(entries)
     random.shuffle(entries)
@@ -67,7 +88,7 @@ def test_the_order_in_which_episodes_arrive_does_not_matter_to_the_best(
 def test_the_best_are_the_last_and_all_when_there_are_fewer(
     batches: list[list[float]], capacity: int, n: int
 ) -> None:
-    buffer = ReplayBuffer(capacity)
+    buffer = ReplayBuffer(settings(capacity))
     for entries in numbered(batches):
         buffer.admit(entries)
     everything = list(buffer)
@@ -77,7 +98,7 @@ def test_the_best_are_the_last_and_all_when_there_are_fewer(
 
 
 def test_of_equal_returns_the_newer_ranks_higher_and_the_oldest_leaves_first() -> None:
-    buffer = ReplayBuffer(3)
+    buffer = ReplayBuffer(settings(3))
     assert buffer.admit([Entry(500.0, i, 500) for i in (3, 1, 2)]) == []
     assert [entry.id for entry in buffer] == [1, 2, 3]
     assert [entry.id for entry in buffer.admit([Entry(500.0, 4, 500)])] == [1]
@@ -85,26 +106,27 @@ def test_of_equal_returns_the_newer_ranks_higher_and_the_oldest_leaves_first() -
 
 
 def test_a_new_episode_that_is_not_good_enough_leaves_at_once() -> None:
-    buffer = ReplayBuffer(2)
+    buffer = ReplayBuffer(settings(2))
     buffer.admit([Entry(1.0, 1, 1), Entry(2.0, 2, 1)])
     assert buffer.admit([Entry(0.0, 3, 1)]) == [Entry(0.0, 3, 1)]
     assert [entry.id for entry in buffer] == [1, 2]
 
 
-@given(batches, capacities, recents, st.randoms(use_true_random=False))
+@given(batches, capacities, recents, ages, st.randoms(use_true_random=False))
 def test_a_restored_buffer_goes_on_like_one_that_never_stopped(
-    batches: list[list[float]], capacity: int, recent: int, random: Random
+    batches: list[list[float]], capacity: int, recent: int, max_age: int | None, random: Random
 ) -> None:
-    buffer = ReplayBuffer(capacity, recent=recent)
+    config = settings(capacity, recent, max_age)
+    buffer = ReplayBuffer(config)
     for entries in numbered(batches):
         held = list(buffer)
         random.shuffle(held)
-        restored = ReplayBuffer(capacity, held, recent=recent)
+        restored = ReplayBuffer(config, held)
         assert buffer.admit(entries) == restored.admit(entries)
         assert list(buffer) == list(restored)
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1), (2, 3, 1)])
 def test_a_buffer_is_restored_from_its_entries_in_any_order(order: tuple[int, ...]) -> None:
-    buffer = ReplayBuffer(3, [Entry(float(i), i, 1) for i in order])
+    buffer = ReplayBuffer(settings(3), [Entry(float(i), i, 1) for i in order])
     assert [entry.id for entry in buffer] == [1, 2, 3]

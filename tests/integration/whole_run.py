@@ -32,6 +32,7 @@ SMALL: dict[str, Any] = {
     "n_episodes_per_iter": 6,
     "n_updates_per_iter": 10,
     "replay_size": 30,
+    "max_age": 6,
     "recent_size": 15,
     "last_few": 10,
     "return_scale": 0.02,

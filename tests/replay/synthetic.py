@@ -30,6 +30,7 @@ from udrl_replay.store import Store, Version
 
 #: Several pages of a file.
 BLOB = bytes(range(256)) * 40
+MAX_AGE = 3
 SPEC = EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=4)
 
 
@@ -41,6 +42,7 @@ def config(lead: int = 0) -> Config:
         n_warm_up_episodes=4,
         n_episodes_per_iter=3,
         replay_size=5,
+        max_age=MAX_AGE,
         recent_size=4,
         last_few=2,
         eval_every=9,
@@ -122,10 +124,13 @@ def reference(lead: int, max_env_steps: int) -> Result:
     evaluation = None
 
     def buffer(iteration: int) -> list[Episode]:
-        everything = [e for done in explored[: iteration + 1] for e in done]
-        best = sorted(everything, key=entry)[-settings.replay_size :]
-        newest = everything[-settings.recent_size :]
-        return sorted({e.command_id: e for e in best + newest}.values(), key=entry)
+        held: list[Episode] = []
+        for i in range(iteration + 1):
+            held = [e for e in held + explored[i] if i - entry(e).iteration < MAX_AGE]
+            best = sorted(held, key=entry)[-settings.replay_size :]
+            newest = held[-settings.recent_size :]
+            held = [e for e in held if e in best or e in newest]
+        return sorted(held, key=entry)
 
     def carry_out(commands: Sequence[Command]) -> list[Episode]:
         return [episode(c, weights[c.weights_version]) for c in commands]
@@ -137,7 +142,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
         else:
             weights.append(trained(i, weights[-1], map(episode_digest, buffer(i - 1))).weights)
             source = weights_version(i, lead) - 1
-            drawn_from = ReplayBuffer(settings.replay_size, map(entry, buffer(source)))
+            drawn_from = ReplayBuffer(settings, map(entry, buffer(source)))
             explored.append(carry_out(sample.explore(i, drawn_from)))
             before = steps[source - 1] if source else 0
             due = evaluation_due(source, before, steps[source], settings.eval_every)
@@ -148,7 +153,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
     digest = replay_digest(map(episode_digest, buffer(i)))
     closing = None
     if i > 0:
-        last = ReplayBuffer(settings.replay_size, map(entry, buffer(i)))
+        last = ReplayBuffer(settings, map(entry, buffer(i)))
         closing = summarise([e.episode_return for e in carry_out(sample.close(i, last))])
     return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
 

@@ -18,6 +18,7 @@ from hypothesis.stateful import (
 from msgspec.structs import replace
 
 from tests.replay.synthetic import (
+    MAX_AGE,
     arrive,
     config,
     create,
@@ -275,10 +276,13 @@ class RunMachine(RuleBasedStateMachine):
 
     def best(self, iteration: int) -> list[Entry]:
         """Return the buffer after an iteration, from all that was ever accepted."""
-        end = (iteration + 1) * COMMANDS_PER_ITERATION
-        admitted = sorted((e for e in self.explored if e.id < end), key=lambda e: e.id)
-        best, newest = sorted(admitted)[-config().replay_size :], admitted[-config().recent_size :]
-        return sorted({*best, *newest})
+        held: list[Entry] = []
+        for i in range(iteration + 1):
+            held += sorted((e for e in self.explored if e.iteration == i), key=lambda e: e.id)
+            held = [e for e in held if i - e.iteration < MAX_AGE]
+            best, newest = sorted(held)[-config().replay_size :], held[-config().recent_size :]
+            held = [e for e in held if e in best or e in newest]
+        return sorted(held)
 
     def check_collected(self) -> None:
         """A version has arrived: nothing is kept that nobody can ask for."""

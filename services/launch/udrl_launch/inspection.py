@@ -122,11 +122,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             config=hello.config,
             version=wanted,
             behavior=decode_weights(found.weights, hello.config, hello.environment),
-            buffer=ReplayBuffer(
-                hello.config.replay_size,
-                (p.entry for p in held),
-                recent=hello.config.recent_size,
-            ),
+            buffer=ReplayBuffer(hello.config, (p.entry for p in held)),
             iteration=progress.iteration,
             weights=found.weights,
         )

@@ -99,9 +99,7 @@ class Run:
         self._sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
         self._began = time.monotonic() - self.progress.wall_s
         held = store.buffer(self.progress.iteration)
-        self.buffer = ReplayBuffer(
-            self.config.replay_size, (p.entry for p in held), recent=self.config.recent_size
-        )
+        self.buffer = ReplayBuffer(self.config, (p.entry for p in held))
         self.digests = {p.entry.id: p.digest for p in held}
         outstanding = store.commands(cancelled=False)
         arrived = store.pending_ids()
