@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from udrl.behavior import BehaviorFunction
+from udrl.behavior import Acting, BehaviorFunction
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments.making import (
@@ -52,6 +52,14 @@ class Failure(NamedTuple):
     error: EnvironmentFault
 
 
+class _Call(NamedTuple):
+    """A call of a behavior function: the rows it is for, and those again until there are enough."""
+
+    act: Acting
+    rows: _Rows
+    padded: _Rows
+
+
 class EpisodeGenerator:
     """Runs Algorithm 2 in ``n_environments`` environments at once.
 
@@ -77,13 +85,13 @@ class EpisodeGenerator:
         self._limits = [self.spec.max_episode_steps] * n_environments
         self._commands: list[Command | None] = [None] * n_environments
         self._behaviors: list[BehaviorFunction | None] = [None] * n_environments
-        self._calls: list[tuple[BehaviorFunction, _Rows]] | None = None
+        self._calls: list[_Call] | None = None
         self._greedy: list[int] = []
 
         # What the network reads in one call. See training._Batch for why torch owns it.
-        rows = config.inference_rows
-        self._observation_in = torch.zeros(rows, self.spec.observation_size)
-        self._command_in = torch.zeros(rows, 2)
+        self._inference_rows = config.inference_rows
+        self._observation_in = torch.zeros(self._inference_rows, self.spec.observation_size)
+        self._command_in = torch.zeros(self._inference_rows, 2)
 
         # s_t, c_t = (dr_t, dh_t), c_t bounded and scaled, r_t, and the logits of P(a | s_t, c_t).
         self._observation = np.zeros((n_environments, self.spec.observation_size), np.float32)
@@ -202,11 +210,10 @@ class EpisodeGenerator:
             self._calls = self._plan_calls()
         observation_in, command_in = self._observation_in.numpy(), self._command_in.numpy()
         with torch.inference_mode():
-            for behavior, rows in self._calls:
-                n = len(rows)
-                self._observation.take(rows, axis=0, out=observation_in[:n], mode="clip")
-                command.take(rows, axis=0, out=command_in[:n], mode="clip")
-                logits[rows] = behavior(self._observation_in, self._command_in).numpy()[:n]
+            for act, rows, padded in self._calls:
+                self._observation.take(padded, axis=0, out=observation_in, mode="clip")
+                command.take(padded, axis=0, out=command_in, mode="clip")
+                logits[rows] = act(self._observation_in, self._command_in).numpy()[: len(rows)]
         weights = np.exp(logits - np.maximum.reduce(logits, axis=1, keepdims=True))
         cumulative = np.add.accumulate(weights, axis=1)
         threshold = uniforms * cumulative[:, -1]
@@ -216,18 +223,20 @@ class EpisodeGenerator:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
         return actions
 
-    def _plan_calls(self) -> list[tuple[BehaviorFunction, _Rows]]:
+    def _plan_calls(self) -> list[_Call]:
         """Gather the rows of each weights version into calls of at most ``inference_rows``."""
         rows_of: dict[BehaviorFunction, list[int]] = {}
         for row, behavior in enumerate(self._behaviors):
             if behavior is not None:
                 rows_of.setdefault(behavior, []).append(row)
-        size = len(self._command_in)
-        return [
-            (behavior, np.array(rows[i : i + size]))
-            for behavior, rows in rows_of.items()
-            for i in range(0, len(rows), size)
-        ]
+        size = self._inference_rows
+        calls = []
+        for behavior, rows in rows_of.items():
+            act = behavior.frozen()
+            for first in range(0, len(rows), size):
+                part = np.array(rows[first : first + size])
+                calls.append(_Call(act, part, np.resize(part, size)))
+        return calls
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
         command = self._command_of(row)

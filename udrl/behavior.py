@@ -5,15 +5,21 @@ sigmoid layer and is multiplied element-wise with the embedding of the observati
 layer; fully connected layers follow.
 """
 
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.streams import Purpose, Stream, stream_key
+
+#: From observation [n, observation_size] and scaled command [n, 2] to logits [n, n_actions].
+Acting = Callable[[Tensor, Tensor], Tensor]
+
+_Layers = list[tuple[Tensor, Tensor]]
 
 # In place, to touch less memory: the gradient of a layer needs its input only.
 _ACTIVATIONS = {"relu": torch.relu_, "tanh": torch.tanh_}
@@ -38,12 +44,6 @@ class BehaviorFunction(nn.Module):
             nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise(widths)
         )
         self.action = nn.utils.skip_init(nn.Linear, widths[-1], spec.n_actions)
-        # The same parameters, without nn.Module's lookups and calls: those cost more than a third
-        # of the time of a call on 16 rows.
-        self._parts = tuple(
-            (layer.weight, layer.bias)
-            for layer in (self.observation, self.command, *self.layers, self.action)
-        )
 
     def forward(self, observation: Tensor, command: Tensor) -> Tensor:
         """Return the logits of P(a | s, c).
@@ -55,13 +55,30 @@ class BehaviorFunction(nn.Module):
         Returns:
             float32 [batch, n_actions].
         """
-        first, gate, *layers, action = self._parts
-        activation = self._activation
-        embedding = activation(linear(observation, *first))
-        embedding = embedding * torch.sigmoid(linear(command, *gate))
-        for layer in layers:
-            embedding = activation(linear(embedding, *layer))
-        return linear(embedding, *action)
+        return _logits(self._activation, self._layers(), observation, command)
+
+    def frozen(self) -> Acting:
+        """Return what acts: :meth:`forward`, the same bits, without gradients or nn.Module.
+
+        It shares the weights. On 16 rows it takes three quarters of the time.
+        """
+        layers = [(weight.detach(), bias.detach()) for weight, bias in self._layers()]
+        return partial(_logits, self._activation, layers)
+
+    def _layers(self) -> _Layers:
+        layers = (self.observation, self.command, *self.layers, self.action)
+        return [(layer.weight.t(), layer.bias) for layer in layers]
+
+
+def _logits(
+    activation: Callable[[Tensor], Tensor], layers: _Layers, observation: Tensor, command: Tensor
+) -> Tensor:
+    (weight, bias), (gate_weight, gate_bias), *hidden, (action_weight, action_bias) = layers
+    embedding = activation(torch.addmm(bias, observation, weight))
+    embedding = embedding * torch.sigmoid(torch.addmm(gate_bias, command, gate_weight))
+    for weight, bias in hidden:
+        embedding = activation(torch.addmm(bias, embedding, weight))
+    return torch.addmm(action_bias, embedding, action_weight)
 
 
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:

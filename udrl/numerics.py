@@ -57,7 +57,7 @@ def check_batch_invariance(config: Config, spec: EnvironmentSpec, tries: int = 8
     Raises:
         InexactArithmetic: they do not.
     """
-    behavior = initialise(config, spec)
+    behavior = initialise(config, spec).frozen()
     rows = config.inference_rows
     observation, command = _probe_rows(spec, rows)
     with torch.inference_mode():
@@ -86,7 +86,7 @@ def acting_class(config: Config, generator: EpisodeGenerator) -> str:
     spec = generator.spec
     behavior = initialise(config, spec)
     with torch.inference_mode():
-        logits = behavior(*_probe_rows(spec, config.inference_rows))
+        logits = behavior.frozen()(*_probe_rows(spec, config.inference_rows))
     episode = _short_episode(config, generator, behavior, index=0)
     sha = hashlib.sha256(arrays_digest({"logits": logits.numpy()}))
     sha.update(episode_digest(episode))

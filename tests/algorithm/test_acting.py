@@ -15,7 +15,7 @@ from torch import Tensor
 
 from udrl import acting
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
-from udrl.behavior import BehaviorFunction, initialise
+from udrl.behavior import Acting, BehaviorFunction, initialise
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, build
 from udrl.digests import episode_digest
@@ -268,10 +268,13 @@ class Spy(BehaviorFunction):
         self.commands: list[list[float]] = []  # of the first row
         self.rows: list[int] = []
 
-    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
-        self.commands.append(command[0].tolist())
-        self.rows.append(len(observation))
-        return self.logits.expand(len(observation), -1)
+    def frozen(self) -> Acting:
+        def act(observation: Tensor, command: Tensor) -> Tensor:
+            self.commands.append(command[0].tolist())
+            self.rows.append(len(observation))
+            return self.logits.expand(len(observation), -1)
+
+        return act
 
 
 def act(world: World, commands: list[Command], n_environments: int = 1) -> list[Episode | Failure]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from udrl import numerics
 from udrl.acting import EpisodeGenerator
-from udrl.behavior import BehaviorFunction, initialise
+from udrl.behavior import Acting, BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments import Environment, EnvironmentSpec
 from udrl.environments.obedience import Obedience
@@ -40,25 +40,33 @@ def test_rows_keep_their_bits_in_any_company_here(hidden: list[int]) -> None:
 class SeesNeighbours(BehaviorFunction):
     """A row's logits depend, ever so slightly, on the other rows."""
 
-    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
-        company = 1e-5 * observation.std()
-        return super().forward(observation, command) + company
+    def frozen(self) -> Acting:
+        act = super().frozen()
+        return lambda observation, command: act(observation, command) + 1e-5 * observation.std()
 
 
 class SeesOneNeighbour(BehaviorFunction):
     """Only the row below makes a difference."""
 
-    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
-        return super().forward(observation + 1e-3 * observation.roll(1, dims=0), command)
+    def frozen(self) -> Acting:
+        act = super().frozen()
+        return lambda observation, command: act(
+            observation + 1e-3 * observation.roll(1, dims=0), command
+        )
 
 
 class SeesItsPlace(BehaviorFunction):
     """A row's logits depend on where it stands, as the blocks of a matrix product might."""
 
-    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
-        logits = super().forward(observation, command)
-        logits[-1] += 1e-6
-        return logits
+    def frozen(self) -> Acting:
+        act = super().frozen()
+
+        def last_differs(observation: Tensor, command: Tensor) -> Tensor:
+            logits = act(observation, command)
+            logits[-1] += 1e-6
+            return logits
+
+        return last_differs
 
 
 @pytest.mark.parametrize("kind", [SeesNeighbours, SeesOneNeighbour, SeesItsPlace])
@@ -147,13 +155,16 @@ def test_a_generator_is_as_good_as_new_after_the_probes() -> None:
 def test_the_acting_class_sees_a_change_of_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings()
     expected = acting_class(config, EpisodeGenerator(config, 1))
-    forward = BehaviorFunction.forward
+    frozen = BehaviorFunction.frozen
 
-    def rounds_otherwise(self: BehaviorFunction, s: Tensor, c: Tensor) -> Tensor:
-        logits = forward(self, s, c)
-        return torch.nextafter(logits, torch.full_like(logits, torch.inf))
+    def rounds_otherwise(self: BehaviorFunction) -> Acting:
+        def act(s: Tensor, c: Tensor) -> Tensor:
+            logits = frozen(self)(s, c)
+            return torch.nextafter(logits, torch.full_like(logits, torch.inf))
 
-    monkeypatch.setattr(BehaviorFunction, "forward", rounds_otherwise)
+        return act
+
+    monkeypatch.setattr(BehaviorFunction, "frozen", rounds_otherwise)
     assert acting_class(config, EpisodeGenerator(config, 1)) != expected
 
 

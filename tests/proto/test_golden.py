@@ -9,11 +9,10 @@ from typing import Any
 import msgpack
 import pytest
 import torch
-from torch import Tensor
 
 from tests.proto.strategies import MESSAGES
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import BehaviorFunction
+from udrl.behavior import Acting, BehaviorFunction
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.streams import Stream
@@ -94,8 +93,9 @@ def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
 @pytest.mark.parametrize("vector", CHOICES, ids=lambda v: f"{v['logits']}-{v['u']:.3f}")
 def test_actor_chooses_as_the_vectors_say(vector: dict[str, Any], greedy: bool) -> None:
     class Fixed(BehaviorFunction):
-        def forward(self, observation: Tensor, command: Tensor) -> Tensor:
-            return torch.tensor(vector["logits"]).expand(len(observation), -1)
+        def frozen(self) -> Acting:
+            logits = torch.tensor(vector["logits"])
+            return lambda observation, command: logits.expand(len(observation), -1)
 
     config = Config(environment="Figure2-v0")
     generator = EpisodeGenerator(config, 1)
