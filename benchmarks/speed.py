@@ -50,6 +50,7 @@ from udrl_replay.run import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
+_REFERENCE_STEPS = 300_000
 
 
 class Window(NamedTuple):
@@ -113,11 +114,14 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     cores = os.cpu_count() or 1
     per_step = config.n_updates_per_iter * window.iterations / window.steps
 
-    def limit(parts: Parts) -> float:
+    def limit(parts: Parts, per_step: float = per_step, cores: int = cores) -> float:
         return cores / (parts.step + parts.inference + parts.update * per_step)
 
     parts, busy = _time_parts(run_dir, 1), _time_parts(run_dir, cores)
     system = window.steps / window.seconds
+    reference = _reference_run(config)
+    reference_speed = reference.steps / reference.seconds
+    reference_per_step = config.n_updates_per_iter * reference.iterations / reference.steps
     return {
         "bare environment step, us": parts.step * 1e6,
         "bare environment, random actions, env steps/s per core": _random_speed(config),
@@ -131,7 +135,9 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "update while every core makes them, ms": busy.update * 1e3,
         "limit while every core is busy, env steps/s": limit(busy),
         "system / limit while every core is busy": system / limit(busy),
-        "reference implementation (1 core), env steps/s": _reference_speed(config),
+        "reference implementation (1 core), env steps/s": reference_speed,
+        "reference, updates per 1,000 env steps": reference_per_step * 1000,
+        "reference / limit of one core": reference_speed / limit(parts, reference_per_step, 1),
         "replay service, CPU ms per episode (start-up included)": 1e3
          * replay_cpu / status["episodes"]["delivered"],
         "episode on the wire, bytes per env step": sum(
@@ -264,15 +270,20 @@ def _random_speed(config: Config) -> float:
     return steps / (time.perf_counter() - began)
 
 
-def _reference_speed(config: Config) -> float:
-    began: list[tuple[float, int]] = []
+def _reference_run(config: Config) -> Window:
+    """Return the second half of a short run of the reference implementation."""
+    reports: list[Window] = []
     algorithm1(
         msgspec.structs.replace(config, lead=0, eval_every=2**30),
-        Budget(max_env_steps=150_000),
-        report=lambda run: began.append((time.perf_counter(), run.env_steps)),
+        Budget(max_env_steps=_REFERENCE_STEPS),
+        report=lambda run: reports.append(
+            Window(time.perf_counter(), run.env_steps, run.iteration)
+        ),
     )
-    (t0, s0), (t1, s1) = began[len(began) // 2], began[-1]
-    return (s1 - s0) / (t1 - t0)
+    first, last = reports[len(reports) // 2], reports[-1]
+    return Window(
+        last.seconds - first.seconds, last.steps - first.steps, last.iterations - first.iterations
+    )
 
 
 if __name__ == "__main__":
