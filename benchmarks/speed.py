@@ -51,6 +51,7 @@ from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
 _REFERENCE_STEPS = 300_000
+_ROLES = ("actor", "learner", "replay", "train")
 
 
 class Window(NamedTuple):
@@ -59,6 +60,13 @@ class Window(NamedTuple):
     seconds: float
     steps: int
     iterations: int
+
+
+class Usage(NamedTuple):
+    """Env steps after the warm-up, and CPU seconds by role since the processes began."""
+
+    steps: int
+    cpu: dict[str, float]
 
 
 class Parts(NamedTuple):
@@ -108,7 +116,8 @@ def _machine() -> str:
 def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     """Return the figures of one run."""
     run_dir = folder / "run"
-    status, replay_cpu = _train(options, run_dir)
+    status, usages = _train(options, run_dir)
+    first, last = usages[0], usages[-1]
     window = _window(run_dir)
     config, episodes = _recorded(run_dir)
     cores = os.cpu_count() or 1
@@ -135,11 +144,16 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "update while every core makes them, ms": busy.update * 1e3,
         "limit while every core is busy, env steps/s": limit(busy),
         "system / limit while every core is busy": system / limit(busy),
+        **{
+            f"CPU of {role}, us per env step": 1e6
+            * (last.cpu[role] - first.cpu[role]) / (last.steps - first.steps)
+            for role in _ROLES
+        },
         "reference implementation (1 core), env steps/s": reference_speed,
         "reference, updates per 1,000 env steps": reference_per_step * 1000,
         "reference / limit of one core": reference_speed / limit(parts, reference_per_step, 1),
         "replay service, CPU ms per episode (start-up included)": 1e3
-         * replay_cpu / status["episodes"]["delivered"],
+         * last.cpu["replay"] / status["episodes"]["delivered"],
         "episode on the wire, bytes per env step": sum(
             len(encode_episode(e, "actor")) for e in episodes
         ) / sum(e.length for e in episodes),
@@ -148,8 +162,8 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], float]:
-    """Train; return the last live status and the CPU seconds that the replay service used."""
+def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], list[Usage]]:
+    """Train; return the last status and what the processes used by and by after the warm-up."""
     command = [
         sys.executable, "-m", "udrl_launch", "train", options.env,
         "--run-dir", str(run_dir), "--json",
@@ -161,25 +175,36 @@ def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], 
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     assert process.stdout is not None
-    cpu = 0.0
+    usages: list[Usage] = []
     lags: list[float] = []
     while process.poll() is None:
-        cpu = max(cpu, _cpu_of_replay(run_dir))
+        usage = _usage(run_dir, process.pid)
+        if usage.steps and all(usage.cpu.values()):
+            usages.append(usage)
         with contextlib.suppress(UdrlError):
             lags.append(status_of(run_dir).weights_lag_s)
         time.sleep(2)
     status: dict[str, Any] = json.loads(process.stdout.read().strip().splitlines()[-1])
     status["weights_lag_s"] = statistics.median(lags)
-    return status, cpu
+    return status, usages
 
 
-def _cpu_of_replay(run_dir: Path) -> float:
+def _usage(run_dir: Path, parent: int) -> Usage:
+    """Return how far a run is and what its processes have used."""
     try:
-        pid = json.loads((run_dir / "endpoint.json").read_text())["pid"]
-        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    except (OSError, ValueError, KeyError):
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / _TICK
+        window = _window(run_dir)
+    except (FileNotFoundError, IndexError, ValueError):
+        window = Window(0.0, 0, 0)
+    cpu = dict.fromkeys(_ROLES, 0.0)
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended
+            words = (process / "cmdline").read_text().split("\0")
+            ours = process.name == str(parent) or str(parent) in words
+            role = next((word for word in words if word in _ROLES), None)
+            if ours and role is not None:
+                fields = (process / "stat").read_text().rsplit(")", 1)[1].split()
+                cpu[role] += (int(fields[11]) + int(fields[12])) / _TICK
+    return Usage(window.steps, cpu)
 
 
 def _window(run_dir: Path) -> Window:
