@@ -78,20 +78,24 @@ class CommandSampler:
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
         n = self._config.n_warm_up_episodes
-        return self._commands("warm_up", 0, 0, [0.0] * n, 0, TRAINING_SEEDS)
+        return self._commands("warm_up", 0, 0, [(0.0, 0)] * n, TRAINING_SEEDS)
 
     def explore(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's exploratory commands (section 2.3.4).
 
         The desired horizon is the mean length of the ``last_few`` best episodes; the desired
         returns are uniform in [M, M + S], with M and S the mean and the (population) standard
-        deviation of their returns.
+        deviation of their returns. Not in the paper: with a ``horizon_spread`` s, the desired
+        horizons are uniform in [1 - s, 1 + s] times that.
         """
         mean, deviation, horizon = self._best(buffer)
-        stream = self._stream(iteration)
-        numbers = stream.uniforms(self._config.n_episodes_per_iter)
-        returns = [mean + deviation * u for u in numbers.tolist()]
-        return self._commands("explore", iteration, 0, returns, horizon, TRAINING_SEEDS)
+        spread = self._config.horizon_spread
+        numbers = self._stream(iteration).uniforms(2 * self._config.n_episodes_per_iter)
+        desired = [
+            (mean + deviation * u, max(1, _round(horizon * (1 + spread * (2 * v - 1)))))
+            for u, v in numbers.reshape(2, -1).T.tolist()
+        ]
+        return self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
@@ -105,8 +109,8 @@ class CommandSampler:
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
         mean, _, horizon = self._best(buffer)
-        returns = [mean] * self._config.eval_episodes
-        return self._commands("evaluate", iteration, first, returns, horizon, EVALUATION_SEEDS)
+        desired = [(mean, horizon)] * self._config.eval_episodes
+        return self._commands("evaluate", iteration, first, desired, EVALUATION_SEEDS)
 
     def _best(self, buffer: ReplayBuffer) -> tuple[float, float, int]:
         """Return M, S and the mean length, rounded, of the best episodes."""
@@ -116,7 +120,7 @@ class CommandSampler:
         mean = math.fsum(e.episode_return for e in best) / n
         variance = math.fsum((e.episode_return - mean) ** 2 for e in best) / n
         mean_length = sum(e.length for e in best) / n
-        return mean, math.sqrt(variance), math.floor(mean_length + 0.5)
+        return mean, math.sqrt(variance), _round(mean_length)
 
     def _stream(self, iteration: int, index: int = -1) -> Stream:
         return Stream(stream_key(self._config.seed, Purpose.COMMANDS, iteration, index))
@@ -126,25 +130,29 @@ class CommandSampler:
         kind: Kind,
         iteration: int,
         first: int,
-        returns: list[float],
-        horizon: int,
+        desired: list[tuple[float, int]],
         seeds: tuple[int, int],
     ) -> list[Command]:
-        environment_seeds = self._stream(iteration, first).integers(len(returns), *seeds)
+        environment_seeds = self._stream(iteration, first).integers(len(desired), *seeds)
         evaluation = kind == "evaluate"
         return [
             Command(
                 id=iteration * COMMANDS_PER_ITERATION + index,
                 kind=kind,
                 desired_return=desired_return,
-                desired_horizon=horizon,
+                desired_horizon=desired_horizon,
                 environment_seed=seed,
                 stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
                 weights_version=weights_version(iteration, self._config.lead),
                 max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
                 greedy=evaluation and self._config.eval_greedy,
             )
-            for index, (desired_return, seed) in enumerate(
-                zip(returns, environment_seeds.tolist(), strict=True), start=first
+            for index, ((desired_return, desired_horizon), seed) in enumerate(
+                zip(desired, environment_seeds.tolist(), strict=True), start=first
             )
         ]
+
+
+def _round(number: float) -> int:
+    """Round to the nearest integer, halves up."""
+    return math.floor(number + 0.5)

@@ -44,6 +44,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
         batch_size: examples in one update.
         horizon_scale: factor on the desired horizon at the network's input.
+        horizon_spread: how far desired horizons of exploratory commands are spread around the mean
+            length of the best episodes, as a part of it; 0 is the paper's.
         last_few: number of best episodes that exploratory commands are drawn from (2.3.4).
         learning_rate: Adam's.
         n_episodes_per_iter: exploratory episodes in an iteration.
@@ -75,6 +77,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     horizon_scale: Scale = 0.01
+    horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
     last_few: PositiveInt = 75
     learning_rate: Annotated[float, Meta(gt=0, le=10)] = 3.5e-4
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20

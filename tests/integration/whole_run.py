@@ -35,6 +35,7 @@ SMALL: dict[str, Any] = {
     "max_age": 6,
     "recent_size": 15,
     "last_few": 10,
+    "horizon_spread": 0.25,
     "return_scale": 0.02,
     "horizon_scale": 0.02,
     "eval_every": 1500,
