@@ -47,6 +47,10 @@ def described(kind: inspect.Type) -> str:
             return f"integer {number(least)} to {number(most)}"
         case inspect.FloatType(gt=(int() | float()) as above, le=(int() | float()) as most):
             return f"number above {number(above)}, to {number(most)}"
+        case inspect.FloatType(ge=(int() | float()) as least, le=(int() | float()) as most) if (
+            most < 1e300
+        ):
+            return f"number {number(least)} to {number(most)}"
         case inspect.FloatType(ge=(int() | float())):
             return "finite number"
         case inspect.FloatType():
