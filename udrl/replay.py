@@ -3,7 +3,7 @@
 Two settings that are not in the paper change what "all episodes" are. With an age limit the best of
 the last iterations are kept: elites of all times are lucky ones in the end, imitated long after the
 agent could have replaced them, and learned by heart. And the newest can be kept whatever they
-returned, which holds the agent near what it does and shows it what the best ones did otherwise.
+returned, which holds the agent near what it does.
 """
 
 import bisect
