@@ -370,7 +370,7 @@ class Store:
             "i.return_min, i.return_mean, i.return_max, i.explored_return, "
             "e.desired_return, e.desired_horizon "
             "FROM iterations i "
-            "LEFT JOIN evaluations e ON e.iteration = i.iteration AND NOT e.closing "
+            "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.closing = 0 "
             "LEFT JOIN versions v ON v.version = i.weights_version "
             "WHERE i.iteration > ? ORDER BY i.iteration",
             (after,),

@@ -30,10 +30,12 @@ CREATE TABLE evaluations (
     iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
     desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
     mean REAL NOT NULL, std REAL NOT NULL, ci95_low REAL NOT NULL, ci95_high REAL NOT NULL,
-    episodes INTEGER NOT NULL, seal BLOB NOT NULL, PRIMARY KEY (iteration, closing)) WITHOUT ROWID;
+    episodes INTEGER NOT NULL, seal BLOB NOT NULL, PRIMARY KEY (closing, iteration)) WITHOUT ROWID;
 CREATE TABLE versions (
     version INTEGER PRIMARY KEY, digest BLOB NOT NULL, loss REAL NOT NULL, train_s REAL NOT NULL,
     checksum BLOB NOT NULL, seal BLOB NOT NULL, weights BLOB, optimizer BLOB);
+CREATE INDEX weights_kept ON versions (version) WHERE weights IS NOT NULL;
+CREATE INDEX optimizers_kept ON versions (version) WHERE optimizer IS NOT NULL;
 """
 
 #: What the seal of each table's rows covers, the row's key first.

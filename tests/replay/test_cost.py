@@ -1,0 +1,32 @@
+"""What an iteration costs does not grow with the age of the run."""
+
+from collections.abc import Callable
+
+from tests.replay.synthetic import work
+from udrl_replay.run import Run
+
+#: Tables that keep a row of every iteration for good.
+GROWING = ("iterations", "evaluations", "versions")
+
+
+def test_no_statement_reads_a_whole_table_that_grows(make_run: Callable[..., Run]) -> None:
+    run = make_run(lead=1)
+    for _ in range(5):
+        work(run)
+    statements: set[str] = set()
+    run.store._db.set_trace_callback(statements.add)
+    for _ in range(10):
+        work(run)
+    run.store.last_evaluation(closing=False)
+    run.store.last_evaluation(closing=True)
+    run.store.metrics(after=run.progress.iteration - 1)
+    run.store._db.set_trace_callback(None)
+
+    scans = []
+    for statement in statements:
+        if statement.startswith(("SELECT", "INSERT", "UPDATE", "DELETE")):
+            for *_, step in run.store._db.execute(f"EXPLAIN QUERY PLAN {statement}"):
+                if step.startswith("SCAN") and " INDEX " not in step:
+                    scans.append((step, statement[:80]))
+    assert len(statements) > 20
+    assert [s for s in scans if any(table in s[1] for table in GROWING)] == []
