@@ -35,6 +35,7 @@ from udrl.commands import Command
 from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.errors import Interrupted
 from udrl.numerics import use_one_thread
 from udrl.training import untrained
 from udrl_launch.training import free_port
@@ -275,16 +276,17 @@ class Announced(NamedTuple):
     at: float
 
 
-def deliver_versions(endpoint: str, hello: Hello, stop: threading.Event) -> list[Announced]:
-    """Deliver the same weights as every version until ``stop`` is set."""
+def deliver_versions(
+    endpoint: str, hello: Hello, stop: threading.Event, announced: list[Announced]
+) -> None:
+    """Deliver the same weights as every version until ``stop`` is set, and note when."""
     use_one_thread()
     state = untrained(hello.config, hello.environment)
     for parameter in state.behavior.parameters():
         parameter.grad = parameter.new_zeros(parameter.shape)
     state.optimizer.step()  # gives Adam the state that a delivery must have
     weights, optimizer = encode_weights(state.behavior), encode_optimizer(state)
-    announced = []
-    with sessions.connect(endpoint, 30.0, stop) as session:
+    with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
         asker = Asker(session, _RUN, "learner scale", stop)
         version = 1
         while not stop.is_set():
@@ -302,7 +304,6 @@ def deliver_versions(endpoint: str, hello: Hello, stop: threading.Event) -> list
             news = encode(Weights(version=version, weights=weights))
             session.put(keys.key(_RUN, keys.NEW_WEIGHTS), news)
             version += 1
-    return announced
 
 
 # One measurement.
@@ -358,7 +359,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
     ):
         asker = Asker(session, _RUN, "scale", patience_s=30.0)
         learner = threading.Thread(
-            target=lambda: announced.extend(deliver_versions(endpoint, hello, stop)), daemon=True
+            target=deliver_versions, args=(endpoint, hello, stop, announced), daemon=True
         )
         learner.start()
         load = Load(
