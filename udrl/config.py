@@ -73,7 +73,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_train_steps: PositiveInt | None = None
     max_return: float | None = None
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
-    lead: Annotated[int, Meta(ge=0, le=64)] = 2
+    lead: Annotated[int, Meta(ge=0, le=64)] = 0
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     horizon_scale: Scale = 0.01
