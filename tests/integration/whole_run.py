@@ -98,7 +98,12 @@ class Cli:
         )
 
     def finish(self, timeout: float = 60) -> tuple[int, str, str]:
-        out, err = self.process.communicate(timeout=timeout)
+        try:
+            out, err = self.process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            self.process.terminate()
+            out, err = self.process.communicate(timeout=20)
+            raise AssertionError(f"still running after {timeout} s:\n{err}") from None
         return self.process.returncode, out, err
 
     def status(self, timeout: float = 60) -> Status:

@@ -1,6 +1,8 @@
 """The actor starts again with exact arithmetic when the fast one is not."""
 
 import os
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -50,3 +52,35 @@ def test_actor_that_is_inexact_in_strict_mode_too_gives_up(
     code = cli(ACTOR, standalone_mode=False)
     assert code == InexactArithmetic.exit_code
     assert programs == []
+
+
+def test_end_does_not_wait_for_callbacks() -> None:
+    """Zenoh's threads outlive a session; an interpreter that ends under them hangs or aborts."""
+    program = """
+import sys, threading, click, zenoh
+from udrl_launch import cli
+from udrl_proto.session import listen
+from udrl_launch.training import free_port
+
+@click.command()
+def busy():
+    called = threading.Event()
+
+    def callback(sample):
+        called.set()
+        while True:
+            pass
+
+    with listen(f"tcp/127.0.0.1:{free_port()}") as session:
+        session.declare_subscriber("key", callback)
+        session.put("key", b"")
+        assert called.wait(10)
+    print("worked")
+    return 3
+
+cli.cli.add_command(busy)
+sys.argv = ["udrl", "busy"]
+cli.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, b"worked\n", b"")

@@ -13,6 +13,8 @@ from udrl.errors import RunFailed
 from udrl_launch import supervisor as module
 from udrl_launch.supervisor import Supervisor
 
+WAIT = "import time; time.sleep(100)"
+
 
 @pytest.fixture
 def supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervisor]:
@@ -50,7 +52,7 @@ def test_child_that_ends_well_is_done(supervisor: Supervisor) -> None:
 
 
 def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
-    supervisor.start("child", "import time; time.sleep(100)")
+    supervisor.start("child", WAIT)
     first = pid(supervisor)
     os.kill(first, signal.SIGKILL)
     check_until(supervisor, lambda: pid(supervisor) != first)
@@ -87,3 +89,35 @@ def test_end_kills_a_child_that_does_not_listen(
     process = supervisor.children[0].process
     assert process is not None
     assert process.returncode == -signal.SIGKILL
+
+
+def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) -> None:
+    supervisor.start("first", "pass")
+    check_until(supervisor, lambda: supervisor.children[0].done)
+    supervisor.start("other", "raise SystemExit(1)")
+    check_until(supervisor, lambda: supervisor.done)
+    assert supervisor.children[1].restarts == []
+
+
+def test_who_does_not_end_after_the_first_is_not_waited_for(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_END_S", 0.2)
+    supervisor.start("first", "pass")
+    supervisor.start("other", WAIT)
+    check_until(supervisor, lambda: supervisor.done)
+    assert not supervisor.children[1].done
+    supervisor.end()
+    other = supervisor.children[1].process
+    assert other is not None
+    assert other.returncode == -signal.SIGTERM
+
+
+def test_a_killed_first_child_is_started_again(supervisor: Supervisor) -> None:
+    supervisor.start("first", WAIT)
+    supervisor.start("other", "pass")
+    check_until(supervisor, lambda: supervisor.children[1].done)
+    first = pid(supervisor)
+    os.kill(first, signal.SIGKILL)
+    check_until(supervisor, lambda: pid(supervisor) != first)
+    assert not supervisor.done

@@ -1,6 +1,8 @@
 """The command ``udrl``."""
 
+import os
 import sys
+from typing import NoReturn
 
 import click
 
@@ -12,7 +14,7 @@ from udrl_launch.commands.services import actor, learner, replay
 from udrl_launch.commands.training import train
 
 
-def main() -> None:
+def main() -> NoReturn:
     """Run the command line; errors of ours are one line, without a traceback."""
     try:
         code = cli(standalone_mode=False)
@@ -24,8 +26,12 @@ def main() -> None:
         code = error.exit_code
     except click.Abort:
         code = 130
+    # Not sys.exit: Zenoh's threads may still be in a callback, and when the interpreter ends under
+    # them the process now and then aborts, after all its work. No command leaves work to exit
+    # handlers, and what is left of it is memory.
     sys.stdout.flush()
-    sys.exit(code)
+    sys.stderr.flush()
+    os._exit(code or 0)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

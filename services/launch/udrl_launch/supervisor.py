@@ -66,6 +66,9 @@ class Child:
 class Supervisor:
     """Keeps children running until they are done.
 
+    The first child is what the others work for: when it has ended well, nobody is started again,
+    and the others get a few seconds to end too.
+
     Args:
         log_dir: where their output goes, a file each.
     """
@@ -74,6 +77,7 @@ class Supervisor:
         log_dir.mkdir(parents=True, exist_ok=True)
         self._log_dir = log_dir
         self.children: list[Child] = []
+        self._first_done: float | None = None
 
     def start(self, name: str, *arguments: str) -> None:
         """Start ``udrl ARGUMENTS`` as a child."""
@@ -92,10 +96,14 @@ class Supervisor:
             code = child.process.poll()
             if code is None or child.done:
                 continue
-            if code == 0:
+            now = time.monotonic()
+            if child is self.children[0] and code == 0:
+                self._first_done = now
+            if code == 0 or self._first_done is not None:
+                if code != 0:
+                    log.warning("%s ended with code %d when all was done", child.name, code)
                 child.done = True
                 continue
-            now = time.monotonic()
             child.restarts = [t for t in child.restarts if now - t < _PERIOD_S]
             if code in FINAL_CODES or len(child.restarts) >= _MAX_RESTARTS:
                 failure = RunFailed(f"{child.name} ended with code {code}:\n{child.last_words()}")
@@ -107,7 +115,9 @@ class Supervisor:
 
     @property
     def done(self) -> bool:
-        """Whether all children have ended well."""
+        """Whether all children have ended, or the first has and the others had their time."""
+        if self._first_done is not None and time.monotonic() - self._first_done > _END_S:
+            return True
         return all(child.done for child in self.children)
 
     def end(self) -> None:
