@@ -24,9 +24,11 @@ from typing import Any
 import gymnasium as gym
 import msgspec
 
+from cut_cable import CutCable
 from disturbed_environments import HEALED, SLOW_ONE
 from disturbed_run import DisturbedRun, TooLate, digests, is_balanced
 from faults import FAULTS, Fault
+from severed_link import SeveredLink
 from udrl.errors import RunFailed
 from udrl_launch.settings import Settings, gather
 from udrl_proto.messages import Status
@@ -100,6 +102,9 @@ def main() -> int:
         print(_HEADER, flush=True)
         rows = []
         for fault in wanted:
+            if fault.link is CutCable and not CutCable.is_possible():
+                print(f"| {fault.name} | needs root and iproute2 |{' |' * 12}", flush=True)
+                continue
             rows.append(disturb(fault, options, folder, undisturbed))
             print(_line(rows[-1]), flush=True)
     if options.json:
@@ -127,7 +132,7 @@ def _settings(options: argparse.Namespace, environment: str | None) -> Settings:
 
 def _undisturbed(options: argparse.Namespace, run_dir: Path) -> tuple[Status, float]:
     began = time.monotonic()
-    run = DisturbedRun(_settings(options, None), run_dir, options.limit, _NEVER_S)
+    run = DisturbedRun(_settings(options, None), run_dir, SeveredLink(), options.limit, _NEVER_S)
     with run.going():
         failure = run.failure()
     if failure is not None:
@@ -142,7 +147,8 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     chance = random.Random(f"{options.seed}-{fault.name}")  # noqa: S311
     began = time.monotonic()
     hang_s = _HANG_S if "Hanging" in str(fault.environment) else _NEVER_S
-    run = DisturbedRun(_settings(options, fault.environment), folder / name, options.limit, hang_s)
+    settings = _settings(options, fault.environment)
+    run = DisturbedRun(settings, folder / name, fault.link(), options.limit, hang_s)
     spans: list[tuple[float, float]] = []
     failure: RunFailed | None = None
     remarks: list[str] = []

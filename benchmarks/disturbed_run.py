@@ -12,9 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from severed_link import SeveredLink, free_port
 from udrl.errors import RunFailed, StoreError, UdrlError
 from udrl_launch.inspection import read_status
 from udrl_launch.settings import Settings
@@ -48,29 +47,48 @@ class TooLate(UdrlError):
     """A run did not do in time what it should have done."""
 
 
+class Link(Protocol):
+    """What lies between the replay service and the others.
+
+    Attributes:
+        listen: where the replay service listens.
+        listen_options: more of its command line.
+        prefix: what runs it.
+        endpoint: where the others connect to.
+    """
+
+    listen: str
+    listen_options: tuple[str, ...]
+    prefix: tuple[str, ...]
+    endpoint: str
+
+    def close(self) -> None:
+        """Take it away."""
+
+
 class DisturbedRun:
     """A run of ``udrl replay``, ``udrl learner`` and ``udrl actor``, started again as they die.
-
-    Actors and learner reach the replay service through a link that can be severed.
 
     Args:
         settings: what to train.
         run_dir: a directory that is not there yet.
+        link: that actors and learner reach the replay service through; closed in the end.
         limit_s: seconds after which waiting for anything is given up.
         hang_s: the actors' ``--hang-timeout``.
     """
 
-    def __init__(self, settings: Settings, run_dir: Path, limit_s: float, hang_s: float) -> None:
+    def __init__(
+        self, settings: Settings, run_dir: Path, link: Link, limit_s: float, hang_s: float
+    ) -> None:
         self.run_dir = run_dir
         self.settings = settings
+        self.link = link
         self.unbalanced: list[str] = []
         self.moments: list[Moment] = []
         self._hang_s = hang_s
         self._deadline = time.monotonic() + limit_s
-        self._port = free_port()
         create(run_dir, settings.config).close()
         write_config(run_dir, settings.config, settings.budget)
-        self.link = SeveredLink(self._port)
         self._supervisor = Supervisor(run_dir / "logs")
 
     @contextmanager
@@ -81,12 +99,12 @@ class DisturbedRun:
         try:
             start(
                 "replay", "replay", environment, "--run-dir", str(self.run_dir), "--resume",
-                "--listen", f"tcp/127.0.0.1:{self._port}",
+                "--listen", self.link.listen, *self.link.listen_options, prefix=self.link.prefix,
             )  # fmt: skip
-            start("learner", "learner", "--connect", self.endpoint, "--patience", "60")
+            start("learner", "learner", "--connect", self.link.endpoint, "--patience", "60")
             for number in range(1, self.settings.fleet.actors + 1):
                 start(
-                    f"actor-{number}", "actor", "--connect", self.endpoint, "--patience", "60",
+                    f"actor-{number}", "actor", "--connect", self.link.endpoint, "--patience", "60",
                     "--envs", str(self.settings.fleet.envs_per_actor),
                     "--hang-timeout", str(self._hang_s),
                 )  # fmt: skip
@@ -96,11 +114,6 @@ class DisturbedRun:
                 self._signal(child, signal.SIGCONT)
             self._supervisor.end()
             self.link.close()
-
-    @property
-    def endpoint(self) -> str:
-        """Where actors and learner connect to."""
-        return f"tcp/127.0.0.1:{self.link.port}"
 
     def children(self, *roles: str) -> list[Child]:
         """Return the services of some roles."""

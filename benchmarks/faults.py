@@ -9,12 +9,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from disturbed_run import DisturbedRun
+from cut_cable import CutCable
+from disturbed_run import DisturbedRun, Link
+from severed_link import SeveredLink
 
 #: Seconds of a stop or cut: longer than the lease (2 s) and than a query (3 s).
 OUTAGE_S = 5.0
@@ -29,6 +30,7 @@ class Fault(NamedTuple):
         name: for ``--faults``.
         begin: what is done at random moments; None: the environment does it by itself.
         lose: roles of the services that lose contact.
+        link: what is between the replay service and the others.
         environment: the class of :mod:`disturbed_environments` around the run's own; None: none.
         stops_the_run: it must end with exit code 9 and name a reproduction.
     """
@@ -36,6 +38,7 @@ class Fault(NamedTuple):
     name: str
     begin: Callable[[DisturbedRun], None] | None = None
     lose: Sequence[str] = ()
+    link: Callable[[], Link] = SeveredLink
     environment: str | None = None
     stops_the_run: bool = False
 
@@ -50,8 +53,21 @@ def _stop(who: Sequence[str], run: DisturbedRun) -> None:
     run.send(signal.SIGCONT, *who)
 
 
-def _cut(how: Callable[[DisturbedRun], AbstractContextManager[None]], run: DisturbedRun) -> None:
-    with how(run):
+def _stall(run: DisturbedRun) -> None:
+    assert isinstance(run.link, SeveredLink)
+    with run.link.stalled():
+        run.pass_by(OUTAGE_S)
+
+
+def _sever(run: DisturbedRun) -> None:
+    assert isinstance(run.link, SeveredLink)
+    with run.link.severed():
+        run.pass_by(OUTAGE_S)
+
+
+def _cut(run: DisturbedRun) -> None:
+    assert isinstance(run.link, CutCable)
+    with run.link.cut():
         run.pass_by(OUTAGE_S)
 
 
@@ -60,7 +76,7 @@ def _twins(run: DisturbedRun) -> None:
     twin = [
         sys.executable,
         str(Path(__file__).with_name("twin.py")),
-        run.endpoint,
+        run.link.endpoint,
         str(os.getpid()),
     ]
     both = [
@@ -82,8 +98,9 @@ FAULTS = (
     Fault("kill replay and learner", partial(_kill, ("replay", "learner")), ("replay", "learner")),
     *(Fault(f"stop {role}", partial(_stop, (f"{role}-1" if role == "actor" else role,)), (role,))
       for role in ROLES),
-    Fault("stall network", partial(_cut, lambda run: run.link.stalled()), ("actor", "learner")),
-    Fault("sever network", partial(_cut, lambda run: run.link.severed()), ("actor", "learner")),
+    Fault("stall network", _stall, ("actor", "learner")),
+    Fault("sever network", _sever, ("actor", "learner")),
+    Fault("cut network", _cut, ("actor", "learner"), link=CutCable),
     Fault("twins", _twins),
     Fault("slow actor", environment="Slow"),
     Fault("environment raises", environment="Raising"),

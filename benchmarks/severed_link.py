@@ -18,21 +18,20 @@ def free_port() -> int:
 
 
 class SeveredLink:
-    """Forwards connections to a port of this machine, unless told otherwise.
+    """Forwards connections to the replay service on this machine, unless told otherwise."""
 
-    Args:
-        target: the port to forward to.
-    """
-
-    def __init__(self, target: int) -> None:
-        self._target = target
+    def __init__(self) -> None:
+        self._target = free_port()
         self._flows = threading.Event()
         self._flows.set()
         self._refuses = False
         self._ends = threading.Event()
         self._sockets: set[socket.socket] = set()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
+        self.listen = f"tcp/127.0.0.1:{self._target}"
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self.listen_options: tuple[str, ...] = ()
+        self.prefix: tuple[str, ...] = ()
         threading.Thread(target=self._accept, name="link", daemon=True).start()
 
     @contextlib.contextmanager

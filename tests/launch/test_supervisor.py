@@ -17,19 +17,15 @@ WAIT = "import time; time.sleep(100)"
 
 
 @pytest.fixture
-def supervisor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervisor]:
-    """A supervisor whose children are the Python code that their first argument is."""
-
-    class Python:
-        executable = str(tmp_path / "python")
-
-    script = f'#!/bin/sh\nexec {sys.executable} -c "$3"\n'  # called with: -m udrl_launch CODE
-    Path(Python.executable).write_text(script)
-    os.chmod(Python.executable, 0o755)
-    monkeypatch.setattr(module, "sys", Python)
+def supervisor(tmp_path: Path) -> Iterator[Supervisor]:
     one = Supervisor(tmp_path / "logs")
     yield one
     one.end()
+
+
+def start(one: Supervisor, name: str, code: str) -> None:
+    """Start Python code as a child; what else it is given are arguments that it ignores."""
+    one.start(name, prefix=(sys.executable, "-c", code))
 
 
 def check_until(one: Supervisor, condition: Callable[[], bool]) -> None:
@@ -46,13 +42,13 @@ def pid(one: Supervisor) -> int:
 
 
 def test_child_that_ends_well_is_done(supervisor: Supervisor) -> None:
-    supervisor.start("child", "print('bye')")
+    start(supervisor, "child", "print('bye')")
     check_until(supervisor, lambda: supervisor.done)
     assert supervisor.children[0].last_words() == "bye"
 
 
 def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
-    supervisor.start("child", WAIT)
+    start(supervisor, "child", WAIT)
     first = pid(supervisor)
     os.kill(first, signal.SIGKILL)
     check_until(supervisor, lambda: pid(supervisor) != first)
@@ -61,14 +57,14 @@ def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
 
 @pytest.mark.parametrize("code", sorted(module.FINAL_CODES))
 def test_error_that_would_be_repeated_is_final(supervisor: Supervisor, code: int) -> None:
-    supervisor.start("child", f"print('because'); raise SystemExit({code})")
+    start(supervisor, "child", f"print('because'); raise SystemExit({code})")
     with pytest.raises(RunFailed, match=f"child ended with code {code}:\nbecause") as failure:
         check_until(supervisor, lambda: False)
     assert failure.value.exit_code == code
 
 
 def test_child_that_keeps_dying_is_given_up(supervisor: Supervisor) -> None:
-    supervisor.start("child", "raise SystemExit(1)")
+    start(supervisor, "child", "raise SystemExit(1)")
     with pytest.raises(RunFailed, match="child ended with code 1"):
         check_until(supervisor, lambda: False)
     assert len(supervisor.children[0].restarts) == 5
@@ -79,7 +75,8 @@ def test_end_kills_a_child_that_does_not_listen(
 ) -> None:
     monkeypatch.setattr(module, "_END_S", 0.2)
     ready = supervisor._log_dir / "child.log"
-    supervisor.start(
+    start(
+        supervisor,
         "child",
         "import signal,time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
         "print('ready', flush=True); time.sleep(100)",
@@ -92,9 +89,9 @@ def test_end_kills_a_child_that_does_not_listen(
 
 
 def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) -> None:
-    supervisor.start("first", "pass")
+    start(supervisor, "first", "pass")
     check_until(supervisor, lambda: supervisor.children[0].done)
-    supervisor.start("other", "raise SystemExit(1)")
+    start(supervisor, "other", "raise SystemExit(1)")
     check_until(supervisor, lambda: supervisor.done)
     assert supervisor.children[1].restarts == []
 
@@ -103,8 +100,8 @@ def test_who_does_not_end_after_the_first_is_not_waited_for(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_END_S", 0.2)
-    supervisor.start("first", "pass")
-    supervisor.start("other", WAIT)
+    start(supervisor, "first", "pass")
+    start(supervisor, "other", WAIT)
     check_until(supervisor, lambda: supervisor.done)
     assert not supervisor.children[1].done
     supervisor.end()
@@ -114,8 +111,8 @@ def test_who_does_not_end_after_the_first_is_not_waited_for(
 
 
 def test_a_killed_first_child_is_started_again(supervisor: Supervisor) -> None:
-    supervisor.start("first", WAIT)
-    supervisor.start("other", "pass")
+    start(supervisor, "first", WAIT)
+    start(supervisor, "other", "pass")
     check_until(supervisor, lambda: supervisor.children[1].done)
     first = pid(supervisor)
     os.kill(first, signal.SIGKILL)

@@ -29,12 +29,14 @@ class Child:
     Attributes:
         name: for logs, and the name of its log file.
         arguments: of the ``udrl`` command.
+        prefix: another program, with its arguments, that runs it, e.g. in a container.
         restarts: when it was started again.
     """
 
     name: str
     arguments: list[str]
     log_file: Path
+    prefix: tuple[str, ...] = ()
     process: subprocess.Popen[bytes] | None = None
     restarts: list[float] = field(default_factory=list)
     done: bool = False
@@ -44,6 +46,7 @@ class Child:
         with self.log_file.open("ab") as output:
             self.process = subprocess.Popen(  # noqa: S603 - our own program
                 [
+                    *self.prefix,
                     sys.executable,
                     "-m",
                     "udrl_launch",
@@ -79,9 +82,9 @@ class Supervisor:
         self.children: list[Child] = []
         self._first_done: float | None = None
 
-    def start(self, name: str, *arguments: str) -> None:
-        """Start ``udrl ARGUMENTS`` as a child."""
-        child = Child(name, list(arguments), self._log_dir / f"{name}.log")
+    def start(self, name: str, *arguments: str, prefix: tuple[str, ...] = ()) -> None:
+        """Start ``PREFIX udrl ARGUMENTS`` as a child."""
+        child = Child(name, list(arguments), self._log_dir / f"{name}.log", prefix)
         child.start()
         self.children.append(child)
 
