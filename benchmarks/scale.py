@@ -4,37 +4,32 @@
 
     .venv/bin/python benchmarks/scale.py --actors 1 10 100 1000 --kilobytes 20 1000
 
-A real replay service runs in a process of its own. One more process holds the Zenoh sessions of the
-fleet; each logical actor there asks for commands, answers every one with an episode that was made
-up beforehand, and has one episode in flight at a time, like a real one. A learner that does not
-train delivers the same weights as every version.
+A real replay service runs in a process of its own; ``fleet.py``, in another, is the actors. A
+learner that does not train delivers the same weights as every version. Printed is the median of
+the repeats, and in brackets their range.
 """
 
 import argparse
 import contextlib
 import json
 import os
-import queue
+import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import zenoh
 
+from fleet import RUN, Load, Measured
 from udrl.checkpoint import encode_optimizer, encode_weights
-from udrl.commands import Command
 from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec
-from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import use_one_thread
 from udrl.training import untrained
@@ -42,18 +37,11 @@ from udrl_launch.training import free_port
 from udrl_proto import PROTOCOL, keys
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
-from udrl_proto.codec import LARGEST, decode, encode, encode_array
+from udrl_proto.codec import LARGEST, encode
 from udrl_proto.messages import (
     ChangesReply,
     ChangesRequest,
-    CommandsReply,
-    CommandsRequest,
-    EpisodeMessage,
-    EpisodeReply,
     Hello,
-    JoinReply,
-    JoinRequest,
-    Message,
     Status,
     StatusRequest,
     VersionMessage,
@@ -65,30 +53,6 @@ from udrl_replay.run import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
-_RUN = "scale"
-#: Made-up episodes that an actor chooses from.
-_VARIETY = 64
-_WANTED = 16
-
-
-class Load(msgspec.Struct, frozen=True):
-    """What a fleet process is told."""
-
-    endpoint: str
-    actors: int
-    sessions: int
-    steps: int
-    seconds: float
-
-
-class Measured(msgspec.Struct, frozen=True):
-    """What a fleet process found; latencies in seconds, arrivals by weights version."""
-
-    acknowledged: float
-    episode_s: list[float]
-    command_s: list[float]
-    retries: int
-    arrivals: dict[str, float]
 
 
 def spec_of(kilobytes: int) -> EnvironmentSpec:
@@ -97,173 +61,6 @@ def spec_of(kilobytes: int) -> EnvironmentSpec:
     return EnvironmentSpec(
         observation_size=size, n_actions=4, max_episode_steps=kilobytes * 1000 // (4 * size + 5)
     )
-
-
-# The fleet, in a process of its own.
-
-
-@dataclass
-class Actor:
-    """A logical actor: what it holds, and what it is waiting for an answer to."""
-
-    name: str
-    session: zenoh.Session
-    commands: deque[Command] = field(default_factory=deque)
-    verb: str = ""
-    payload: bytes = b""
-    asked_at: float = 0.0
-    query: int = 0
-
-
-class Fleet:
-    """All logical actors, driven by one thread; answers come through one queue."""
-
-    def __init__(self, load: Load) -> None:
-        self._load = load
-        self._answers: queue.SimpleQueue[tuple[Actor, int, bytes | None]] = queue.SimpleQueue()
-        self._sessions = [sessions.connect(load.endpoint, 30.0) for _ in range(load.sessions)]
-        hello = sessions.find_run(self._sessions[0], _RUN, 30.0)
-        self._spec = hello.environment
-        self._episodes = [_made_up(self._spec, load.steps, i) for i in range(_VARIETY)]
-        self._arrivals: dict[str, float] = {}
-        self._episode_s: list[float] = []
-        self._command_s: list[float] = []
-        self._retries = 0
-        self._news = False
-
-    def run(self) -> Measured:
-        """Join, then work for the time that the load says."""
-        subscribers = [
-            s.declare_subscriber(keys.key(_RUN, keys.NEW_WEIGHTS), self._note_weights)
-            for s in self._sessions
-        ]
-        actors = [
-            Actor(f"logical-{i}", self._sessions[i % len(self._sessions)])
-            for i in range(self._load.actors)
-        ]
-        for actor in actors:
-            Asker(actor.session, _RUN, actor.name).ask(keys.JOIN, self._join(actor), JoinReply)
-        for actor in actors:
-            self._next(actor)
-        warm = time.monotonic() + self._load.seconds / 4
-        began = 0.0
-        end = warm + self._load.seconds
-        pauses: list[tuple[float, Actor]] = []
-        while (now := time.monotonic()) < end:
-            if not began and now >= warm:
-                began = now
-                self._episode_s.clear()
-                self._command_s.clear()
-            if self._news:  # new weights mean new commands: nobody waits any longer
-                self._news = False
-                pauses = [(now, actor) for _, actor in pauses]
-            for _, actor in [p for p in pauses if p[0] <= now]:
-                self._next(actor)
-            pauses = [p for p in pauses if p[0] > now]
-            with contextlib.suppress(queue.Empty):
-                pause_s = self._take(*self._answers.get(timeout=0.01))
-                if pause_s is not None:
-                    actor, seconds = pause_s
-                    pauses.append((now + seconds, actor))
-        took = time.monotonic() - began
-        for subscriber in subscribers:
-            subscriber.undeclare()
-        measured = Measured(
-            len(self._episode_s) / took,
-            self._episode_s,
-            self._command_s,
-            self._retries,
-            self._arrivals,
-        )
-        for session in self._sessions:
-            session.close()
-        return measured
-
-    def _join(self, actor: Actor) -> JoinRequest:
-        return JoinRequest(
-            role="actor", id=actor.name, host="fleet", pid=os.getpid(), software="0",
-            environments=_WANTED, numerics_class="synthetic", environment=self._spec,
-        )  # fmt: skip
-
-    def _note_weights(self, sample: zenoh.Sample) -> None:
-        version = decode(sample.payload.to_bytes(), Weights, LARGEST).version
-        self._arrivals[str(version)] = time.monotonic()  # the last session's counts
-        self._news = True
-
-    def _next(self, actor: Actor) -> None:
-        """Deliver the next episode, or ask for commands."""
-        if actor.commands:
-            command_id = actor.commands[0].id
-            made_up = self._episodes[command_id % _VARIETY]
-            message = msgspec.structs.replace(made_up, actor=actor.name, command_id=command_id)
-            self._send(actor, keys.EPISODE, message)
-        else:
-            self._send(actor, keys.COMMANDS, CommandsRequest(actor=actor.name, wanted=_WANTED))
-
-    def _send(self, actor: Actor, verb: str, message: Message) -> None:
-        actor.verb, actor.payload = verb, encode(message)
-        actor.asked_at = time.monotonic()
-        self._ask(actor)
-
-    def _ask(self, actor: Actor) -> None:
-        actor.query = query = actor.query + 1
-
-        def reply(answer: zenoh.Reply) -> None:
-            if answer.ok is not None:
-                self._answers.put((actor, query, answer.ok.payload.to_bytes()))
-
-        # On Zenoh's own thread, which only fills the queue: another thread for every query would
-        # cost more than the query.
-        actor.session.get(
-            keys.key(_RUN, actor.verb),
-            zenoh.handlers.Callback(
-                reply, lambda: self._answers.put((actor, query, None)), indirect=False
-            ),
-            payload=actor.payload,
-            timeout=10.0,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-
-    def _take(self, actor: Actor, query: int, answer: bytes | None) -> tuple[Actor, float] | None:
-        """Handle an answer; return when an actor has to wait, and for how long."""
-        if query != actor.query:
-            return None  # the end of a query that has had its answer
-        if answer is None:
-            self._retries += 1
-            self._ask(actor)
-            return None
-        actor.query += 1
-        took = time.monotonic() - actor.asked_at
-        if actor.verb == keys.EPISODE:
-            decode(answer, EpisodeReply)
-            self._episode_s.append(took)
-            actor.commands.popleft()
-        else:
-            reply = decode(answer, CommandsReply)
-            self._command_s.append(took)
-            actor.commands.extend(reply.commands)
-            if not reply.commands:
-                return actor, reply.wait.retry_after_s if reply.wait else 0.05
-        self._next(actor)
-        return None
-
-
-def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
-    rng = np.random.default_rng(seed)
-    episode = Episode(
-        command_id=0,
-        observations=rng.normal(size=(steps, spec.observation_size)).astype(np.float32),
-        actions=rng.integers(0, spec.n_actions, steps).astype(np.uint8),
-        rewards=rng.normal(size=steps).astype(np.float32),
-        terminated=True,
-        truncated=False,
-    )
-    return EpisodeMessage(
-        actor="nobody", command_id=0, observations=encode_array(episode.observations),
-        actions=encode_array(episode.actions), rewards=encode_array(episode.rewards),
-        terminated=True, truncated=False,
-    )  # fmt: skip
 
 
 # The learner that does not train, in this process.
@@ -287,7 +84,7 @@ def deliver_versions(
     state.optimizer.step()  # gives Adam the state that a delivery must have
     weights, optimizer = encode_weights(state.behavior), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
-        asker = Asker(session, _RUN, "learner scale", stop)
+        asker = Asker(session, RUN, "learner scale", stop)
         version = 1
         while not stop.is_set():
             request = ChangesRequest(learner="scale", version=version)
@@ -302,11 +99,32 @@ def deliver_versions(
             asker.ask(keys.VERSION, message, VersionReply)
             announced.append(Announced(version, time.monotonic()))
             news = encode(Weights(version=version, weights=weights))
-            session.put(keys.key(_RUN, keys.NEW_WEIGHTS), news)
+            session.put(keys.key(RUN, keys.NEW_WEIGHTS), news)
             version += 1
 
 
 # One measurement.
+
+
+#: The figures of one fleet, in the order of the table.
+UNITS = (
+    "logical actors",
+    "Zenoh sessions",
+    "episode, KB",
+    "acknowledged episodes/s",
+    "MB/s",
+    "acknowledgement p50, ms",
+    "p99, ms",
+    "commands p50, ms",
+    "commands p99, ms",
+    "replay CPU, ms/episode",
+    "weights to all p50, ms",
+    "weights to all p99, ms",
+    "resident at first, MB",
+    "resident at last, MB",
+    "iterations",
+    "queries asked again",
+)
 
 
 class Sample(NamedTuple):
@@ -334,7 +152,7 @@ def replay_service(run_dir: Path, hello: Hello, endpoint: str) -> Iterator[int]:
         process.wait(10)
 
 
-def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[str, Any]:
+def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[str, float]:
     """Return the figures of one fleet."""
     spec = spec_of(kilobytes)
     config = Config(
@@ -347,7 +165,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
         lead=2,
         eval_every=2**31 - 1,
     )
-    hello = Hello(protocol=PROTOCOL, software="0", run_id=_RUN, config=config, environment=spec)
+    hello = Hello(protocol=PROTOCOL, software="0", run_id=RUN, config=config, environment=spec)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stop = threading.Event()
     announced: list[Announced] = []
@@ -357,7 +175,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
         replay_service(Path(folder) / "run", hello, endpoint) as pid,
         sessions.connect(endpoint, 30.0) as session,
     ):
-        asker = Asker(session, _RUN, "scale", patience_s=30.0)
+        asker = Asker(session, RUN, "scale", patience_s=30.0)
         learner = threading.Thread(
             target=deliver_versions, args=(endpoint, hello, stop, announced), daemon=True
         )
@@ -366,8 +184,10 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
             endpoint, actors, min(actors, options.sessions), spec.max_episode_steps, options.seconds
         )
         report = Path(folder) / "fleet.json"
-        command = [sys.executable, __file__, "--fleet", msgspec.json.encode(load).decode()]
-        fleet = subprocess.Popen([*command, "--json", str(report)])
+        fleet = subprocess.Popen([
+            sys.executable, str(Path(__file__).with_name("fleet.py")),
+            msgspec.json.encode(load).decode(), str(report),
+        ])  # fmt: skip
         try:
             status = asker.ask(keys.STATUS, StatusRequest(), Status)
             deadline = time.monotonic() + 60.0 + 3 * options.seconds
@@ -398,7 +218,7 @@ def _figures(
     announced: list[Announced],
     samples: list[Sample],
     status: Status,
-) -> dict[str, Any]:
+) -> dict[str, float]:
     first, last = samples[len(samples) // 4], samples[-1]
     fan_out = [
         measured.arrivals[str(a.version)] - a.at
@@ -407,30 +227,29 @@ def _figures(
     ]
     ledger = status.episodes
     assert ledger.delivered == ledger.accepted + ledger.duplicate + ledger.rejected
-    return {
-        "logical actors": load.actors,
-        "sessions": load.sessions,
-        "episode, KB": kilobytes,
-        "acknowledged episodes/s": round(measured.acknowledged, 1),
-        "acknowledged, MB/s": round(measured.acknowledged * kilobytes / 1e3, 1),
-        "episode p50, ms": _percentile(measured.episode_s, 50),
-        "episode p99, ms": _percentile(measured.episode_s, 99),
-        "commands p50, ms": _percentile(measured.command_s, 50),
-        "commands p99, ms": _percentile(measured.command_s, 99),
-        "replay CPU, ms/episode": round(
-            1e3 * (last.cpu - first.cpu) / max(1, last.accepted - first.accepted), 3
-        ),
-        "replay resident, MB, first to last": f"{first.resident:.0f} to {last.resident:.0f}",
-        "weights fan-out p50, ms": _percentile(fan_out, 50),
-        "iterations": status.iteration,
-        "duplicates": ledger.duplicate,
-        "rejected": ledger.rejected,
-        "queries asked again": measured.retries,
-    }
+    figures = (
+        load.actors,
+        load.sessions,
+        kilobytes,
+        measured.acknowledged,
+        measured.acknowledged * kilobytes / 1e3,
+        _percentile(measured.episode_s, 50),
+        _percentile(measured.episode_s, 99),
+        _percentile(measured.command_s, 50),
+        _percentile(measured.command_s, 99),
+        1e3 * (last.cpu - first.cpu) / max(1, last.accepted - first.accepted),
+        _percentile(fan_out, 50),
+        _percentile(fan_out, 99),
+        first.resident,
+        last.resident,
+        status.iteration,
+        measured.retries,
+    )
+    return dict(zip(UNITS, figures, strict=True))
 
 
 def _percentile(seconds: list[float], percent: float) -> float:
-    return round(1e3 * float(np.percentile(seconds, percent)), 2) if seconds else float("nan")
+    return 1e3 * float(np.percentile(seconds, percent)) if seconds else float("nan")
 
 
 def main() -> None:
@@ -439,26 +258,26 @@ def main() -> None:
     parser.add_argument("--actors", nargs="+", type=int, default=[1, 10, 100, 1000])
     parser.add_argument("--kilobytes", nargs="+", type=int, default=[20, 1000])
     parser.add_argument("--sessions", type=int, default=64, help="the most Zenoh sessions")
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--replay-size", type=int, default=500)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--fleet", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.fleet:
-        load = msgspec.json.decode(options.fleet, type=Load)
-        options.json.write_bytes(msgspec.json.encode(Fleet(load).run()))
-        return
     rows = []
+    print("| " + " | ".join(UNITS) + " |\n|" + "---|" * len(UNITS))
     for kilobytes in options.kilobytes:
         for actors in options.actors:
-            rows.append(measure(actors, kilobytes, options))
-            print(json.dumps(rows[-1]), flush=True)
-    names = list(rows[0])
-    print("| " + " | ".join(names) + " |\n|" + "---|" * len(names))
-    for row in rows:
-        print("| " + " | ".join(str(row[n]) for n in names) + " |")
+            repeats = [measure(actors, kilobytes, options) for _ in range(options.repeats)]
+            rows += repeats
+            cells = [_median_and_range([r[name] for r in repeats]) for name in UNITS]
+            print("| " + " | ".join(cells) + " |", flush=True)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def _median_and_range(values: list[float]) -> str:
+    middle, low, high = statistics.median(values), min(values), max(values)
+    return f"{middle:,.4g}" if low == high else f"{middle:,.4g} ({low:,.4g} to {high:,.4g})"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,230 @@
+"""A fleet of logical actors in one process: it makes nothing, asks for commands, and delivers.
+
+Each logical actor asks for commands, answers every one with an episode that was made up beforehand,
+and has one episode in flight at a time, like a real one. ``scale.py`` starts it.
+"""
+
+import contextlib
+import os
+import queue
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import zenoh
+
+from udrl.commands import Command
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl_proto import keys
+from udrl_proto import session as sessions
+from udrl_proto.asking import Asker
+from udrl_proto.codec import LARGEST, decode, encode, encode_array
+from udrl_proto.messages import (
+    CommandsReply,
+    CommandsRequest,
+    EpisodeMessage,
+    EpisodeReply,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Weights,
+)
+
+RUN = "scale"
+#: Made-up episodes that an actor chooses from.
+_VARIETY = 64
+_WANTED = 16
+
+
+class Load(msgspec.Struct, frozen=True):
+    """What a fleet process is told."""
+
+    endpoint: str
+    actors: int
+    sessions: int
+    steps: int
+    seconds: float
+
+
+class Measured(msgspec.Struct, frozen=True):
+    """What a fleet process found; latencies in seconds, arrivals by weights version."""
+
+    acknowledged: float
+    episode_s: list[float]
+    command_s: list[float]
+    retries: int
+    arrivals: dict[str, float]
+
+
+@dataclass
+class Actor:
+    """A logical actor: what it holds, and what it is waiting for an answer to."""
+
+    name: str
+    session: zenoh.Session
+    commands: deque[Command] = field(default_factory=deque)
+    verb: str = ""
+    payload: bytes = b""
+    asked_at: float = 0.0
+    query: int = 0
+
+
+class Fleet:
+    """All logical actors, driven by one thread; answers come through one queue."""
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+        self._answers: queue.SimpleQueue[tuple[Actor, int, bytes | None]] = queue.SimpleQueue()
+        self._sessions = [sessions.connect(load.endpoint, 30.0) for _ in range(load.sessions)]
+        hello = sessions.find_run(self._sessions[0], RUN, 30.0)
+        self._spec = hello.environment
+        self._episodes = [_made_up(self._spec, load.steps, i) for i in range(_VARIETY)]
+        self._arrivals: dict[str, float] = {}
+        self._episode_s: list[float] = []
+        self._command_s: list[float] = []
+        self._retries = 0
+        self._news = False
+
+    def run(self) -> Measured:
+        """Join, then work for the time that the load says."""
+        subscribers = [
+            s.declare_subscriber(keys.key(RUN, keys.NEW_WEIGHTS), self._note_weights)
+            for s in self._sessions
+        ]
+        actors = [
+            Actor(f"logical-{i}", self._sessions[i % len(self._sessions)])
+            for i in range(self._load.actors)
+        ]
+        for actor in actors:
+            Asker(actor.session, RUN, actor.name).ask(keys.JOIN, self._join(actor), JoinReply)
+        for actor in actors:
+            self._next(actor)
+        warm = time.monotonic() + self._load.seconds / 4
+        began = 0.0
+        end = warm + self._load.seconds
+        pauses: list[tuple[float, Actor]] = []
+        while (now := time.monotonic()) < end:
+            if not began and now >= warm:
+                began = now
+                self._episode_s.clear()
+                self._command_s.clear()
+            if self._news:  # new weights mean new commands: nobody waits any longer
+                self._news = False
+                pauses = [(now, actor) for _, actor in pauses]
+            for _, actor in [p for p in pauses if p[0] <= now]:
+                self._next(actor)
+            pauses = [p for p in pauses if p[0] > now]
+            with contextlib.suppress(queue.Empty):
+                pause_s = self._take(*self._answers.get(timeout=0.01))
+                if pause_s is not None:
+                    actor, seconds = pause_s
+                    pauses.append((now + seconds, actor))
+        took = time.monotonic() - began
+        for subscriber in subscribers:
+            subscriber.undeclare()
+        measured = Measured(
+            len(self._episode_s) / took,
+            self._episode_s,
+            self._command_s,
+            self._retries,
+            self._arrivals,
+        )
+        for session in self._sessions:
+            session.close()
+        return measured
+
+    def _join(self, actor: Actor) -> JoinRequest:
+        return JoinRequest(
+            role="actor", id=actor.name, host="fleet", pid=os.getpid(), software="0",
+            environments=_WANTED, numerics_class="synthetic", environment=self._spec,
+        )  # fmt: skip
+
+    def _note_weights(self, sample: zenoh.Sample) -> None:
+        version = decode(sample.payload.to_bytes(), Weights, LARGEST).version
+        self._arrivals[str(version)] = time.monotonic()  # the last session's counts
+        self._news = True
+
+    def _next(self, actor: Actor) -> None:
+        """Deliver the next episode, or ask for commands."""
+        if actor.commands:
+            command_id = actor.commands[0].id
+            made_up = self._episodes[command_id % _VARIETY]
+            message = msgspec.structs.replace(made_up, actor=actor.name, command_id=command_id)
+            self._send(actor, keys.EPISODE, message)
+        else:
+            self._send(actor, keys.COMMANDS, CommandsRequest(actor=actor.name, wanted=_WANTED))
+
+    def _send(self, actor: Actor, verb: str, message: Message) -> None:
+        actor.verb, actor.payload = verb, encode(message)
+        actor.asked_at = time.monotonic()
+        self._ask(actor)
+
+    def _ask(self, actor: Actor) -> None:
+        actor.query = query = actor.query + 1
+
+        def reply(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                self._answers.put((actor, query, answer.ok.payload.to_bytes()))
+
+        # On Zenoh's own thread, which only fills the queue: another thread for every query would
+        # cost more than the query.
+        actor.session.get(
+            keys.key(RUN, actor.verb),
+            zenoh.handlers.Callback(
+                reply, lambda: self._answers.put((actor, query, None)), indirect=False
+            ),
+            payload=actor.payload,
+            timeout=10.0,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def _take(self, actor: Actor, query: int, answer: bytes | None) -> tuple[Actor, float] | None:
+        """Handle an answer; return when an actor has to wait, and for how long."""
+        if query != actor.query:
+            return None  # the end of a query that has had its answer
+        if answer is None:
+            self._retries += 1
+            self._ask(actor)
+            return None
+        actor.query += 1
+        took = time.monotonic() - actor.asked_at
+        if actor.verb == keys.EPISODE:
+            decode(answer, EpisodeReply)
+            self._episode_s.append(took)
+            actor.commands.popleft()
+        else:
+            reply = decode(answer, CommandsReply)
+            self._command_s.append(took)
+            actor.commands.extend(reply.commands)
+            if not reply.commands:
+                return actor, reply.wait.retry_after_s if reply.wait else 0.05
+        self._next(actor)
+        return None
+
+
+def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
+    rng = np.random.default_rng(seed)
+    episode = Episode(
+        command_id=0,
+        observations=rng.normal(size=(steps, spec.observation_size)).astype(np.float32),
+        actions=rng.integers(0, spec.n_actions, steps).astype(np.uint8),
+        rewards=rng.normal(size=steps).astype(np.float32),
+        terminated=True,
+        truncated=False,
+    )
+    return EpisodeMessage(
+        actor="nobody", command_id=0, observations=encode_array(episode.observations),
+        actions=encode_array(episode.actions), rewards=encode_array(episode.rewards),
+        terminated=True, truncated=False,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    told = msgspec.json.decode(sys.argv[1], type=Load)
+    Path(sys.argv[2]).write_bytes(msgspec.json.encode(Fleet(told).run()))
