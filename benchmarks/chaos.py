@@ -177,6 +177,12 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     if failure is not None:
         remarks.append(f"the run failed: {failure}")
     status = run.status()
+    counts = {
+        "env_failures": status.env_failures,
+        "restarts": sum(len(c.restarts) for c in run.children("actor", "learner", "replay")),
+    }
+    if fault.shows_in is not None and not counts[fault.shows_in]:
+        remarks.append(f"WRONG: it never happened, {fault.shows_in} is 0")
     return Row(
         fault=fault.name,
         equal=digests(status) == digests(undisturbed) and status.exact,
@@ -184,8 +190,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
         as_expected=failure is None and not any(r.startswith("WRONG") for r in remarks),
         wall_s=time.monotonic() - began,
         injections=[_measure(run, fault, *span) for span in spans],
-        env_failures=status.env_failures,
-        restarts=sum(len(child.restarts) for child in run.children("actor", "learner", "replay")),
+        **counts,
         duplicates=status.episodes.duplicate,
         lost=status.commands.outstanding,
         remark="; ".join([*remarks, *run.unbalanced[:1]]),

@@ -81,9 +81,9 @@ class Nan(Disturbed):
 
 
 class Hanging(Disturbed):
-    """Hangs in native code in one of a few hundred episodes, holding the interpreter's lock."""
+    """Hangs in native code in one of a hundred episodes, holding the interpreter's lock."""
 
-    chance: ClassVar[float | None] = 0.003
+    chance: ClassVar[float | None] = 0.01
 
     def misbehave(self, outcome: Any) -> Any:
         """Sleep in C without letting go of the lock: no Python code of this process runs again."""

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from cut_cable import CutCable
 from disturbed_run import DisturbedRun, Link
@@ -32,6 +32,7 @@ class Fault(NamedTuple):
         lose: roles of the services that lose contact.
         link: what is between the replay service and the others.
         environment: the class of :mod:`disturbed_environments` around the run's own; None: none.
+        shows_in: the counter of a run that must not be zero afterwards.
         stops_the_run: it must end with exit code 9 and name a reproduction.
     """
 
@@ -40,6 +41,7 @@ class Fault(NamedTuple):
     lose: Sequence[str] = ()
     link: Callable[[], Link] = SeveredLink
     environment: str | None = None
+    shows_in: Literal["env_failures", "restarts"] | None = None
     stops_the_run: bool = False
 
 
@@ -103,9 +105,9 @@ FAULTS = (
     Fault("cut network", _cut, ("actor", "learner"), link=CutCable),
     Fault("twins", _twins),
     Fault("slow actor", environment="Slow"),
-    Fault("environment raises", environment="Raising"),
-    Fault("environment returns NaN", environment="Nan"),
-    Fault("environment hangs", environment="Hanging"),
+    Fault("environment raises", environment="Raising", shows_in="env_failures"),
+    Fault("environment returns NaN", environment="Nan", shows_in="env_failures"),
+    Fault("environment hangs", environment="Hanging", shows_in="restarts"),
     Fault("command always raises", environment="AlwaysRaising", stops_the_run=True),
     Fault("command always hangs", environment="AlwaysHanging", stops_the_run=True),
 )  # fmt: skip
