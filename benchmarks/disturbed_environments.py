@@ -7,6 +7,7 @@ run before they join, whose seeds come first.
 """
 
 import ctypes
+import itertools
 import os
 import random
 import sys
@@ -40,9 +41,12 @@ class Disturbed(gym.Wrapper[Any, Any, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin an episode and decide its fate."""
         in_run = (seed or 0) > _FIRST_OF_A_RUN and HEALED not in os.environ
-        unlucky = (seed or 0) % _CURSED == 0 if self.chance is None else _draw() < self.chance
-        self._sick = in_run and unlucky
+        self._sick = in_run and self.is_doomed(seed or 0)
         return super().reset(seed=seed, options=options)
+
+    def is_doomed(self, seed: int) -> bool:
+        """Say whether the episode that begins is a bad one."""
+        return seed % _CURSED == 0 if self.chance is None else _draw() < self.chance
 
     def step(self, action: Any) -> Any:
         """Advance, or misbehave in about one of ten steps of a doomed episode."""
@@ -81,9 +85,16 @@ class Nan(Disturbed):
 
 
 class Hanging(Disturbed):
-    """Hangs in native code in one of a hundred episodes, holding the interpreter's lock."""
+    """Hangs in native code, holding the interpreter's lock, in every 150th episode of a process.
 
-    chance: ClassVar[float | None] = 0.01
+    Counted, not by chance: `udrl train` gives up what dies more than five times within a minute.
+    """
+
+    _episodes = itertools.count(1)
+
+    def is_doomed(self, seed: int) -> bool:
+        """Count."""
+        return next(self._episodes) % 150 == 0
 
     def misbehave(self, outcome: Any) -> Any:
         """Sleep in C without letting go of the lock: no Python code of this process runs again."""
@@ -100,7 +111,9 @@ class AlwaysRaising(Raising):
 class AlwaysHanging(Hanging):
     """Hangs under the same few commands every time."""
 
-    chance = None
+    def is_doomed(self, seed: int) -> bool:
+        """Decide by the command."""
+        return seed % _CURSED == 0
 
 
 class Slow(gym.Wrapper[Any, Any, Any, Any]):
