@@ -25,11 +25,14 @@ import gymnasium as gym
 import msgspec
 
 from cut_cable import CutCable
-from disturbed_environments import HEALED, SLOW_ONE
+from disturbed_environments import CURSED, HEALED, SLOW_ONE
 from disturbed_run import DisturbedRun, TooLate, digests, is_balanced
 from faults import FAULTS, Fault
 from severed_link import SeveredLink
+from udrl.commands import CommandSampler
+from udrl.config import Config
 from udrl.errors import RunFailed
+from udrl.replay import Entry, ReplayBuffer
 from udrl_launch.settings import Settings, gather
 from udrl_proto.messages import Status
 
@@ -145,6 +148,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     name = fault.name.replace(" ", "-")
     os.environ[SLOW_ONE] = str(folder / f"{name}.slow")
     chance = random.Random(f"{options.seed}-{fault.name}")  # noqa: S311
+    os.environ[CURSED] = str(_curse(_settings(options, None).config, chance))
     began = time.monotonic()
     hang_s = _HANG_S if "Hanging" in str(fault.environment) else _NEVER_S
     settings = _settings(options, fault.environment)
@@ -195,6 +199,15 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
         lost=status.commands.outstanding,
         remark="; ".join([*remarks, *run.unbalanced[:1]]),
     )
+
+
+def _curse(config: Config, chance: random.Random) -> int:
+    """Return the environment seed of an exploratory command, early in a run."""
+    any_buffer = ReplayBuffer(config)  # the seeds do not depend on what is in it
+    any_buffer.admit([Entry(0.0, 0, 1)])
+    sampler = CommandSampler(config, config.max_episode_steps or 1)
+    commands = sampler.explore(chance.randint(3, 10), any_buffer)
+    return chance.choice(commands).environment_seed
 
 
 def _check_failure(failure: RunFailed | None, run: DisturbedRun) -> str:

@@ -1,7 +1,7 @@
 """Environments around another one that misbehave: ``disturbed_environments:Raising-v0`` and so on.
 
 Those that misbehave now and then do so by a chance of the process, whatever the command, so that
-the same command succeeds elsewhere or later. The others do it always, under the same few commands.
+the same command succeeds elsewhere or later. The others do it always, under one command.
 ``UDRL_HEALED`` in the process' environment cures all of them. They spare the probes that services
 run before they join, whose seeds come first.
 """
@@ -22,8 +22,10 @@ HEALED = "UDRL_HEALED"
 #: A file; the process that creates it is the slow one.
 SLOW_ONE = "UDRL_SLOW_ONE"
 
+#: The seed of the command that fails always.
+CURSED = "UDRL_CURSED"
+
 _FIRST_OF_A_RUN = 1_000_100
-_CURSED = 61  # one in so many seeds
 
 _chance = random.Random(f"{os.environ.get('UDRL_CHAOS_SEED', '0')}-{os.getpid()}")  # noqa: S311
 
@@ -31,7 +33,7 @@ _chance = random.Random(f"{os.environ.get('UDRL_CHAOS_SEED', '0')}-{os.getpid()}
 class Disturbed(gym.Wrapper[Any, Any, Any, Any]):
     """An environment that is well until an episode of a run begins."""
 
-    #: Chance that an episode is disturbed; None: always, under the commands with certain seeds.
+    #: Chance that an episode is disturbed; None: always, under one command.
     chance: ClassVar[float | None] = None
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -46,7 +48,7 @@ class Disturbed(gym.Wrapper[Any, Any, Any, Any]):
 
     def is_doomed(self, seed: int) -> bool:
         """Say whether the episode that begins is a bad one."""
-        return seed % _CURSED == 0 if self.chance is None else _draw() < self.chance
+        return _is_cursed(seed) if self.chance is None else _draw() < self.chance
 
     def step(self, action: Any) -> Any:
         """Advance, or misbehave in about one of ten steps of a doomed episode."""
@@ -57,6 +59,10 @@ class Disturbed(gym.Wrapper[Any, Any, Any, Any]):
     def misbehave(self, outcome: Any) -> Any:
         """Do what this environment is for."""
         raise NotImplementedError
+
+
+def _is_cursed(seed: int) -> bool:
+    return str(seed) == os.environ.get(CURSED)
 
 
 def _draw() -> float:
@@ -103,17 +109,17 @@ class Hanging(Disturbed):
 
 
 class AlwaysRaising(Raising):
-    """Raises under the same few commands every time."""
+    """Raises under one command every time."""
 
     chance = None
 
 
 class AlwaysHanging(Hanging):
-    """Hangs under the same few commands every time."""
+    """Hangs under one command every time."""
 
     def is_doomed(self, seed: int) -> bool:
         """Decide by the command."""
-        return seed % _CURSED == 0
+        return _is_cursed(seed)
 
 
 class Slow(gym.Wrapper[Any, Any, Any, Any]):
