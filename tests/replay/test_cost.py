@@ -6,7 +6,7 @@ from tests.replay.synthetic import work
 from udrl_replay.run import Run
 
 #: Tables whose size the settings bound; the others keep a row of every iteration for good.
-BOUNDED = {"facts", "commands", "episodes", "CONSTANT"}
+BOUNDED = {"facts", "commands", "episodes", "bodies", "CONSTANT"}
 #: Indexes of the few rows that still have their blobs.
 SMALL = ("weights_kept", "optimizers_kept")
 

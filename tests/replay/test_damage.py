@@ -107,7 +107,7 @@ def test_changed_weights_without_an_optimizer_are_noticed(written: Path) -> None
 
 
 def test_changed_episode_is_noticed(written: Path) -> None:
-    edit(written, "UPDATE episodes SET body = x'00' WHERE id = ?", 10**9)
+    edit(written, "UPDATE bodies SET body = x'00' WHERE id = ?", 10**9)
     with (
         closing(Store(written.parent)) as store,
         pytest.raises(DamagedStore, match=f"{written}: episode {10**9} is not what was written"),

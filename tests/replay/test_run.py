@@ -269,6 +269,11 @@ class RunMachine(RuleBasedStateMachine):
     def everything_is_on_disk(self) -> None:
         assert self.run.store.fact("progress", Progress) == self.run.progress
 
+    @invariant()
+    def every_episode_has_its_body(self) -> None:
+        store = self.run.store
+        assert store._rows("SELECT id FROM bodies") == store._rows("SELECT id FROM episodes")
+
     def needed_buffers(self) -> range:
         """Return the iterations after which the buffer may still be asked for."""
         latest, iteration = self.run.progress.latest_version, self.run.progress.iteration

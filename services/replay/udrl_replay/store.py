@@ -255,7 +255,8 @@ class Store:
     def add_episode(self, entry: Entry, digest: bytes, body: bytes) -> None:
         """Add an episode that arrived."""
         row = entry.id, entry.episode_return, entry.length, digest, None, None, sha256(body)
-        self._insert("episodes", *row, unsealed=(body,))
+        self._insert("episodes", *row)
+        self._db.execute("INSERT INTO bodies VALUES (?, ?)", (entry.id, body))
 
     def episode_digest(self, episode_id: int) -> bytes | None:
         """Return an episode's digest if its row is still there."""
@@ -289,11 +290,14 @@ class Store:
 
     def remove_episodes(self, ids: Iterable[int]) -> None:
         """Forget episodes."""
-        self._db.executemany("DELETE FROM episodes WHERE id = ?", ((i,) for i in ids))
+        rows = [(i,) for i in ids]
+        self._db.executemany("DELETE FROM episodes WHERE id = ?", rows)
+        self._db.executemany("DELETE FROM bodies WHERE id = ?", rows)
 
     def remove_evicted(self, until: int) -> None:
         """Forget episodes that no buffer after iteration ``until`` or later holds."""
-        self._db.execute("DELETE FROM episodes WHERE evicted <= ?", (until,))
+        rows = self._rows("SELECT id FROM episodes WHERE evicted <= ? ORDER BY id", (until,))
+        self.remove_episodes(i for (i,) in rows)
 
     def buffer(self, iteration: int) -> list[Pending]:
         """Return the buffer as it was after an iteration, least return first."""
@@ -312,14 +316,17 @@ class Store:
         """
         bodies: list[bytes] = []
         for episode_id in ids:
-            rows = self._rows("SELECT body, checksum FROM episodes WHERE id = ?", (episode_id,))
+            rows = self._rows(
+                "SELECT body, checksum FROM episodes LEFT JOIN bodies USING (id) WHERE id = ?",
+                (episode_id,),
+            )
             if not rows:
                 break
             ((body, checksum),) = rows
-            limit -= len(body)
+            limit -= len(body or b"")
             if bodies and limit < 0:
                 break
-            if sha256(body) != checksum:
+            if body is None or sha256(body) != checksum:
                 raise self._damaged(f"episode {episode_id} is not what was written")
             bodies.append(body)
         return bodies

@@ -8,9 +8,11 @@ columns are documented in ``docs/operations.md``.
 import hashlib
 from collections.abc import Iterable
 
-SCHEMA = 2
+SCHEMA = 3
 
-#: Large columns stand last: whoever reads what stands before them does not read them.
+#: SQLite writes a whole row anew when a column changes its size; so an episode's body, which may
+#: be a megabyte and never changes, has a table of its own. Elsewhere large columns stand last:
+#: whoever reads what stands before them does not read them.
 TABLES = """
 CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL, seal BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE commands (
@@ -18,7 +20,8 @@ CREATE TABLE commands (
 CREATE TABLE episodes (
     id INTEGER PRIMARY KEY, episode_return REAL NOT NULL, length INTEGER NOT NULL,
     digest BLOB NOT NULL, admitted INTEGER, evicted INTEGER, checksum BLOB NOT NULL,
-    seal BLOB NOT NULL, body BLOB NOT NULL);
+    seal BLOB NOT NULL);
+CREATE TABLE bodies (id INTEGER PRIMARY KEY, body BLOB NOT NULL);
 CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
 CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
 CREATE TABLE iterations (
