@@ -71,6 +71,7 @@ class Actor:
     verb: str = ""
     payload: bytes = b""
     asked_at: float = 0.0
+    answered: bool = True
     query: int = 0
 
 
@@ -117,7 +118,7 @@ class Fleet:
                 self._news = False
                 pauses = [(now, actor) for _, actor in pauses]
             for _, actor in [p for p in pauses if p[0] <= now]:
-                self._next(actor)
+                self._go_on(actor)
             pauses = [p for p in pauses if p[0] > now]
             with contextlib.suppress(queue.Empty):
                 pause_s = self._take(*self._answers.get(timeout=0.01))
@@ -149,6 +150,13 @@ class Fleet:
         self._arrivals[str(version)] = time.monotonic()  # the last session's counts
         self._news = True
 
+    def _go_on(self, actor: Actor) -> None:
+        """Ask again what got no answer, or else the next thing."""
+        if actor.answered:
+            self._next(actor)
+        else:
+            self._ask(actor)
+
     def _next(self, actor: Actor) -> None:
         """Deliver the next episode, or ask for commands."""
         if actor.commands:
@@ -161,7 +169,7 @@ class Fleet:
 
     def _send(self, actor: Actor, verb: str, message: Message) -> None:
         actor.verb, actor.payload = verb, encode(message)
-        actor.asked_at = time.monotonic()
+        actor.asked_at, actor.answered = time.monotonic(), False
         self._ask(actor)
 
     def _ask(self, actor: Actor) -> None:
@@ -188,11 +196,12 @@ class Fleet:
         """Handle an answer; return when an actor has to wait, and for how long."""
         if query != actor.query:
             return None  # the end of a query that has had its answer
-        if answer is None:
+        if answer is None:  # dropped, or too late: as a real actor, ask again after a pause
             self._retries += 1
-            self._ask(actor)
-            return None
+            actor.query += 1
+            return actor, 0.5
         actor.query += 1
+        actor.answered = True
         took = time.monotonic() - actor.asked_at
         if actor.verb == keys.EPISODE:
             decode(answer, EpisodeReply)

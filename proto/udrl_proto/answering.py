@@ -1,11 +1,10 @@
 """Answering queries: the replay service's side of the contract.
 
 Queries arrive on Zenoh's threads, are decoded there, and wait in one bounded queue for the one
-thread that owns the run. A query that finds the queue full gets no answer and is asked again.
+thread that owns the run. A query that finds the inbox full gets no answer and is asked again.
 """
 
 import logging
-import queue
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ import zenoh
 from udrl.errors import InvalidData
 from udrl_proto import keys
 from udrl_proto.codec import decode, encode
+from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
 
 log = logging.getLogger("udrl")
@@ -56,16 +56,18 @@ class Verb:
     Attributes:
         kind: the message.
         limit: the most bytes it may have.
+        bulk: its questions are many and large, and wait for all others.
         prepare: turns the message into what the run wants, on the thread that received it.
     """
 
     kind: type[Message]
     limit: int
+    bulk: bool = False
     prepare: Callable[[Any], Any] = lambda request: request
 
 
 def serve(
-    session: zenoh.Session, run_id: str, verbs: Mapping[str, Verb], inbox: "queue.Queue[Any]"
+    session: zenoh.Session, run_id: str, verbs: Mapping[str, Verb], inbox: Inbox[Any]
 ) -> list[zenoh.Queryable[None]]:
     """Declare a queryable for every verb; questions go to ``inbox``. Undeclare them to stop."""
 
@@ -74,15 +76,16 @@ def serve(
 
         def receive(query: zenoh.Query) -> None:
             request: Any
+            payload = query.payload
+            data = b"" if payload is None else payload.to_bytes()
+            if not inbox.has_room(len(data)):  # before the work of reading it
+                query.drop()
+                return
             try:
-                payload = query.payload
-                data = b"" if payload is None else payload.to_bytes()
                 request = verb.prepare(decode(data, verb.kind, verb.limit))
             except InvalidData as error:
                 request = error
-            try:
-                inbox.put_nowait(Question(name, request, query, key))
-            except queue.Full:
+            if not inbox.put(Question(name, request, query, key), len(data), bulk=verb.bulk):
                 query.drop()
 
         return receive

@@ -20,8 +20,9 @@ log = logging.getLogger("udrl")
 
 Reply = TypeVar("Reply", bound=Message)
 
-#: Seconds that one query may take before it is asked again.
-ATTEMPT_S = 3.0
+#: Seconds that one query may take before it is asked again, at first and at last: twice as long
+#: each time, so that what answers slowly is not given ever more to do.
+ATTEMPT_S, LONGEST_ATTEMPT_S = 3.0, 30.0
 #: Seconds that a service goes on asking a replay service that does not answer.
 PATIENCE_S = 300.0
 
@@ -70,13 +71,14 @@ class Asker:
         """
         payload = request if isinstance(request, bytes) else encode(request)
         began = time.monotonic()
-        pause = 0.02
+        pause, attempt_s = 0.02, ATTEMPT_S
         warn_at = 2.0
         while not self._stop.is_set():
+            asked = time.monotonic()
             replies = self._session.get(
                 keys.key(self._run_id, verb),
                 payload=payload,
-                timeout=ATTEMPT_S,
+                timeout=attempt_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
@@ -85,7 +87,10 @@ class Asker:
                     return decode(reply.ok.payload.to_bytes(), kind, limit)
                 if reply.err is not None and (problem := _problem(reply.err)) is not None:
                     raise Refused(problem.code, problem.message)
-            waited = time.monotonic() - began
+            now = time.monotonic()
+            if now - asked >= attempt_s:
+                attempt_s = min(2 * attempt_s, LONGEST_ATTEMPT_S)
+            waited = now - began
             if waited >= self._patience_s:
                 raise Unreachable(
                     f"{self._who} asked the replay service of {self._run_id} for {verb!r} and got "

@@ -5,7 +5,6 @@ is asked of each input: one answer, which is a message of the protocol; ledgers 
 exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
 """
 
-import queue
 import tempfile
 from collections.abc import Callable
 from copy import deepcopy
@@ -138,8 +137,8 @@ class World:
         budget = Budget(max_env_steps=2**53)
         self.service = ReplayService(session, self._store, budget, run_dir, audit=0.2)
         self.spec = self.service.run.hello.environment
-        inbox: queue.Queue[Any] = self.service._inbox
-        serve(session, self.service.run.hello.run_id, self.service._verbs(), inbox)
+        verbs, inbox = self.service._verbs(), self.service._inbox
+        serve(session, self.service.run.hello.run_id, verbs, inbox)
 
     def close(self) -> None:
         """Forget the run."""
@@ -156,7 +155,7 @@ class World:
         query = Query(data)
         accepted = self.service.run.progress.accepted
         self._session.receivers[verb](query)
-        self.service._answer(self.service._next_group())
+        self.service._answer(self.service._inbox.take(1, 1, 0.0))
         assert not query.dropped
         assert len(query.replies) + len(query.problems) == 1, "one question, one answer"
         self._check_ledgers()

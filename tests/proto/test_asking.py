@@ -1,12 +1,11 @@
 """Asking until there is an answer, and answering: at least once, never for ever."""
 
 import logging
-import queue
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -16,6 +15,7 @@ from udrl_proto import asking, keys
 from udrl_proto.answering import Question, Verb, serve
 from udrl_proto.asking import Asker
 from udrl_proto.codec import SMALL, encode
+from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
     Acknowledged,
     FailureMessage,
@@ -31,14 +31,14 @@ REQUEST = StateRequest(learner="l")
 ANSWER = StateReply(version=3, weights=b"w", optimizer=b"o")
 WAIT_S = 10.0
 
-Inbox = queue.Queue[Question]
+Questions = Inbox[Question]
 Ask = Callable[..., Future[StateReply]]
 
 
 @pytest.fixture
-def inbox(router: zenoh.Session) -> Inbox:
+def inbox(router: zenoh.Session) -> Questions:
     """Questions that arrive at a service on the router."""
-    questions: Inbox = queue.Queue()
+    questions: Questions = Inbox(100, 1000)
     serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, questions)
     return questions
 
@@ -59,6 +59,11 @@ def ask(asker: Asker) -> Iterator[Ask]:
         yield submit
 
 
+def first(inbox: Inbox[Any]) -> Any:
+    (question,) = inbox.take(1, 1, WAIT_S)
+    return question
+
+
 def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
     """Treat the first query with the first function, and so on."""
     remaining = iter(answers)
@@ -70,25 +75,25 @@ def answer(query: zenoh.Query) -> None:
         query.reply(keys.key(RUN, keys.STATE), encode(ANSWER))
 
 
-def test_answer_is_returned(inbox: Inbox, ask: Ask) -> None:
+def test_answer_is_returned(inbox: Questions, ask: Ask) -> None:
     future = ask()
-    question = inbox.get(timeout=WAIT_S)
+    question = first(inbox)
     assert (question.verb, question.request) == (keys.STATE, REQUEST)
     question.answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_request_may_be_encoded_already(inbox: Inbox, ask: Ask) -> None:
+def test_request_may_be_encoded_already(inbox: Questions, ask: Ask) -> None:
     future = ask(encode(REQUEST))
-    question = inbox.get(timeout=WAIT_S)
+    question = first(inbox)
     assert question.request == REQUEST
     question.answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_problem_is_raised_with_its_code(inbox: Inbox, ask: Ask) -> None:
+def test_problem_is_raised_with_its_code(inbox: Questions, ask: Ask) -> None:
     future = ask()
-    inbox.get(timeout=WAIT_S).answer(Problem(code="rewind", message="version 3 is next"))
+    first(inbox).answer(Problem(code="rewind", message="version 3 is next"))
     with pytest.raises(Refused, match="version 3 is next") as caught:
         future.result(WAIT_S)
     assert caught.value.code == "rewind"
@@ -107,6 +112,28 @@ def test_question_that_hangs_is_asked_again(
     answer_each(router, hanging.append, answer)
     assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
     hanging.pop().drop()
+
+
+def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    attempts: list[float] = []
+
+    class Slow:
+        def get(self, *_: object, timeout: float, **__: object) -> list[zenoh.Reply]:
+            nonlocal now
+            now += timeout
+            attempts.append(timeout)
+            return []
+
+    class NoPause(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            return False
+
+    monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
+    asker = Asker(cast(zenoh.Session, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
+    with pytest.raises(Unreachable):
+        asker.ask(keys.STATE, REQUEST, StateReply)
+    assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]
 
 
 def test_error_that_is_not_ours_is_no_answer(router: zenoh.Session, asker: Asker) -> None:
@@ -161,16 +188,16 @@ def test_asking_can_be_stopped(client: zenoh.Session) -> None:
             future.result(WAIT_S)
 
 
-def test_answer_of_another_kind_is_refused(inbox: Inbox, ask: Ask) -> None:
+def test_answer_of_another_kind_is_refused(inbox: Questions, ask: Ask) -> None:
     future = ask()
-    inbox.get(timeout=WAIT_S).answer(Acknowledged())
+    first(inbox).answer(Acknowledged())
     with pytest.raises(InvalidMessage, match=r"StateReply: .* `version`"):
         future.result(WAIT_S)
 
 
-def test_answer_beyond_its_limit_is_refused(inbox: Inbox, ask: Ask) -> None:
+def test_answer_beyond_its_limit_is_refused(inbox: Questions, ask: Ask) -> None:
     future = ask(limit=10)
-    inbox.get(timeout=WAIT_S).answer(ANSWER)
+    first(inbox).answer(ANSWER)
     with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
         future.result(WAIT_S)
 
@@ -187,10 +214,10 @@ def test_answer_beyond_its_limit_is_refused(inbox: Inbox, ask: Ask) -> None:
     ],
 )
 def test_invalid_request_reaches_the_service_as_the_error_it_is(
-    payload: bytes, complaint: str, inbox: Inbox, ask: Ask
+    payload: bytes, complaint: str, inbox: Questions, ask: Ask
 ) -> None:
     future = ask(payload)
-    question = inbox.get(timeout=WAIT_S)
+    question = first(inbox)
     assert isinstance(question.request, InvalidMessage)
     assert complaint in str(question.request)
     question.answer(Problem(code="invalid", message=str(question.request)))
@@ -199,51 +226,51 @@ def test_invalid_request_reaches_the_service_as_the_error_it_is(
 
 
 def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) -> None:
-    inbox: queue.Queue[Any] = queue.Queue()
-    verb = Verb(StateRequest, 100, lambda request: request.learner.upper())
+    inbox: Inbox[Any] = Inbox(100, 1000)
+    verb = Verb(StateRequest, 100, prepare=lambda request: request.learner.upper())
     serve(router, RUN, {keys.STATE: verb}, inbox)
     future = ask()
-    question = inbox.get(timeout=WAIT_S)
+    question = first(inbox)
     assert question.request == "L"
     question.answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
 def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session, ask: Ask) -> None:
-    class FullAtFirst(queue.Queue[Any]):
+    class FullAtFirst(Inbox[Any]):
         refused = 0
 
-        def put_nowait(self, item: Any) -> None:
+        def put(self, item: Any, size: int, *, bulk: bool = False) -> bool:
             if not self.refused:
                 self.refused += 1
-                raise queue.Full
-            super().put_nowait(item)
+                return False
+            return super().put(item, size, bulk=bulk)
 
-    inbox = FullAtFirst()
+    inbox = FullAtFirst(100, 1000)
     serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox)
     future = ask()
-    inbox.get(timeout=WAIT_S).answer(ANSWER)
+    first(inbox).answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
     assert inbox.refused == 1
 
 
 def test_answer_to_somebody_who_is_gone_is_forgotten(
-    inbox: Inbox, router: zenoh.Session, endpoint: str
+    inbox: Questions, router: zenoh.Session, endpoint: str
 ) -> None:
     with connect(endpoint, patience_s=5.0) as client:
         client.get(keys.key(RUN, keys.STATE), payload=encode(REQUEST))
-        question = inbox.get(timeout=WAIT_S)
+        question = first(inbox)
     question.answer(ANSWER)
-    assert inbox.empty()
+    assert inbox.take(1, 1, 0.0) == []
 
 
 def test_service_that_undeclares_its_verbs_is_not_asked(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
-    inbox: Inbox = queue.Queue()
+    inbox: Inbox[Any] = Inbox(100, 1000)
     for queryable in serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox):
         queryable.undeclare()
     asker = Asker(client, RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable):
         asker.ask(keys.STATE, REQUEST, StateReply)
-    assert inbox.empty()
+    assert inbox.take(1, 1, 0.0) == []

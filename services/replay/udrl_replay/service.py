@@ -6,7 +6,6 @@ episode waits for none but its own.
 """
 
 import logging
-import queue
 import threading
 import time
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from udrl.errors import InvalidData, InvalidMessage, Refused
 from udrl_proto import keys
 from udrl_proto.answering import Question, Verb, serve
 from udrl_proto.codec import LARGEST, PAGE, encode
+from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
     Acknowledged,
     ChangesReply,
@@ -58,10 +58,10 @@ from udrl_replay.store import Store, Version
 
 log = logging.getLogger("udrl")
 
-#: Questions that may wait; more are dropped and asked again.
-_INBOX = 4096
-#: Questions handled in one transaction.
-_GROUP = 64
+#: Questions that may wait, and their bytes; more are dropped and asked again.
+_INBOX, _INBOX_BYTES = 4096, 512 << 20
+#: Questions handled in one transaction, and bytes after which no more are.
+_GROUP, _GROUP_BYTES = 64, 8 << 20
 #: Seconds that the service of an ended run stays, so that all its peers learn of the end.
 _LINGER_S = 10.0
 #: Seconds that it stays when nobody is left.
@@ -109,7 +109,7 @@ class ReplayService:
         self._store = store
         self._metrics = MetricsFile(run_dir, store)
         self._metrics.update(self.run.progress.iteration)
-        self._inbox: queue.Queue[Question | _Presence] = queue.Queue(_INBOX)
+        self._inbox: Inbox[Question | _Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
         self._waits = Waits()
         self._here: set[tuple[str, str]] = set()
@@ -156,7 +156,8 @@ class ReplayService:
     def _answer_until_ended(self, stop: threading.Event) -> None:
         ended_at: float | None = None
         while not stop.is_set():
-            self._answer(self._next_group())
+            # Waits for a quarter of a second at most: time passes also when nobody asks.
+            self._answer(self._inbox.take(_GROUP, _GROUP_BYTES, 0.25))
             now = time.monotonic()
             if self.run.progress.state in ("ended", "failed"):
                 ended_at = ended_at or now
@@ -185,11 +186,11 @@ class ReplayService:
             keys.HELLO: Verb(HelloRequest, _OVERHEAD),
             keys.JOIN: Verb(JoinRequest, 1 << 16),
             keys.COMMANDS: Verb(CommandsRequest, 1 << 20),
-            keys.EPISODE: Verb(EpisodeMessage, steps + _OVERHEAD, arrive),
+            keys.EPISODE: Verb(EpisodeMessage, steps + _OVERHEAD, bulk=True, prepare=arrive),
             keys.FAILURE: Verb(FailureMessage, 1 << 16),
             keys.CHANGES: Verb(ChangesRequest, _OVERHEAD),
             keys.EPISODES: Verb(EpisodesRequest, PAGE),
-            keys.VERSION: Verb(VersionMessage, LARGEST, check),
+            keys.VERSION: Verb(VersionMessage, LARGEST, prepare=check),
             keys.STATE: Verb(StateRequest, _OVERHEAD),
             keys.WEIGHTS: Verb(WeightsRequest, _OVERHEAD),
             keys.STATUS: Verb(StatusRequest, _OVERHEAD),
@@ -198,18 +199,7 @@ class ReplayService:
     def _presence(self, sample: zenoh.Sample) -> None:
         _, _, token = keys.parse(str(sample.key_expr))
         _, role, name = token.split("/", 2)
-        self._inbox.put(_Presence(role, name, sample.kind == zenoh.SampleKind.PUT))
-
-    def _next_group(self) -> list[Question | _Presence]:
-        """Return what waits in the inbox, after at most a quarter of a second."""
-        group: list[Question | _Presence] = []
-        try:
-            group.append(self._inbox.get(timeout=0.25))
-            while len(group) < _GROUP:
-                group.append(self._inbox.get_nowait())
-        except queue.Empty:
-            pass
-        return group
+        self._inbox.must_put(_Presence(role, name, sample.kind == zenoh.SampleKind.PUT))
 
     def _answer(self, group: list[Question | _Presence]) -> None:
         now = time.monotonic()
