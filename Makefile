@@ -45,7 +45,7 @@ soak: setup-dev  ## Half an hour of a run: memory, descriptors, threads (docs/re
 	$(VENV)/bin/python benchmarks/soak.py $(ARGS)
 
 fuzz: setup-dev  ## A million inputs for every decoder and queryable (SECURITY.md).
-	$(PIP_INSTALL) --editable '.[box2d,plot,secure,dev,fuzz]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure,dev,fuzz]'
 	$(VENV)/bin/python -m tests.fuzz coverage $(ARGS)
 	$(VENV)/bin/python -m tests.fuzz hypothesis $(ARGS)
 
@@ -56,11 +56,11 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(PIP_INSTALL) --editable '.[box2d,plot,secure]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[box2d,plot,secure,dev]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure,dev]'
 	touch $@
 
 clean:

@@ -59,7 +59,7 @@ def spec_of(kilobytes: int) -> EnvironmentSpec:
     """Return an environment whose longest episode has so many kilobytes."""
     size = 8 if kilobytes < 100 else 256
     return EnvironmentSpec(
-        observation_size=size, n_actions=4, max_episode_steps=kilobytes * 1000 // (4 * size + 5)
+        observation_shape=(size,), n_actions=4, max_episode_steps=kilobytes * 1000 // (4 * size + 5)
     )
 
 

@@ -252,7 +252,7 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
 
     behavior = initialise(config, spec)
     rows = config.inference_rows
-    observation, command = torch.zeros(rows, spec.observation_size), torch.zeros(rows, 2)
+    observation, command = torch.zeros(rows, *spec.observation_shape), torch.zeros(rows, 2)
     with torch.inference_mode():
         inference = _seconds(lambda: behavior(observation, command), 5000) / rows
 

@@ -11,7 +11,8 @@
 
 The behavior function is evaluated for all environments in one call, padded to a fixed number of
 rows. Which rows stand beside it does not change a row's result (:mod:`udrl.numerics` checks), so an
-episode depends on its command alone.
+episode depends on its command alone. With a ``frame_stack`` of more than 1 it sees the episode's
+most recent observations (:func:`udrl.episode.recent`).
 """
 
 import contextlib
@@ -23,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from udrl.behavior import Acting, BehaviorFunction
+from udrl.behavior import Acting, BehaviorFunction, stacked_shape
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments.making import (
@@ -33,7 +34,7 @@ from udrl.environments.making import (
     make_environment,
     specify,
 )
-from udrl.episode import Episode, action_dtype
+from udrl.episode import Episode, action_dtype, recent
 from udrl.errors import EnvironmentFault
 from udrl.streams import Stream
 
@@ -41,6 +42,7 @@ from udrl.streams import Stream
 MAX_FAILURES = 3
 
 _FIRST_CAPACITY = 1024
+_FIRST_BYTES = 64 << 20
 
 _Rows = npt.NDArray[np.int64]
 
@@ -79,6 +81,7 @@ class EpisodeGenerator:
         make: Callable[[Config], Environment] = make_environment,
     ) -> None:
         self._config = config
+        self._frame_stack = config.frame_stack
         self._make = make
         self._envs = [make(config) for _ in range(n_environments)]
         self.spec: EnvironmentSpec = specify(self._envs[0], config)
@@ -89,27 +92,34 @@ class EpisodeGenerator:
         self._greedy: list[int] = []
 
         # What the network reads in one call. See training._Batch for why torch owns it.
-        self._inference_rows = config.inference_rows
-        self._observation_in = torch.zeros(self._inference_rows, self.spec.observation_size)
-        self._command_in = torch.zeros(self._inference_rows, 2)
+        self._inference_rows = rows = config.inference_rows
+        dtype = np.dtype(self.spec.observation_dtype)
+        self._observation_in = torch.from_numpy(np.zeros(0, dtype)).new_zeros(
+            rows, *stacked_shape(self.spec, config)
+        )
+        self._command_in = torch.zeros(rows, 2)
 
         # s_t, c_t = (dr_t, dh_t), c_t bounded and scaled, r_t, and the logits of P(a | s_t, c_t).
-        self._observation = np.zeros((n_environments, self.spec.observation_size), np.float32)
+        self._observation = np.zeros((n_environments, *self.spec.observation_shape), dtype)
         self._desired = np.zeros((n_environments, 2))
         self._command = np.zeros((n_environments, 2), np.float32)
         self._reward = np.zeros(n_environments, np.float32)
         self._logits = np.zeros((n_environments, self.spec.n_actions))
         self._cap = np.full(n_environments, np.inf)
-        self._least = np.array([-np.inf, 1.0])
+        self._horizon_is_return = config.desired_horizon == "return"
+        self._least = np.array([1.0 if self._horizon_is_return else -np.inf, 1.0])
         self._scales = np.array([config.return_scale, config.horizon_scale])
 
         # A ring of rounds: round k of all environments is kept at k % capacity, until the longest
         # running episode needs more.
         self._round = 0
-        self._began = [0] * n_environments
-        self._capacity = min(self.spec.max_episode_steps, _FIRST_CAPACITY)
+        self._began = np.zeros(n_environments, np.int64)
+        round_bytes = n_environments * self.spec.step_bytes
+        self._capacity = min(
+            self.spec.max_episode_steps, _FIRST_CAPACITY, max(64, _FIRST_BYTES // round_bytes)
+        )
         shape = (self._capacity, n_environments)
-        self._observations = np.zeros((*shape, self.spec.observation_size), np.float32)
+        self._observations = np.zeros((*shape, *self.spec.observation_shape), dtype)
         self._actions = np.zeros(shape, action_dtype(self.spec.n_actions))
         self._rewards = np.zeros(shape, np.float32)
         self._uniforms = np.zeros(shape)
@@ -203,15 +213,18 @@ class EpisodeGenerator:
         desired, command, logits = self._desired, self._command, self._logits
         if self.spec.max_return is not None:
             np.minimum(desired[:, 0], self._cap, out=desired[:, 0])
+        if self._horizon_is_return:
+            np.floor(desired[:, 0], out=desired[:, 1])
         np.multiply(
             np.maximum(desired, self._least), self._scales, out=command, casting="same_kind"
         )
         if self._calls is None:
             self._calls = self._plan_calls()
+        observation = self._observation if self._frame_stack == 1 else self._stacks()
         observation_in, command_in = self._observation_in.numpy(), self._command_in.numpy()
         with torch.inference_mode():
             for act, rows, padded in self._calls:
-                self._observation.take(padded, axis=0, out=observation_in, mode="clip")
+                observation.take(padded, axis=0, out=observation_in, mode="clip")
                 command.take(padded, axis=0, out=command_in, mode="clip")
                 logits[rows] = act(self._observation_in, self._command_in).numpy()[: len(rows)]
         weights = np.exp(logits - np.maximum.reduce(logits, axis=1, keepdims=True))
@@ -222,6 +235,16 @@ class EpisodeGenerator:
         if self._greedy:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
         return actions
+
+    def _stacks(self) -> npt.NDArray[np.generic]:
+        """Return what the network sees now in every environment."""
+        t = recent(self._round - self._began, self._frame_stack)
+        rounds = (self._began[:, None] + t) % self._capacity
+        frames = self._observations[rounds, np.arange(len(rounds))[:, None]]
+        stacks: npt.NDArray[np.generic] = frames.reshape(
+            len(frames), *self._observation_in.shape[1:]
+        )
+        return stacks
 
     def _plan_calls(self) -> list[_Call]:
         """Gather the rows of each weights version into calls of at most ``inference_rows``."""
@@ -240,7 +263,8 @@ class EpisodeGenerator:
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
         command = self._command_of(row)
-        places = self._places(self._began[row], self._round - self._began[row])
+        began = int(self._began[row])
+        places = self._places(began, self._round - began)
         episode = Episode(
             command_id=command.id,
             observations=self._observations[places, row],
@@ -276,7 +300,7 @@ class EpisodeGenerator:
     def _lay_out_uniforms(self, row: int, command: Command) -> None:
         """Put number t of the command's stream where step t of its episode will look."""
         numbers = Stream(command.stream_key).uniforms(self._capacity)
-        self._uniforms[self._places(self._began[row], self._capacity), row] = numbers
+        self._uniforms[self._places(int(self._began[row]), self._capacity), row] = numbers
 
     def _make_room(self) -> None:
         """Make the ring twice as long if an episode would overwrite its own beginning."""

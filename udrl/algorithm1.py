@@ -13,7 +13,7 @@ from udrl.digests import Digest, episode_digest, replay_digest, tensors_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
-from udrl.numerics import use_one_thread
+from udrl.numerics import settle, use_one_thread
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
@@ -81,6 +81,7 @@ def algorithm1(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
     use_one_thread()
+    config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
     sample = CommandSampler(config, generator.spec.max_episode_steps)
 
@@ -104,11 +105,11 @@ def algorithm1(
         exploratory = sample.explore(run.iteration, run.buffer)
         evaluation = sample.evaluate(run.iteration, run.buffer) if due else []
         # 6: generate episodes using Algorithm 2 and add to replay buffer
-        before = run.env_steps
-        run.add(generate_episodes(generator, exploratory, run.state.behavior))
+        before, behavior = run.env_steps, run.state.acting()
+        run.add(generate_episodes(generator, exploratory, behavior))
         # 7-9: if evaluation required, evaluate current agent using Algorithm 2
         if due:
-            episodes = generate_episodes(generator, evaluation, run.state.behavior)
+            episodes = generate_episodes(generator, evaluation, behavior)
             run.evaluations[run.iteration] = summarise([e.episode_return for e in episodes])
         due = evaluation_due(run.iteration, before, run.env_steps, config.eval_every)
         stop = run.env_steps >= budget.max_env_steps or _lands(run, budget)

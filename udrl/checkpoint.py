@@ -56,7 +56,7 @@ def decode_state(
     Raises:
         InvalidWeights: the bytes are not those of such a state.
     """
-    behavior = decode_weights(weights, config, spec)
+    behavior = decode_weights(weights, config, spec).to(config.device)
     expected: dict[str, Tensor] = {}
     for name, parameter in behavior.named_parameters():
         expected |= {f"{moment}.{name}": parameter.detach() for moment in _MOMENTS}
@@ -64,7 +64,9 @@ def decode_state(
     tensors = _decode(optimizer, expected)
     adam = make_optimizer(behavior, config)
     for name, parameter in behavior.named_parameters():
-        adam.state[parameter] = {k: tensors[f"{k}.{name}"] for k in ("step", *_MOMENTS)}
+        adam.state[parameter] = {
+            k: tensors[f"{k}.{name}"].to(config.device) for k in ("step", *_MOMENTS)
+        }
     return TrainingState(version, behavior, adam)
 
 

@@ -22,6 +22,9 @@ from udrl.errors import ConfigError
 PositiveInt = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**31)]
 Scale = Annotated[float, Meta(gt=0, le=1e6)]
+Widths = Annotated[
+    tuple[Annotated[int, Meta(ge=1, le=65_536)], ...], Meta(min_length=1, max_length=16)
+]
 KeywordValue = bool | int | float | str
 
 Settings = TypeVar("Settings", bound=msgspec.Struct)
@@ -43,6 +46,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         seed: the seed that every random stream is keyed by.
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
         batch_size: examples in one update.
+        desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
+            length of the best episodes; or ``return``: as many steps as return, as an integer,
+            where each step gives a reward of 1 (TakeCover, 3.1).
         horizon_scale: factor on the desired horizon at the network's input.
         horizon_spread: how far desired horizons of exploratory commands are spread around the mean
             length of the best episodes, as a part of it; 0 is the paper's.
@@ -58,13 +64,21 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             0 is the paper's.
         return_scale: factor on the desired return at the network's input.
         segments: ``trailing`` segments only (the paper's experiments) or ``all`` (2.3.3).
-        hidden: units of each layer; the first is multiplied with the embedded command (3.2).
+        frame_stack: most recent observations that the network sees at once, one after another
+            along the first dimension; before an episode's first there is the first again.
+        convolutions: channels of each convolutional layer, for images (3.2, B.2).
+        hidden: units of each fully connected layer; for vectors, the first is multiplied with the
+            embedded command (3.2).
         activation: of the hidden layers.
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
         eval_every: env steps between two evaluations.
         eval_episodes: episodes in one evaluation.
         eval_greedy: act by the mode of the action distribution in evaluations (2.3.6).
         inference_rows: rows that every inference call is padded to.
+        precision: what the network computes in; weights and optimizer are float32 always.
+            ``auto``: bfloat16 if the machine that creates the run is fast in it.
+        device: what the learner trains on; ``auto``: ``cuda`` if the machine that creates the run
+            has it.
     """
 
     environment: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -76,6 +90,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     lead: Annotated[int, Meta(ge=0, le=64)] = 0
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
+    desired_horizon: Literal["mean", "return"] = "mean"
     horizon_scale: Scale = 0.01
     horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
     last_few: PositiveInt = 75
@@ -89,9 +104,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     return_scale: Scale = 0.025
 
     segments: Literal["trailing", "all"] = "trailing"
-    hidden: Annotated[
-        tuple[Annotated[int, Meta(ge=1, le=65_536)], ...], Meta(min_length=1, max_length=16)
-    ] = (32, 128, 128, 128)
+    frame_stack: Annotated[int, Meta(ge=1, le=64)] = 1
+    convolutions: Widths = (32, 48, 96, 128)
+    hidden: Widths = (32, 128, 128, 128)
     activation: Literal["relu", "tanh"] = "relu"
     initialisation: Literal["orthogonal", "uniform"] = "orthogonal"
 
@@ -100,6 +115,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     eval_greedy: bool = False
 
     inference_rows: Annotated[int, Meta(ge=16, le=4096)] = 16
+    precision: Literal["auto", "float32", "bfloat16"] = "float32"
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
         _refuse_non_finite(self)
@@ -108,6 +125,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 f"last_few = {self.last_few}: must be at most replay_size = {self.replay_size}, "
                 f"because exploratory commands are drawn from the replay buffer; "
                 f"lower last_few or raise replay_size"
+            )
+        if self.desired_horizon == "return" and self.horizon_spread:
+            raise ConfigError(
+                f"horizon_spread = {self.horizon_spread}: with desired_horizon = 'return' horizons "
+                f"are as long as returns are high; set horizon_spread = 0"
             )
 
 

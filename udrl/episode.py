@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Observations = npt.NDArray[np.float32]
+Observations = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
 Actions = npt.NDArray[np.integer[Any]]
 Rewards = npt.NDArray[np.float32]
 
@@ -15,6 +15,21 @@ Rewards = npt.NDArray[np.float32]
 def action_dtype(n_actions: int) -> type[np.uint8] | type[np.int32]:
     """Return the dtype that actions are kept in: the smaller of the two that holds them."""
     return np.uint8 if n_actions <= 256 else np.int32
+
+
+def recent(t: npt.NDArray[np.int64], frame_stack: int) -> npt.NDArray[np.int64]:
+    """Return the times of the observations that the network sees at times ``t``.
+
+    Args:
+        t: int64 [n].
+        frame_stack: how many.
+
+    Returns:
+        int64 [n, frame_stack]: t - frame_stack + 1 to t; 0 for those before the episode, so that
+        its first observation stands in for what was not observed.
+    """
+    times: npt.NDArray[np.int64] = np.maximum(t[:, None] - np.arange(frame_stack)[::-1], 0)
+    return times
 
 
 def cumulative(rewards: Rewards) -> npt.NDArray[np.float64]:
@@ -31,7 +46,9 @@ class Episode:
 
     Attributes:
         command_id: the id of the command that it answers, and its own.
-        observations: s_t, float32 [T, observation_size].
+        observations: what the environment showed at each step, [T, *observation_shape]: float32
+            vectors or uint8 images. With ``frame_stack`` 1 they are the s_t; else s_t is built of
+            them by :func:`recent`.
         actions: a_t, uint8 or int32 [T].
         rewards: r_t, float32 [T], rounded once, at the environment.
         terminated: the environment reached a terminal state.

@@ -7,18 +7,21 @@ class*, the digest of a fixed probe, is the same (:func:`acting_class`, :func:`t
 """
 
 import hashlib
+import math
+import os
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import BehaviorFunction, initialise
+from udrl.behavior import BehaviorFunction, initialise, stacked_shape
 from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
 from udrl.digests import arrays_digest, episode_digest, tensors_digest
 from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Episode, action_dtype
+from udrl.episode import Episode, Observations, action_dtype
 from udrl.errors import InexactArithmetic
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
@@ -35,18 +38,58 @@ def use_one_thread() -> None:
     """Let torch compute deterministically in one thread, as every role of a run does."""
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # CUDA's matrix products too
     torch.use_deterministic_algorithms(mode=True)
+
+
+def settle(config: Config) -> Config:
+    """Return the settings of a new run: what says ``auto`` is chosen for this machine."""
+    device, precision = config.device, config.precision
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    if precision == "auto":
+        precision = "bfloat16" if _is_fast_in_bfloat16() else "float32"
+    return msgspec.structs.replace(config, device=device, precision=precision)
+
+
+def settle_as(held: Config, config: Config) -> Config:
+    """Return settings with what says ``auto`` as it was chosen for another run."""
+    chosen = {n: getattr(held, n) for n in ("device", "precision") if getattr(config, n) == "auto"}
+    return msgspec.structs.replace(config, **chosen)
+
+
+def _is_fast_in_bfloat16() -> bool:
+    """Say whether this processor has instructions for it; where nobody tells, it has not.
+
+    Acting is done on the CPU, also where a GPU trains.
+    """
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
+    except OSError:
+        return False
+    return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 
 def _probe_stream(index: int) -> Stream:
     return Stream(stream_key(0, Purpose.PROBE, 0, index))
 
 
-def _probe_rows(spec: EnvironmentSpec, rows: int) -> tuple[torch.Tensor, torch.Tensor]:
-    observation = _probe_stream(0).uniforms(rows * spec.observation_size) * 4 - 2
+def _probe_observations(
+    stream: Stream, n: int, shape: tuple[int, ...], *, images: bool
+) -> Observations:
+    """Return noise: bytes, or numbers in [-2, 2)."""
+    uniforms = stream.uniforms(n * math.prod(shape)).reshape(n, *shape)
+    return (uniforms * 256).astype(np.uint8) if images else (uniforms * 4 - 2).astype(np.float32)
+
+
+def _probe_rows(config: Config, spec: EnvironmentSpec) -> tuple[torch.Tensor, torch.Tensor]:
+    rows = config.inference_rows
+    observation = _probe_observations(
+        _probe_stream(0), rows, stacked_shape(spec, config), images=spec.is_image
+    )
     command = _probe_stream(1).uniforms(rows * 2) * 4 - 2
     return (
-        torch.tensor(observation.reshape(rows, -1), dtype=torch.float32),
+        torch.tensor(observation),
         torch.tensor(command.reshape(rows, 2), dtype=torch.float32),
     )
 
@@ -59,17 +102,15 @@ def check_batch_invariance(config: Config, spec: EnvironmentSpec, tries: int = 8
     """
     behavior = initialise(config, spec).frozen()
     rows = config.inference_rows
-    observation, command = _probe_rows(spec, rows)
+    observation, command = _probe_rows(config, spec)
     with torch.inference_mode():
         expected = behavior(observation, command)
         for index in range(tries):
             order = torch.from_numpy(np.argsort(_probe_stream(2 + index).uniforms(rows)))
             changed = behavior(observation[order].clone(), command[order].clone())
-            neighbours = behavior(
-                torch.where(order[:, None] % 2 == 0, observation, observation.flip(0)),
-                torch.where(order[:, None] % 2 == 0, command, command.flip(0)),
-            )
             kept = order % 2 == 0
+            others = torch.where(kept, torch.arange(rows), torch.arange(rows).flip(0))
+            neighbours = behavior(observation[others].clone(), command[others].clone())
             if not (
                 torch.equal(changed, expected[order])
                 and torch.equal(neighbours[kept], expected[kept])
@@ -86,7 +127,7 @@ def acting_class(config: Config, generator: EpisodeGenerator) -> str:
     spec = generator.spec
     behavior = initialise(config, spec)
     with torch.inference_mode():
-        logits = behavior.frozen()(*_probe_rows(spec, config.inference_rows))
+        logits = behavior.frozen()(*_probe_rows(config, spec))
     episode = _short_episode(config, generator, behavior, index=0)
     sha = hashlib.sha256(arrays_digest({"logits": logits.numpy()}))
     sha.update(episode_digest(episode))
@@ -100,10 +141,10 @@ def training_class(config: Config, spec: EnvironmentSpec) -> str:
     )
     stream = _probe_stream(1000)
     length = min(_PROBE_STEPS, spec.max_episode_steps)
-    observations = stream.uniforms(length * spec.observation_size).reshape(length, -1)
+    observations = _probe_observations(stream, length, spec.observation_shape, images=spec.is_image)
     episode = Episode(
         command_id=0,
-        observations=observations.astype(np.float32),
+        observations=observations,
         actions=stream.integers(length, 0, spec.n_actions).astype(action_dtype(spec.n_actions)),
         rewards=stream.uniforms(length).astype(np.float32),
         terminated=True,

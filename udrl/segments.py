@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Actions, Episode, action_dtype
+from udrl.episode import Actions, Episode, Observations, action_dtype, recent
 
 _PAGE = 64
 
@@ -32,13 +32,13 @@ class Examples(NamedTuple):
     """Inputs and targets of the behavior function, one per row.
 
     Attributes:
-        observation: s_t1, float32 [n, observation_size].
+        observation: s_t1, [n, *stacked_shape]: float32 vectors or uint8 images.
         desired_return: float64 [n].
         desired_horizon: int64 [n], in steps.
         action: a_t1, uint8 or int32 [n].
     """
 
-    observation: npt.NDArray[np.float32]
+    observation: Observations
     desired_return: Numbers
     desired_horizon: Indices
     action: Actions
@@ -82,11 +82,13 @@ class Experience:
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
-        pages_per_episode = -(-spec.max_episode_steps // _PAGE)
+        longest = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
+        pages_per_episode = -(-longest // _PAGE)
         n_episodes = config.replay_size + config.recent_size
         n_pages = n_episodes * pages_per_episode
         steps = n_pages * _PAGE
-        self._observations = np.empty((steps, spec.observation_size), np.float32)
+        self._frame_stack = config.frame_stack
+        self._observations = np.empty((steps, *spec.observation_shape), spec.observation_dtype)
         self._actions = np.empty(steps, action_dtype(spec.n_actions))
         self._earned = np.empty(steps)  # P[t]: rewards earned before step t
         self._page_table = np.zeros((n_episodes, pages_per_episode), np.int64)
@@ -147,11 +149,20 @@ class RankedExperience:
         if len(inner):
             earned_at_t2[inner] = held._earned[self._row(slot[inner], segments.t2[inner])]
         return Examples(
-            observation=held._observations[row],
+            observation=self._observed(slot, segments.t1),
             desired_return=earned_at_t2 - held._earned[row],
             desired_horizon=segments.t2 - segments.t1,
             action=held._actions[row],
         )
+
+    def _observed(self, slot: Indices, t: Indices) -> Observations:
+        """Return what the network sees at times t: single observations, or stacks of them."""
+        held = self._experience
+        if held._frame_stack == 1:
+            return held._observations[self._row(slot, t)]
+        frames = held._observations[self._row(slot[:, None], recent(t, held._frame_stack))]
+        n, stack, first, *rest = frames.shape
+        return frames.reshape(n, stack * first, *rest)
 
     def _row(self, slot: Indices, t: Indices) -> Indices:
         page = self._experience._page_table[slot, t // _PAGE]

@@ -1,9 +1,11 @@
 """Section 2.3.3: a fixed number of Adam updates turns weights version v-1 into version v."""
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn import functional
 
 from udrl.behavior import BehaviorFunction, initialise
@@ -27,10 +29,16 @@ class TrainingState:
     optimizer: torch.optim.Adam
     loss: float = float("nan")
 
+    def acting(self) -> BehaviorFunction:
+        """Return the behavior function on the CPU, where acting is done."""
+        if self.behavior.action.weight.is_cpu:
+            return self.behavior
+        return copy.deepcopy(self.behavior).cpu()
+
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
     """Return version 0, a function of the seed."""
-    behavior = initialise(config, spec)
+    behavior = initialise(config, spec).to(config.device)
     return TrainingState(0, behavior, make_optimizer(behavior, config))
 
 
@@ -54,13 +62,11 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
     )
     batch = _Batch(config, state.behavior)
     parameters = list(state.behavior.parameters())
-    losses = torch.zeros((), dtype=torch.float64)
-    one = torch.ones(())
+    losses = torch.zeros((), dtype=torch.float64, device=config.device)
+    one = torch.ones((), device=config.device)
     for rank, t1, t2 in zip(*segments, strict=True):
-        batch.fill(experience, Segments(rank, t1, t2))
-        loss = functional.cross_entropy(
-            state.behavior(batch.observation, batch.command), batch.action
-        )
+        observation, command, action = batch.fill(experience, Segments(rank, t1, t2))
+        loss = functional.cross_entropy(state.behavior(observation, command), action)
         for parameter in parameters:
             parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
         loss.backward(one)
@@ -78,18 +84,25 @@ class _Batch:
     """
 
     def __init__(self, config: Config, behavior: BehaviorFunction) -> None:
-        n = config.batch_size
-        self.observation = torch.empty(n, behavior.observation.in_features)
-        self.command = torch.empty(n, 2)
-        self.action = torch.empty(n, dtype=torch.int64)
-        self._observation = self.observation.numpy()
-        self._command = self.command.numpy()
-        self._action = self.action.numpy()
+        n, shape = config.batch_size, behavior.observation_shape
+        dtype = torch.uint8 if behavior.is_convolutional else torch.float32
+        self._tensors = (
+            torch.empty(n, *shape, dtype=dtype),
+            torch.empty(n, 2),
+            torch.empty(n, dtype=torch.int64),
+        )
+        self._observation, self._command, self._action = (t.numpy() for t in self._tensors)
+        self._device = config.device
         self._scales = np.array([config.return_scale, config.horizon_scale])
 
-    def fill(self, experience: RankedExperience, segments: Segments) -> None:
+    def fill(
+        self, experience: RankedExperience, segments: Segments
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return observations, scaled commands and actions, where the network is."""
         examples = experience.examples(segments)
         self._observation[:] = examples.observation
         self._command[:, 0] = examples.desired_return * self._scales[0]
         self._command[:, 1] = examples.desired_horizon * self._scales[1]
         self._action[:] = examples.action
+        observation, command, action = (t.to(self._device) for t in self._tensors)
+        return observation, command, action

@@ -80,7 +80,7 @@ CONFIG = Config(
     eval_every=20_000,
 )
 ENVIRONMENT = EnvironmentSpec(
-    observation_size=4, n_actions=2, max_episode_steps=500, max_return=500.0
+    observation_shape=(4,), n_actions=2, max_episode_steps=500, max_return=500.0
 )
 EPISODE = Episode(
     command_id=5_000_003,

@@ -10,7 +10,7 @@ from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
 
-LANDER = EnvironmentSpec(observation_size=8, n_actions=4, max_episode_steps=1000)
+LANDER = EnvironmentSpec(observation_shape=(8,), n_actions=4, max_episode_steps=1000)
 
 # Appendix B.1, and the references' [32 gated, 128, 128, 128].
 ARCHITECTURES = [

@@ -29,7 +29,7 @@ CONFIG = build(
         "learning_rate": 1e-2,
     },
 )
-SPEC = EnvironmentSpec(observation_size=3, n_actions=2, max_episode_steps=20)
+SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=2, max_episode_steps=20)
 
 
 def experience() -> RankedExperience:

@@ -161,7 +161,7 @@ def test_figure_2_has_the_arrows_of_the_figure() -> None:
 
 def test_figure_2_is_seen_as_one_of_four_states() -> None:
     env = make("Figure2-v0")
-    assert specify(env, settings("Figure2-v0")).observation_size == 4
+    assert specify(env, settings("Figure2-v0")).observation_shape == (4,)
     observations = {tuple(env.reset(seed=seed)[0].tolist()) for seed in range(10)}
     assert observations == {(1, 0, 0, 0), (0, 1, 0, 0)}
 
@@ -176,7 +176,7 @@ def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
 
 def test_a_spec_says_what_the_algorithm_needs_to_know() -> None:
     spec = specify(make("LunarLander-v3"), settings("LunarLander-v3"))
-    assert spec.observation_size == 8
+    assert spec.observation_shape == (8,)
     assert spec.n_actions == 4
     assert spec.max_episode_steps == 1000
     assert spec.max_return is None
@@ -194,7 +194,7 @@ def test_the_greatest_return_is_the_settings_then_the_instances_then_the_metadat
 def test_a_discrete_observation_with_an_offset_becomes_one_hot(register: Register) -> None:
     name = register(lambda: Blank(spaces.Discrete(3, start=-1), spaces.Discrete(2)))
     env = make(name)
-    assert specify(env, settings(name)).observation_size == 3
+    assert specify(env, settings(name)).observation_shape == (3,)
     for seed in range(10):
         observation, _ = env.reset(seed=seed)
         env.unwrapped.observation_space.seed(seed)
@@ -217,8 +217,9 @@ def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register)
 @pytest.mark.parametrize(
     "space",
     [
-        spaces.Box(0, 255, (84, 84), np.uint8),
-        spaces.Box(0, 255, (84, 84, 3), np.uint8),
+        spaces.Box(0, 1, (84, 84), np.float32),
+        spaces.Box(0, 255, (84, 84, 3), np.int32),
+        spaces.Box(0, 255, (2, 84, 84, 3), np.uint8),
         spaces.Box(-1, 1, (), np.float32),
         spaces.Dict({"position": VECTOR}),
         spaces.Tuple((VECTOR,)),

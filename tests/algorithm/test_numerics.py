@@ -24,7 +24,7 @@ from udrl.numerics import (
     use_one_thread,
 )
 
-LANDER = EnvironmentSpec(observation_size=8, n_actions=4, max_episode_steps=1000)
+LANDER = EnvironmentSpec(observation_shape=(8,), n_actions=4, max_episode_steps=1000)
 
 
 def settings(environment: str = "CartPole-v1", **values: Any) -> Config:

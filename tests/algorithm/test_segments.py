@@ -23,7 +23,7 @@ def experience(replay_size: int, max_steps: int) -> Experience:
         Config, {"environment": "CartPole-v1", "replay_size": replay_size, "last_few": 1}
     )
     return Experience(
-        config, EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=max_steps)
+        config, EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=max_steps)
     )
 
 

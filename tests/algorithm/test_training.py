@@ -17,7 +17,7 @@ from udrl.segments import Experience, RankedExperience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import TrainingState, train, untrained
 
-SPEC = EnvironmentSpec(observation_size=3, n_actions=4, max_episode_steps=90)
+SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
 
 
 def settings(**values: Any) -> Config:

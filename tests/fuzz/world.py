@@ -175,7 +175,7 @@ class World:
         fields = msgpack.unpackb(data, strict_map_key=True)
         length = fields["rewards"]["shape"][0]
         assert 1 <= length <= self.spec.max_episode_steps
-        assert fields["observations"]["shape"] == [length, self.spec.observation_size]
+        assert fields["observations"]["shape"] == [length, *self.spec.observation_shape]
         assert fields["actions"]["shape"] == [length]
         for name, dtype in (("observations", "<f4"), ("actions", "|u1"), ("rewards", "<f4")):
             array = fields[name]

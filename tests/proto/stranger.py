@@ -90,7 +90,7 @@ def run_episode(
             desired = min(desired, spec["max_return"])
         row = [0.0] * spec["n_actions"]
         if weights is not None:
-            s = torch.zeros(config["inference_rows"], spec["observation_size"])
+            s = torch.zeros(config["inference_rows"], *spec["observation_shape"])
             c = torch.zeros(config["inference_rows"], 2)
             s[0] = torch.from_numpy(np.asarray(observation, np.float32))
             scaled = config["return_scale"] * desired, config["horizon_scale"] * max(horizon, 1.0)
@@ -134,7 +134,7 @@ def initial_weights(config: dict[str, Any], spec: dict[str, Any]) -> Weights:
     (u,) = numbers(stream_key(config["seed"], "initialise", 0, 0), 1)
     generator = torch.Generator().manual_seed(math.floor(u * 2**52))
     h = config["hidden"]
-    shapes = {"observation": (h[0], spec["observation_size"]), "command": (h[0], 2)}
+    shapes = {"observation": (h[0], *spec["observation_shape"]), "command": (h[0], 2)}
     shapes |= {f"layers.{i}": (h[i + 1], h[i]) for i in range(len(h) - 1)}
     shapes["action"] = (spec["n_actions"], h[-1])
     weights: dict[str, torch.Tensor] = {}
@@ -161,7 +161,7 @@ def numerics_class(hello: dict[str, Any]) -> str:
         drawn = np.array(numbers(stream_key(0, "probe", 0, index), n * width)) * 4 - 2
         return torch.from_numpy(drawn.reshape(n, width).astype(np.float32))
 
-    found = logits(weights, config, rows(0, spec["observation_size"]), rows(1, 2))
+    found = logits(weights, config, rows(0, *spec["observation_shape"]), rows(1, 2))
     n = min(64, spec["max_episode_steps"])
     command = {
         "kind": "explore",

@@ -163,7 +163,7 @@ def test_refusal_says_what_is_wrong(data: bytes, kind: type[Message], complaint:
 def test_specification_with_an_impossible_configuration_is_refused(
     setting: dict[str, Any], complaint: str
 ) -> None:
-    environment = {"observation_size": 1, "n_actions": 2, "max_episode_steps": 3}
+    environment = {"observation_shape": [1], "n_actions": 2, "max_episode_steps": 3}
     config = {"environment": "x", **setting}
     data = packed(protocol=1, software="", run_id="r", config=config, environment=environment)
     with pytest.raises(InvalidMessage, match=complaint):

@@ -31,7 +31,7 @@ from udrl_replay.store import Store, Version
 #: Several pages of a file.
 BLOB = bytes(range(256)) * 40
 MAX_AGE = 3
-SPEC = EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=4)
+SPEC = EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=4)
 
 
 def config(lead: int = 0) -> Config:

@@ -15,7 +15,7 @@ from udrl_proto.codec import decode, decode_episode, encode_array, encode_episod
 from udrl_proto.messages import Array, EpisodeMessage
 from udrl_replay.arrival import inspect
 
-SPEC = EnvironmentSpec(observation_size=2, n_actions=3, max_episode_steps=4)
+SPEC = EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=4)
 
 
 def episode(**changes: Any) -> Episode:

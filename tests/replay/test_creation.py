@@ -35,7 +35,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
         run_id=hello.run_id,
         config=TOY,
         environment=EnvironmentSpec(
-            observation_size=4, n_actions=3, max_episode_steps=2, max_return=2.0
+            observation_shape=(4,), n_actions=3, max_episode_steps=2, max_return=2.0
         ),
     )
     assert created.fact("progress", Progress) == Progress()

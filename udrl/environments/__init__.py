@@ -1,7 +1,8 @@
 """Environments: the paper's that Gymnasium lacks, and the one door to all others.
 
-Importing this package registers ``LunarLanderSparse-v3`` (section 3.4), ``Figure2-v0`` (the paper's
-toy) and ``Obedience-v0`` (obeying the command is trivial) with Gymnasium.
+Importing this package registers with Gymnasium ``TakeCover-v0`` (section 3.1), ``Doom-v0`` (any of
+ViZDoom's scenarios), ``LunarLanderSparse-v3`` (section 3.4), ``Figure2-v0`` (the paper's toy) and
+``Obedience-v0`` (obeying the command is trivial).
 """
 
 import gymnasium as gym
@@ -23,6 +24,14 @@ if "LunarLanderSparse-v3" not in gym.registry:
         entry_point="gymnasium.envs.box2d.lunar_lander:LunarLander",
         max_episode_steps=1000,
         additional_wrappers=(RewardAtEnd.wrapper_spec(),),
+    )
+    _DOOM = "udrl.environments.doom:Doom"
+    gym.register("Doom-v0", entry_point=_DOOM)
+    gym.register(
+        "TakeCover-v0",
+        entry_point=_DOOM,
+        max_episode_steps=2100,
+        kwargs={"scenario": "take_cover", "max_return": 2100.0},
     )
     gym.register("Figure2-v0", entry_point="udrl.environments.figure2:Figure2", max_episode_steps=2)
     gym.register(

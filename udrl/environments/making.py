@@ -1,39 +1,58 @@
 """Making an environment from a run's settings, and saying what it looks like to the algorithm.
 
-However an environment presents itself, the algorithm sees observations that are float32 vectors
-and actions 0..n-1: a ``Discrete`` observation becomes one-hot, a ``Discrete`` action space with an
-offset is shifted to 0. Everything else is refused, with what is supported.
+However an environment presents itself, the algorithm sees observations that are float32 vectors or
+uint8 images with the channels first, and actions 0..n-1: a ``Discrete`` observation becomes
+one-hot, an image's channels are moved, a ``Discrete`` action space with an offset is shifted to 0.
+Everything else is refused, with what is supported.
 """
 
-from typing import Any
+import math
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 import msgspec
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
+from msgspec import Meta
 
 from udrl.config import Config
 from udrl.errors import UnsupportedEnvironment
 
 Environment = gym.Env[Any, Any]
 
-_EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot"}
+_EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot", "vizdoom": "doom"}
+
+Size = Annotated[int, Meta(ge=1, le=2**20)]
 
 
 class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the algorithm knows of an environment.
 
     Attributes:
-        observation_size: length of the float32 observation vector.
+        observation_shape: [size] of a vector, or [channels, height, width] of an image.
+        observation_dtype: ``float32`` of vectors, ``uint8`` of images.
         n_actions: actions are 0..n_actions-1.
         max_episode_steps: steps after which an episode is truncated.
         max_return: the greatest return possible, if declared (caps evaluation commands, 2.3.2).
     """
 
-    observation_size: int
+    observation_shape: Annotated[tuple[Size, ...], Meta(min_length=1, max_length=3)]
+    observation_dtype: Literal["float32", "uint8"] = "float32"
     n_actions: int
     max_episode_steps: int
     max_return: float | None = None
+
+    @property
+    def is_image(self) -> bool:
+        """Whether observations are images."""
+        return self.observation_dtype == "uint8"
+
+    @property
+    def step_bytes(self) -> int:
+        """Bytes of one observation, action and reward, as they are sent and stored, at most."""
+        size = math.prod(self.observation_shape)
+        return size * np.dtype(self.observation_dtype).itemsize + 8
 
 
 def make_environment(config: Config) -> Environment:
@@ -65,7 +84,7 @@ def make_environment(config: Config) -> Environment:
             f"environment {name!r} has no step limit, so an episode might never end; "
             f"set max_episode_steps, e.g. --set max_episode_steps=1000"
         )
-    return _with_plain_actions(_with_vector_observations(env, name), name)
+    return _with_plain_actions(_with_plain_observations(env, name), name)
 
 
 def _remedy(error: Exception) -> str:
@@ -75,17 +94,38 @@ def _remedy(error: Exception) -> str:
     return "install the package that provides it"
 
 
-def _with_vector_observations(env: Environment, name: str) -> Environment:
+def _with_plain_observations(env: Environment, name: str) -> Environment:
     space = env.observation_space
     if isinstance(space, spaces.Discrete):
         return gym.wrappers.FlattenObservation(env)
-    if isinstance(space, spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0:
-        return env
+    if isinstance(space, spaces.Box) and min(space.shape, default=0) > 0:
+        if len(space.shape) == 1:
+            return env
+        if len(space.shape) in (2, 3) and space.dtype == np.uint8:
+            return _with_channels_first(env, space)
     env.close()
     raise UnsupportedEnvironment(
-        f"environment {name!r} has observations {space}; supported are Box vectors "
-        f"(one dimension) and Discrete; wrap it, e.g. in gymnasium.wrappers.FlattenObservation"
+        f"environment {name!r} has observations {space}; supported are Box vectors (one "
+        f"dimension), Box images of uint8 (two or three dimensions) and Discrete; wrap it, e.g. "
+        f"in gymnasium.wrappers.FlattenObservation"
     )
+
+
+def _with_channels_first(env: Environment, space: spaces.Box) -> Environment:
+    """Return an environment of images as [channels, height, width].
+
+    Which dimension holds the channels, nobody declares; as everywhere, it is the smallest.
+    """
+    shape = space.shape
+    if len(shape) == 3 and shape[0] <= min(shape):
+        return env
+
+    def move(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
+
+    channels = 1 if len(shape) == 2 else shape[-1]
+    moved = spaces.Box(0, 255, (channels, *shape[:2]), np.uint8)
+    return gym.wrappers.TransformObservation(env, move, moved)
 
 
 def _with_plain_actions(env: Environment, name: str) -> Environment:
@@ -112,7 +152,8 @@ def specify(env: Environment, config: Config) -> EnvironmentSpec:
     declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
     max_return = config.max_return if config.max_return is not None else declared
     return EnvironmentSpec(
-        observation_size=int(np.prod(env.observation_space.shape)),
+        observation_shape=env.observation_space.shape,
+        observation_dtype="uint8" if len(env.observation_space.shape) == 3 else "float32",
         n_actions=int(env.action_space.n),
         max_episode_steps=env.spec.max_episode_steps,
         max_return=None if max_return is None else float(max_return),

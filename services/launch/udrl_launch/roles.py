@@ -65,6 +65,7 @@ def replay(
         StoreError: the run's file cannot be written.
         RunFailed: the run cannot go on, or an actor lied (Deceived).
     """
+    run_dir = run_dir.absolute()  # environments may change the working directory for a moment
     with closing(store):
         endpoint = listen or connect
         assert endpoint is not None

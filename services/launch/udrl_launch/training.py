@@ -18,7 +18,7 @@ from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
 from udrl_proto.messages import Status, StatusRequest
-from udrl_replay.creation import create, exists, resume, write_config
+from udrl_replay.creation import config_of, create, exists, resume, write_config
 from udrl_replay.run import Run
 
 log = logging.getLogger("udrl")
@@ -74,7 +74,7 @@ def train(
         store = create(run_dir, config, allow_inexact=allow_inexact)
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
-        write_config(run_dir, config, budget)
+        write_config(run_dir, config_of(store), budget)
         if Run(store, budget).progress.state == "ended":
             return read_status(run_dir)
         unless_it_goes_on.pop_all()

@@ -61,7 +61,7 @@ def _check(episode: Episode, spec: EnvironmentSpec) -> None:
             f"dimension of 1 to {spec.max_episode_steps} steps"
         )
     expected = {
-        "observations": (np.dtype(np.float32), (length, spec.observation_size)),
+        "observations": (np.dtype(spec.observation_dtype), (length, *spec.observation_shape)),
         "actions": (np.dtype(action_dtype(spec.n_actions)), (length,)),
         "rewards": (np.dtype(np.float32), (length,)),
     }

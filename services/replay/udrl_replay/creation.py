@@ -14,7 +14,7 @@ import udrl
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
 from udrl.errors import OtherConfiguration, StoreError
-from udrl.numerics import environment_replays
+from udrl.numerics import environment_replays, settle, settle_as
 from udrl_proto import PROTOCOL
 from udrl_proto.messages import Hello
 from udrl_replay.run import Progress
@@ -41,13 +41,14 @@ def _slug(text: str) -> str:
 def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:
     """Make a new run.
 
-    The environment is made once and asked to replay an episode after another one; if it cannot,
-    the run is marked inexact, and goes on.
+    What the settings leave to the machine is chosen. The environment is made once and asked to
+    replay an episode after another one; if it cannot, the run is marked inexact, and goes on.
 
     Raises:
         UnsupportedEnvironment: the environment does not exist or is not supported.
         StoreError: the directory holds a run already, or cannot be written.
     """
+    config = settle(config)
     generator = EpisodeGenerator(config, 1)
     exact = environment_replays(config, generator)
     generator.close()
@@ -79,7 +80,7 @@ def resume(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
     with _closed_on_error(store):
         hello = store.fact("hello", Hello)
         held = msgspec.to_builtins(hello.config)
-        asked = msgspec.to_builtins(config)
+        asked = msgspec.to_builtins(settle_as(hello.config, config))
         different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
         if different:
             raise OtherConfiguration(
@@ -101,8 +102,18 @@ def _closed_on_error(store: Store) -> Iterator[None]:
         raise
 
 
+def config_of(store: Store) -> Config:
+    """Return the settings of a run, with nothing left to the machine."""
+    return store.fact("hello", Hello).config
+
+
 def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
     """Write the effective configuration, as TOML that ``--config`` reads.
+
+    Args:
+        run_dir: where to.
+        config: the run's.
+        budget: when it ends.
 
     Raises:
         StoreError: it cannot be written; a file that was there before is still there.

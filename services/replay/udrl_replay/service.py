@@ -181,7 +181,7 @@ class ReplayService:
             except InvalidMessage as error:
                 return Malformed(message.actor, error)
 
-        steps = spec.max_episode_steps * (4 * spec.observation_size + 8)
+        steps = spec.max_episode_steps * spec.step_bytes
         return {
             keys.HELLO: Verb(HelloRequest, _OVERHEAD),
             keys.JOIN: Verb(JoinRequest, 1 << 16),

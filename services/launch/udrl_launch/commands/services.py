@@ -30,7 +30,7 @@ from udrl_launch.settings import Settings
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
-from udrl_replay.creation import create, exists, resume, write_config
+from udrl_replay.creation import config_of, create, exists, resume, write_config
 
 log = logging.getLogger("udrl")
 
@@ -96,7 +96,7 @@ def _open(run_dir: Path, settings: Settings, *, go_on: bool, allow_inexact: bool
         store = resume(run_dir, settings.config, allow_inexact=allow_inexact)
     else:
         store = create(run_dir, settings.config, allow_inexact=allow_inexact)
-    write_config(run_dir, settings.config, settings.budget)
+    write_config(run_dir, config_of(store), settings.budget)
     return store
 
 

@@ -1,0 +1,269 @@
+"""TakeCover and the other scenarios of ViZDoom: exact, well behaved, and gone with their owner."""
+
+import builtins
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from udrl.acting import EpisodeGenerator, Failure, generate_episodes
+from udrl.commands import Command, CommandSampler
+from udrl.config import Config, build
+from udrl.digests import episode_digest
+from udrl.environments import make_environment, specify
+from udrl.environments.doom import Doom
+from udrl.environments.downsampling import AreaAverage
+from udrl.errors import UnsupportedEnvironment
+
+
+def take_cover(**changes: Any) -> Config:
+    return build(Config, {"environment": "TakeCover-v0", "max_episode_steps": 60} | changes)
+
+
+@pytest.fixture
+def doom() -> Iterator[Callable[..., Doom]]:
+    opened: list[Doom] = []
+
+    def open_one(**options: Any) -> Doom:
+        opened.append(Doom(**options))
+        return opened[-1]
+
+    yield open_one
+    for one in opened:
+        one.close()
+
+
+def engines(owner: int) -> list[int]:
+    """Return the engines that a process started, or that lost it."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            command = (entry / "cmdline").read_bytes()
+            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+        except (OSError, IndexError):
+            continue
+        if b"+viz_instance_id" in command and parent in (owner, 1):
+            found.append(int(entry.name))
+    return found
+
+
+def wait_until(condition: Callable[[], bool], timeout: float = 20) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def play(env: gym.Env[Any, Any], seed: int, steps: int = 80) -> tuple[list[bytes], float]:
+    """Act at random; return what was seen, and the return."""
+    actions = np.random.default_rng(seed).integers(0, 2, steps)
+    image, _ = env.reset(seed=seed)
+    seen, total = [image.tobytes()], 0.0
+    for action in actions:
+        image, reward, terminated, truncated, _ = env.step(action)
+        seen.append(image.tobytes())
+        total += float(reward)
+        if terminated or truncated:
+            break
+    return seen, total
+
+
+def test_gymnasium_accepts_it(doom: Callable[..., Doom]) -> None:
+    env = doom(render_mode="rgb_array")
+    check_env(env, skip_render_check=True)
+    screen = env.render()
+    assert screen is not None
+    assert screen.shape == (120, 160, 3)
+
+
+def test_take_cover_is_the_paper_s() -> None:
+    env = make_environment(Config(environment="TakeCover-v0"))
+    spec = specify(env, Config(environment="TakeCover-v0"))
+    assert (spec.observation_shape, spec.observation_dtype) == ((1, 32, 32), "uint8")
+    assert (spec.n_actions, spec.max_episode_steps, spec.max_return) == (2, 2100, 2100.0)
+    seen, total = play(env, 7, 2200)
+    assert total == len(seen) - 1, "one for each step, the last included"
+    assert len(set(seen)) > 20, "the screen moves"
+    env.close()
+
+
+def test_actions_are_left_and_right(doom: Callable[..., Doom]) -> None:
+    env = doom()
+    names = [button.name for button in env._game.get_available_buttons()]
+    assert names == ["MOVE_LEFT", "MOVE_RIGHT"]
+
+    def strafe(action: int) -> npt.NDArray[np.uint8]:
+        env.reset(seed=3)
+        for _ in range(10):
+            image, *_ = env.step(np.int64(action))
+        return image
+
+    assert not np.array_equal(strafe(0), strafe(1))
+
+
+def test_episode_is_a_function_of_its_seed(doom: Callable[..., Doom]) -> None:
+    one, other = doom(), doom()
+    first = play(one, 11)
+    for seed in (1, 2, 3):
+        play(one, seed)
+    play(other, 99)
+    assert play(one, 11) == first
+    assert play(other, 11) == first
+    assert play(other, 12) != first
+
+
+def test_size_colour_and_skipping(doom: Callable[..., Doom]) -> None:
+    env = doom(height=30, width=40, colour=True, frame_skip=4)
+    image, _ = env.reset(seed=1)
+    assert image.shape == (30, 40, 3)
+    assert np.ptp(image.astype(int), axis=-1).max() > 10, "it has colours"
+    _, reward, *_ = env.step(np.int64(0))
+    assert reward == 4.0
+
+
+def test_other_scenarios_and_files(doom: Callable[..., Doom], tmp_path: Path) -> None:
+    assert doom(scenario="basic").action_space == gym.spaces.Discrete(3)
+    assert doom(scenario="basic").metadata["render_fps"] == 35
+    with pytest.raises(ValueError, match=r"scenario 'nowhere': neither a file nor one of .*basic"):
+        doom(scenario="nowhere")
+    with pytest.raises(ValueError, match="height = 121, width = 32: the screen is 120 x 160"):
+        doom(height=121)
+
+
+def test_close_ends_the_engine(doom: Callable[..., Doom]) -> None:
+    before = set(engines(os.getpid()))
+    env = doom()
+    (engine,) = set(engines(os.getpid())) - before
+    env.close()
+    wait_until(lambda: engine not in engines(os.getpid()))
+
+
+def test_nothing_is_written_where_one_works(
+    doom: Callable[..., Doom], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    doom().close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def commands(config: Config, n: int) -> list[Command]:
+    return CommandSampler(config, 60).warm_up()[:n]
+
+
+def test_death_of_an_engine_costs_an_episode() -> None:
+    config = take_cover()
+    undisturbed = EpisodeGenerator(config, 1)
+    expected = generate_episodes(undisturbed, commands(config, 1), None)
+    undisturbed.close()
+
+    before = set(engines(os.getpid()))
+    generator = EpisodeGenerator(config, 1)
+    (engine,) = set(engines(os.getpid())) - before
+    generator.start(commands(config, 1)[0], None)
+    generator.step()
+    os.kill(engine, signal.SIGKILL)
+    outcomes = generator.step() or generator.step()
+    assert [type(o) for o in outcomes] == [Failure]
+    again = generate_episodes(generator, commands(config, 1), None)
+    generator.close()
+    assert [episode_digest(e) for e in again] == [episode_digest(e) for e in expected]
+
+
+def test_engines_end_with_a_killed_owner() -> None:
+    shared = set(Path("/dev/shm").glob("ViZDoom*"))
+    program = """
+from udrl.environments.doom import Doom
+both = Doom(), Doom()
+print("ready", flush=True)
+input()
+"""
+    owner = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert owner.stdout is not None
+    assert owner.stdin is not None
+    assert owner.stdout.readline() == b"ready\n"
+    started = set(engines(owner.pid))
+    assert len(started) == 2
+    owner.kill()
+    owner.wait()
+    owner.stdout.close()
+    owner.stdin.close()
+    wait_until(lambda: not started & set(engines(owner.pid)))
+    wait_until(lambda: set(Path("/dev/shm").glob("ViZDoom*")) <= shared)
+
+
+def test_without_vizdoom_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "vizdoom", None)
+    with pytest.raises(UnsupportedEnvironment, match=r'pip install "udrl\[doom\]"'):
+        make_environment(take_cover())
+    assert make_environment(Config(environment="CartPole-v1")) is not None
+
+
+def test_broken_vizdoom_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def broken(name: str, *rest: Any) -> Any:
+        if name == "vizdoom":
+            raise ImportError("libopenal.so.1: cannot open shared object file")
+        return real(name, *rest)
+
+    monkeypatch.delitem(sys.modules, "vizdoom", raising=False)
+    monkeypatch.setattr(builtins, "__import__", broken)
+    with pytest.raises(UnsupportedEnvironment, match=r"libopenal.*udrl\[doom\]"):
+        make_environment(take_cover())
+
+
+# Area averaging.
+
+
+def area_average(image: npt.NDArray[np.uint8], height: int, width: int) -> list[list[int]]:
+    """Average as one would by hand, with fractions."""
+
+    def share(i: int, size: int, j: int, to_size: int) -> Fraction:
+        low = max(Fraction(i, size), Fraction(j, to_size))
+        return max(Fraction(0), min(Fraction(i + 1, size), Fraction(j + 1, to_size)) - low)
+
+    def pixel(row: int, column: int) -> int:
+        total = sum(
+            int(image[y, x])
+            * share(y, image.shape[0], row, height)
+            * share(x, image.shape[1], column, width)
+            for y in range(image.shape[0])
+            for x in range(image.shape[1])
+        )
+        return int(total * height * width + Fraction(1, 2))
+
+    return [[pixel(row, column) for column in range(width)] for row in range(height)]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.data())
+def test_area_average_is_exact(data: st.DataObject) -> None:
+    height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
+    to_height, to_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
+    pixels = data.draw(st.binary(min_size=height * width, max_size=height * width))
+    image = np.frombuffer(pixels, np.uint8).reshape(height, width)
+    found = AreaAverage(height, width, to_height, to_width)(image)
+    assert found.tolist() == area_average(image, to_height, to_width)
+
+
+def test_area_average_of_colours_and_of_large_images() -> None:
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
+    found = AreaAverage(480, 640, 60, 80)(image)
+    blocks = image.astype(np.int64).reshape(60, 8, 80, 8, 3).sum(axis=(1, 3))
+    assert np.array_equal(found, (2 * blocks + 64) // 128)

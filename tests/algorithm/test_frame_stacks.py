@@ -1,0 +1,169 @@
+"""What the network sees in acting is what it is trained on: stacks of frames, bit for bit."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from torch import Tensor
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import Acting, BehaviorFunction, initialise, stacked_shape
+from udrl.commands import Command
+from udrl.config import Config, build
+from udrl.environments import make_environment, specify
+from udrl.episode import Episode, recent
+from udrl.segments import Experience, Segments
+from udrl.streams import Purpose, stream_key
+
+STACK = 4
+
+
+class Noise(gym.Env[npt.NDArray[np.uint8], np.int64]):
+    """Shows noise, for as many steps as the seed says."""
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, shape: tuple[int, ...] = (5, 6, 3)) -> None:
+        self.render_mode = None
+        self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+        self.action_space = gym.spaces.Discrete(3)
+        self._left = 0
+
+    def _observe(self) -> npt.NDArray[np.uint8]:
+        shape = self.observation_space.shape
+        assert shape is not None
+        return self.np_random.integers(0, 256, shape).astype(np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._left = (seed or 0) % 7 * 23 + 1
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> Any:
+        self._left -= 1
+        return self._observe(), 1.0, self._left == 0, False, {}
+
+
+class Vectors(Noise):
+    def __init__(self) -> None:
+        super().__init__((2,))
+        self.observation_space = gym.spaces.Box(0, 255, (2,), np.float32)  # type: ignore[assignment]
+
+
+@pytest.fixture(autouse=True)
+def registered() -> Iterator[None]:
+    gym.register("Noise-v0", entry_point=lambda **_: Noise(), max_episode_steps=5000)
+    gym.register("NoiseVectors-v0", entry_point=lambda **_: Vectors(), max_episode_steps=5000)
+    yield
+    for name in ("Noise-v0", "NoiseVectors-v0"):
+        del gym.registry[name]
+
+
+def settings(environment: str = "Noise-v0", **values: Any) -> Config:
+    small = {
+        "environment": environment, "frame_stack": STACK, "convolutions": [4, 6], "hidden": [8, 8],
+        "replay_size": 20, "last_few": 5,
+    }  # fmt: skip
+    return build(Config, small | values)
+
+
+class Watching(BehaviorFunction):
+    """Notes what it is shown, by the first bytes of the newest frame."""
+
+    seen: list[npt.NDArray[Any]]
+
+    def frozen(self) -> Acting:
+        act = super().frozen()
+
+        def noting(observation: Tensor, command: Tensor) -> Tensor:
+            self.seen.extend(observation.numpy().copy())
+            return act(observation, command)
+
+        return noting
+
+
+def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], Watching]:
+    generator = EpisodeGenerator(config, n_environments)
+    behavior = Watching(generator.spec, config)
+    behavior.load_state_dict(initialise(config, generator.spec).state_dict())
+    behavior.seen = []
+    commands = [
+        Command(
+            id=i,
+            kind="explore",
+            desired_return=3.0,
+            desired_horizon=5,
+            environment_seed=i + 1,
+            stream_key=stream_key(1, Purpose.EPISODE, 1, i),
+            weights_version=1,
+            max_steps=5000,
+        )
+        for i in range(n)
+    ]
+    return generate_episodes(generator, commands, behavior), behavior
+
+
+def test_recent_repeats_the_first() -> None:
+    assert recent(np.array([0, 2, 9]), 4).tolist() == [[0, 0, 0, 0], [0, 0, 1, 2], [6, 7, 8, 9]]
+
+
+@pytest.mark.parametrize("environment", ["Noise-v0", "NoiseVectors-v0"])
+@pytest.mark.parametrize("capacity", [1024, 8])
+def test_acting_sees_what_training_sees(
+    environment: str, capacity: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udrl.acting._FIRST_CAPACITY", capacity)  # 8: the ring turns and grows
+    config = settings(environment)
+    episodes, behavior = watch(config, 3, 12)
+    acted_on = {image.tobytes() for image in behavior.seen}
+    spec = specify(make_environment(config), config)
+    experience = Experience(config, spec)
+    for episode in episodes:
+        experience.add(episode)
+    ranked = experience.by_rank([e.command_id for e in episodes])
+    trained_on = set()
+    for rank, episode in enumerate(episodes):
+        t = np.arange(episode.length)
+        examples = ranked.examples(Segments(np.full_like(t, rank), t, np.full_like(t, len(t))))
+        assert examples.observation.shape[1:] == stacked_shape(spec, config)
+        for i, stack in enumerate(examples.observation):
+            frames = [episode.observations[max(0, i - k)] for k in range(STACK)[::-1]]
+            assert np.array_equal(stack, np.concatenate(frames)), f"step {i}"
+            trained_on.add(stack.tobytes())
+    assert acted_on == trained_on
+    assert len(trained_on) == sum(e.length for e in episodes)
+
+
+def test_images_come_with_the_channels_first() -> None:
+    env = make_environment(settings())
+    raw = gym.make("Noise-v0", disable_env_checker=True)
+    image, _ = env.reset(seed=4)
+    expected, _ = raw.reset(seed=4)
+    assert image.shape == (3, 5, 6)
+    assert np.array_equal(image, np.moveaxis(expected, -1, 0))
+    assert specify(env, settings()).is_image
+
+
+@pytest.mark.parametrize(
+    ("shape", "seen"), [((5, 6), (1, 5, 6)), ((3, 5, 6), (3, 5, 6)), ((5, 6, 4), (4, 5, 6))]
+)
+def test_wherever_the_channels_are(shape: tuple[int, ...], seen: tuple[int, ...]) -> None:
+    config = settings(environment_kwargs={})
+    gym.register("Shaped-v0", entry_point=lambda **_: Noise(shape), max_episode_steps=9)
+    try:
+        env = make_environment(build(Config, {"environment": "Shaped-v0"}))
+        assert env.reset(seed=1)[0].shape == specify(env, config).observation_shape == seen
+    finally:
+        del gym.registry["Shaped-v0"]
+
+
+def test_stack_of_one_is_the_observation() -> None:
+    config = settings(frame_stack=1)
+    episodes, behavior = watch(config, 2, 3)
+    frames = {frame.tobytes() for e in episodes for frame in e.observations}
+    assert {image.tobytes() for image in behavior.seen} == frames
+    assert torch.tensor(episodes[0].observations).dtype == torch.uint8

@@ -1,0 +1,83 @@
+"""TakeCover with all services: learning from pixels gives the same bits, whatever dies."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from udrl.config import Config, build, preset
+from udrl_proto.messages import Status
+from whole_run import Cli, arguments, assert_conserved, digests, kill_at, reference
+
+pytestmark = pytest.mark.timeout(300)
+
+# All that the preset sets: what is named here alone would not be what the command line runs.
+TAKE_COVER: dict[str, Any] = {
+    "environment": "TakeCover-v0",
+    "max_episode_steps": 80,
+    "desired_horizon": "return",
+    "frame_stack": 8,
+    "convolutions": [4, 4, 4, 4],
+    "hidden": [8],
+    "batch_size": 16,
+    "precision": "auto",
+    "device": "auto",
+    "initialisation": "orthogonal",
+    "learning_rate": 1e-3,
+    "return_scale": 0.1,
+    "horizon_scale": 0.02,
+    "recent_size": 5,
+    "max_age": 20,
+    "lead": 0,
+    "n_warm_up_episodes": 6,
+    "n_episodes_per_iter": 4,
+    "n_updates_per_iter": 3,
+    "replay_size": 10,
+    "last_few": 5,
+    "eval_every": 800,
+    "eval_episodes": 2,
+}
+BUDGET = 1600
+
+Runner = Callable[..., Status]
+
+
+def settings(**changes: Any) -> Config:
+    return build(Config, TAKE_COVER | changes)
+
+
+def test_the_preset_sets_nothing_else() -> None:
+    assert preset("TakeCover-v0").keys() - {"max_env_steps"} <= TAKE_COVER.keys()
+
+
+def test_services_equal_the_reference(run: Runner) -> None:
+    expected = reference(settings(), BUDGET)
+    assert expected.evaluations
+    for fleet in ({"actors": 2, "envs": 3}, {"envs": 5, "in_process": False}):
+        assert digests(run(settings(), BUDGET, **fleet)) == digests(expected)
+
+
+@pytest.mark.slow
+def test_kill_in_the_middle_of_an_episode(
+    run: Runner, cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    budget = 2 * BUDGET
+    expected = run(settings(lead=1), budget)
+    run_dir = tmp_path / "killed"
+    process = cli(*arguments(TAKE_COVER | {"lead": 1}, budget, run_dir), "--actors", "1")
+    for role, iteration in [("actor", 1), ("learner", 2), ("actor", 3)]:
+        kill_at(process, run_dir, role, iteration)
+    status = process.status(timeout=120)
+    assert_conserved(status)
+    assert digests(status) == digests(expected)
+
+
+def test_what_is_left_to_the_machine_is_settled_for_good(run: Runner, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    run(settings(), 700, run_dir=run_dir)
+    written = (run_dir / "config.toml").read_text()
+    assert "auto" not in written
+    assert 'precision = "' in written
+    again = run(settings(), BUDGET, run_dir=run_dir, go_on=True)
+    assert digests(again) == digests(run(settings(), BUDGET))

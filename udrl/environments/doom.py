@@ -1,0 +1,165 @@
+"""ViZDoom's scenarios, seen through their screen; TakeCover (section 3.1) is one of them."""
+
+import contextlib
+import os
+import sys
+import tempfile
+import threading
+import uuid
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from udrl.environments import engine_keeper
+from udrl.environments.downsampling import AreaAverage, Image
+
+_SCREEN = (120, 160)
+
+_starting = threading.Lock()
+_mark = uuid.uuid4().hex
+_keeper: int | None = None
+
+
+class Doom(gym.Env[Image, np.int64]):
+    """A ViZDoom scenario: action i presses its button i, the screen is observed.
+
+    An episode is a function of its seed and actions. The engine is a process of its own; when it
+    dies, the next step raises.
+
+    Args:
+        scenario: one that ships with ViZDoom, e.g. ``take_cover``, or the path of a .cfg file.
+        height, width: of the observation in pixels, at most 120 x 160, which the engine renders.
+        colour: observe red, green and blue instead of grey.
+        frame_skip: tics, of which there are 35 in a second, for each step.
+        max_return: the greatest return possible, if known (2.3.2).
+        render_mode: ``rgb_array``, or None.
+
+    Raises:
+        gymnasium.error.DependencyNotInstalled: ViZDoom is not installed, or broken.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 35}
+
+    def __init__(
+        self,
+        scenario: str = "take_cover",
+        height: int = 32,
+        width: int = 32,
+        *,
+        colour: bool = False,
+        frame_skip: int = 1,
+        max_return: float | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if not (0 < height <= _SCREEN[0] and 0 < width <= _SCREEN[1]):
+            raise ValueError(
+                f"height = {height}, width = {width}: the screen is {_SCREEN[0]} x {_SCREEN[1]}, "
+                f"and images are made smaller only"
+            )
+        self.render_mode = render_mode
+        self.max_return = max_return
+        self._frame_skip = frame_skip
+        self._shrink = AreaAverage(*_SCREEN, height, width)
+        self._game, self._folder = _open(scenario, colour=colour)
+        n = self._game.get_available_buttons_size()
+        self._buttons = np.eye(n).tolist()
+        self.action_space = gym.spaces.Discrete(n)
+        shape = (height, width, 3) if colour else (height, width)
+        self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+        self._screen = np.zeros((*_SCREEN, *shape[2:]), np.uint8)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Image, dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        self._game.set_seed(int(self.np_random.integers(2**31)))
+        self._game.new_episode()
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+        """Press a button for ``frame_skip`` tics; after the last step the last screen is seen."""
+        reward = self._game.make_action(self._buttons[action], self._frame_skip)
+        terminated = self._game.is_episode_finished()
+        return self._observe(), float(reward), terminated, False, {}
+
+    def render(self) -> Image | None:
+        """Return the screen, uint8 [120, 160, 3]."""
+        if self.render_mode is None:
+            return None
+        screen = self._screen if self._screen.ndim == 3 else self._screen[..., None]
+        return np.repeat(screen, 3 // screen.shape[-1], axis=-1)
+
+    def close(self) -> None:
+        """End the engine."""
+        self._game.close()
+        self._folder.cleanup()
+
+    def _observe(self) -> Image:
+        state = self._game.get_state()
+        if state is not None:
+            self._screen = state.screen_buffer
+        return self._shrink(self._screen)
+
+
+def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirectory[str]]:
+    """Start an engine; return it with the folder that it writes to."""
+    try:
+        import vizdoom
+    except ImportError as error:
+        raise gym.error.DependencyNotInstalled(f"vizdoom cannot be imported: {error}") from error
+    shipped = Path(vizdoom.scenarios_path) / f"{scenario}.cfg"
+    path = shipped if shipped.exists() else Path(scenario)
+    if not path.is_file():
+        known = sorted(p.stem for p in Path(vizdoom.scenarios_path).glob("*.cfg"))
+        raise ValueError(
+            f"scenario {scenario!r}: neither a file nor one of ViZDoom's {', '.join(known)}"
+        )
+    folder = tempfile.TemporaryDirectory(prefix="udrl-doom-")
+    game = vizdoom.DoomGame()
+    try:
+        game.load_config(str(path.resolve()))
+        game.set_screen_resolution(vizdoom.ScreenResolution.RES_160X120)
+        formats = vizdoom.ScreenFormat
+        game.set_screen_format(formats.RGB24 if colour else formats.GRAY8)
+        game.set_mode(vizdoom.Mode.PLAYER)
+        game.set_window_visible(False)
+        game.set_sound_enabled(False)
+        _start(game, folder.name)
+    except Exception as error:
+        with contextlib.suppress(Exception):
+            game.close()
+        folder.cleanup()
+        raise gym.error.DependencyNotInstalled(
+            f"vizdoom's engine does not start: {type(error).__name__}: {error}"
+        ) from error
+    return game, folder
+
+
+def _start(game: Any, folder: str) -> None:
+    """Start a game's engine, and see to it that it ends with this process, however that ends.
+
+    Engines write to where they are started, and two at once trip over each other there. So for the
+    tenth of a second that it takes, this process works in a folder that the engine has alone.
+    """
+    global _keeper  # what it reads; never closed, but by the end of this process
+    with _starting:
+        if _keeper is None and Path("/proc/self/environ").exists():
+            reads, _keeper = os.pipe()
+            command = [sys.executable, "-I", "-S", engine_keeper.__file__, _mark]
+            os.posix_spawn(
+                sys.executable, command, os.environ,
+                file_actions=[(os.POSIX_SPAWN_DUP2, reads, 0)], setsid=True,
+            )  # fmt: skip
+            os.close(reads)
+        os.environ[engine_keeper.MARK] = _mark
+        here = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
+        os.chdir(folder)
+        try:
+            game.init()
+        finally:
+            os.fchdir(here)
+            os.close(here)
+            del os.environ[engine_keeper.MARK]
