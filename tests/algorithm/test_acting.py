@@ -302,6 +302,21 @@ def test_the_network_is_given_what_is_left_of_the_command(
     assert spy.commands == seen
 
 
+@pytest.mark.parametrize(
+    ("kind", "seen"),
+    [
+        ("explore", [[3, 3], [2, 2], [4, 4], [1, 1]]),
+        ("evaluate", [[2.5, 2], [1.5, 1], [2.5, 2], [1, 1]]),
+    ],
+)
+def test_the_horizon_may_be_the_return_as_an_integer(kind: str, seen: list[list[float]]) -> None:
+    config = settings(return_scale=1, horizon_scale=1, max_return=2.5, desired_horizon="return")
+    generator = EpisodeGenerator(config, 1, World().make)
+    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    generate_episodes(generator, [order(1, kind=kind, desired_horizon=3)], spy)
+    assert spy.commands == seen
+
+
 def test_commands_are_scaled_for_the_network() -> None:
     config = settings(return_scale=0.5, horizon_scale=0.25)
     generator = EpisodeGenerator(config, 1, World().make)

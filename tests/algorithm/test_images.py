@@ -1,0 +1,260 @@
+"""The behavior function, training and checkpoints for images; what is left to the machine."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from udrl import numerics
+from udrl.behavior import BehaviorFunction, initialise
+from udrl.checkpoint import decode_state, encode_optimizer, encode_weights
+from udrl.commands import CommandSampler
+from udrl.config import Config, build
+from udrl.digests import tensors_digest
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import ConfigError
+from udrl.numerics import check_batch_invariance, settle, settle_as, training_class
+from udrl.replay import Entry, ReplayBuffer
+from udrl.segments import Experience
+from udrl.training import train, untrained
+
+TAKE_COVER = EnvironmentSpec(
+    observation_shape=(1, 32, 32), observation_dtype="uint8", n_actions=2, max_episode_steps=2100
+)
+# Appendix B.2.
+CONVOLUTIONS = [(32, 48, 96, 128), (32, 64, 128, 256), (48, 96, 192, 384)]
+FULLY_CONNECTED = [(64, 128), (64, 128, 128), (128, 256), (128, 256, 256), (128, 128), (256, 256)]
+PRECISIONS = ["float32", "bfloat16"]
+
+
+def settings(**values: Any) -> Config:
+    small = {
+        "environment": "TakeCover-v0", "frame_stack": 8, "batch_size": 16, "n_updates_per_iter": 3,
+        "return_scale": 0.1,
+    }  # fmt: skip
+    return build(Config, small | values)
+
+
+def images(n: int, spec: EnvironmentSpec = TAKE_COVER, stack: int = 8) -> torch.Tensor:
+    channels, *size = spec.observation_shape
+    rng = np.random.default_rng(n)
+    return torch.tensor(rng.integers(0, 256, (n, stack * channels, *size)).astype(np.uint8))
+
+
+def commands(n: int) -> torch.Tensor:
+    return torch.tensor(np.random.default_rng(n).standard_normal((n, 2)), dtype=torch.float32)
+
+
+def relu(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.maximum(x, 0.0)
+
+
+def convolve(
+    x: npt.NDArray[np.float64], weight: npt.NDArray[np.float64], bias: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """3x3 filters, 1 pixel of padding in all directions, stride of 2 pixels; one at a time."""
+    _, height, width = x.shape
+    padded = np.pad(x, ((0, 0), (1, 1), (1, 1)))
+    return np.array(
+        [
+            [
+                [
+                    np.sum(padded[:, 2 * i : 2 * i + 3, 2 * j : 2 * j + 3] * w) + b
+                    for j in range((width + 1) // 2)
+                ]
+                for i in range((height + 1) // 2)
+            ]
+            for w, b in zip(weight, bias, strict=True)
+        ]
+    )
+
+
+def appendix_b_2(behavior: BehaviorFunction, image: torch.Tensor, command: torch.Tensor) -> Any:
+    """One image, in float64."""
+    held = {n: t.numpy().astype(np.float64) for n, t in behavior.state_dict().items()}
+    x = image.numpy() / 255
+    for i in range(len(behavior.convolutions)):
+        x = relu(convolve(x, held[f"convolutions.{i}.weight"], held[f"convolutions.{i}.bias"]))
+    gate = 1 / (1 + np.exp(-held["command.weight"] @ command.numpy() - held["command.bias"]))
+    y = x.reshape(-1) * gate
+    for i in range(len(behavior.layers)):
+        y = relu(held[f"layers.{i}.weight"] @ y + held[f"layers.{i}.bias"])
+    return held["action.weight"] @ y + held["action.bias"]
+
+
+@pytest.mark.parametrize("size", [(1, 32, 32), (3, 9, 14)])
+@pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
+def test_logits_are_those_of_appendix_b_2(size: tuple[int, ...], initialisation: str) -> None:
+    spec = EnvironmentSpec(
+        observation_shape=size, observation_dtype="uint8", n_actions=3, max_episode_steps=9
+    )
+    config = settings(
+        convolutions=(3, 4, 5, 6), hidden=(8, 7), frame_stack=2, initialisation=initialisation
+    )
+    behavior = initialise(config, spec)
+    given = images(4, spec, stack=2), commands(4)
+    with torch.inference_mode():
+        logits = behavior(*given)
+    expected = [appendix_b_2(behavior, *row) for row in zip(*given, strict=True)]
+    np.testing.assert_allclose(logits.numpy(), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("hidden", FULLY_CONNECTED, ids=str)
+@pytest.mark.parametrize("convolutions", CONVOLUTIONS, ids=str)
+def test_layers_have_the_sizes_of_appendix_b_2(
+    convolutions: tuple[int, ...], hidden: tuple[int, ...]
+) -> None:
+    config = settings(convolutions=convolutions, hidden=hidden)
+    shapes = {n: tuple(t.shape) for n, t in initialise(config, TAKE_COVER).state_dict().items()}
+    into = [8, *convolutions]
+    flat = 4 * convolutions[-1]  # 32 -> 16 -> 8 -> 4 -> 2 pixels
+    weights: dict[str, tuple[int, ...]] = {
+        f"convolutions.{i}.weight": (into[i + 1], into[i], 3, 3) for i in range(4)
+    }
+    weights |= {"command.weight": (flat, 2), "action.weight": (2, hidden[-1])}
+    units = [flat, *hidden]
+    weights |= {f"layers.{i}.weight": (units[i + 1], units[i]) for i in range(len(hidden))}
+    assert {n: s for n, s in shapes.items() if "weight" in n} == weights
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_what_acts_has_the_bits_of_what_is_trained(precision: str) -> None:
+    behavior = initialise(settings(precision=precision), TAKE_COVER)
+    given = images(16), commands(16)
+    with torch.inference_mode():
+        logits = behavior(*given)
+        assert logits.dtype == torch.float32
+        assert torch.equal(behavior.frozen()(*given), logits)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rows_keep_their_bits_in_any_company_here(precision: str) -> None:
+    check_batch_invariance(settings(precision=precision), TAKE_COVER)
+
+
+def test_bfloat16_is_near_float32() -> None:
+    given = images(32), commands(32)
+    logits = {}
+    for precision in PRECISIONS:
+        with torch.inference_mode():
+            logits[precision] = initialise(settings(precision=precision), TAKE_COVER)(*given)
+    apart = (logits["bfloat16"] - logits["float32"]).abs().max()
+    assert 0 < apart < 0.1 * logits["float32"].abs().max()
+
+
+def some_episodes(n: int, longest: int = 70) -> list[Episode]:
+    rng = np.random.default_rng(1)
+    episodes = []
+    for i in range(n):
+        length = int(rng.integers(10, longest))
+        actions = rng.integers(0, 2, length).astype(np.uint8)
+        observations = rng.integers(0, 100, (length, 1, 32, 32)).astype(np.uint8)
+        observations[:, :, :8] += 100 * actions[:, None, None, None]  # what there is to learn
+        episodes.append(
+            Episode(i, observations, actions, np.ones(length, np.float32), True, False)  # noqa: FBT003
+        )
+    return episodes
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_training_learns_and_goes_on_from_a_checkpoint(precision: str) -> None:
+    config = settings(precision=precision, learning_rate=3e-3, n_updates_per_iter=60)
+    experience = Experience(config, TAKE_COVER)
+    for episode in some_episodes(5):
+        experience.add(episode)
+    ranked = experience.by_rank(list(range(5)))
+    state = untrained(config, TAKE_COVER)
+    train(state, ranked, config)
+    restored = decode_state(
+        1, encode_weights(state.behavior), encode_optimizer(state), config, TAKE_COVER
+    )
+    for one in (state, restored):
+        train(one, ranked, config)
+    digests = {tensors_digest(one.behavior.state_dict()) for one in (state, restored)}
+    assert len(digests) == 1
+    assert state.loss < 0.3, "nats; chance is 0.69"
+    assert all(p.dtype == torch.float32 for p in state.behavior.parameters())
+
+
+def test_classes_of_arithmetic_tell_precisions_apart() -> None:
+    classes = {p: training_class(settings(precision=p), TAKE_COVER) for p in PRECISIONS}
+    assert len(set(classes.values())) == 2
+
+
+def test_buffer_keeps_single_frames() -> None:
+    """500 episodes of 800 steps take at most 0.6 GB, in pages that are taken as they fill."""
+    config = settings(replay_size=500)
+    experience = Experience(config, TAKE_COVER)
+    kept = [a for a in vars(experience).values() if isinstance(a, np.ndarray)]
+    per_step = sum(a.nbytes for a in kept) / len(experience._observations)
+    in_pages = -(-800 // 64) * 64
+    assert 500 * in_pages * per_step < 0.6e9
+
+
+# What is left to the machine.
+
+
+def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    automatic = settings(precision="auto", device="auto")
+    for fast, cuda in ((True, False), (False, True)):
+        monkeypatch.setattr(numerics, "_is_fast_in_bfloat16", lambda fast=fast: fast)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda cuda=cuda: cuda)
+        settled = settle(automatic)
+        assert settled.precision == ("bfloat16" if fast else "float32")
+        assert settled.device == ("cuda" if cuda else "cpu")
+        assert settle(settled) == settled
+
+
+def test_resumed_run_keeps_what_was_settled() -> None:
+    held = settings(precision="bfloat16", device="cpu", seed=3)
+    assert settle_as(held, settings(precision="auto", device="auto", seed=3)) == held
+    asked = settings(precision="float32", device="auto", seed=3)
+    assert settle_as(held, asked).precision == "float32"
+
+
+@pytest.mark.parametrize(
+    ("text", "fast"),
+    [
+        ("flags : fpu avx512_bf16 sse", True),
+        ("Features : fp asimd bf16", True),
+        ("flags : fpu bf16x", False),
+    ],
+)
+def test_processor_says_what_it_is_fast_in(
+    text: str, fast: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: text)
+    assert numerics._is_fast_in_bfloat16() is fast
+
+
+def test_where_nobody_tells_it_is_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object, **__: object) -> str:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "read_text", missing)
+    assert not numerics._is_fast_in_bfloat16()
+
+
+# Commands of TakeCover (3.1): as many steps as return, as an integer.
+
+
+def test_horizon_is_the_return_as_an_integer() -> None:
+    config = settings(desired_horizon="return", replay_size=10, last_few=4)
+    buffer = ReplayBuffer(config)
+    buffer.admit([Entry(float(r), i, r) for i, r in enumerate((200, 301, 350, 412))])
+    sampler = CommandSampler(config, 2100)
+    explored = sampler.explore(1, buffer)
+    assert len({c.desired_return for c in explored}) > 5
+    for command in (*explored, *sampler.evaluate(1, buffer)):
+        assert command.desired_return == command.desired_horizon
+        assert 315 <= command.desired_return <= 315.75 + 78.1
+    assert {c.desired_return for c in sampler.evaluate(1, buffer)} == {315.0}
+
+
+def test_spread_of_horizons_is_refused_beside_it() -> None:
+    with pytest.raises(ConfigError, match=r"horizon_spread = 0.3: .*set horizon_spread = 0"):
+        settings(desired_horizon="return", horizon_spread=0.3)
