@@ -30,13 +30,14 @@ from typing import Any, NamedTuple
 
 import msgspec
 import torch
+from torch.nn import functional
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
 from udrl.behavior import initialise
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Budget, Config
-from udrl.environments import make_environment
+from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
 from udrl.numerics import use_one_thread
@@ -50,7 +51,6 @@ from udrl_replay.run import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
-_REFERENCE_STEPS = 300_000
 _ROLES = ("actor", "learner", "replay", "train")
 
 
@@ -75,6 +75,7 @@ class Parts(NamedTuple):
     step: float
     inference: float
     update: float
+    bare_update: float
 
 
 def main() -> None:
@@ -86,6 +87,7 @@ def main() -> None:
     parser.add_argument("--lead", type=int)
     parser.add_argument("--actors", type=int)
     parser.add_argument("--envs-per-actor", type=int)
+    parser.add_argument("--reference-steps", type=int, default=300_000)
     parser.add_argument("--parts", type=Path, metavar="RUN_DIR", help="time a run's parts only")
     options = parser.parse_args()
     use_one_thread()
@@ -128,7 +130,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
 
     parts, busy = _time_parts(run_dir, 1), _time_parts(run_dir, cores)
     system = window.steps / window.seconds
-    reference = _reference_run(config)
+    reference = _reference_run(config, options.reference_steps)
     reference_speed = reference.steps / reference.seconds
     reference_per_step = config.n_updates_per_iter * reference.iterations / reference.steps
     return {
@@ -136,6 +138,8 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "bare environment, random actions, env steps/s per core": _random_speed(config),
         "inference, us per row (full call)": parts.inference * 1e6,
         "update, ms": parts.update * 1e3,
+        "bare update, on tensors in memory, ms": parts.bare_update * 1e3,
+        "update / bare update": parts.update / parts.bare_update,
         "updates per 1,000 env steps": per_step * 1000,
         "limit, env steps/s": limit(parts),
         "system, env steps/s": system,
@@ -252,7 +256,10 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
 
     behavior = initialise(config, spec)
     rows = config.inference_rows
-    observation, command = torch.zeros(rows, *spec.observation_shape), torch.zeros(rows, 2)
+    observation = torch.zeros(
+        rows, *behavior.observation_shape, dtype=getattr(torch, spec.observation_dtype)
+    )
+    command = torch.zeros(rows, 2)
     with torch.inference_mode():
         inference = _seconds(lambda: behavior(observation, command), 5000) / rows
 
@@ -262,7 +269,23 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
     state = untrained(config, spec)
     ranked = experience.by_rank([e.command_id for e in episodes])
     update = _seconds(lambda: train(state, ranked, config), 5) / config.n_updates_per_iter
-    return Parts(step, inference, update)
+    return Parts(step, inference, update, _bare_update(config, spec))
+
+
+def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
+    """Return the seconds of forward, backward and step on tensors that are in memory already."""
+    state, n = untrained(config, spec), config.batch_size
+    shape = state.behavior.observation_shape
+    observation = (torch.rand(n, *shape) * 255).to(getattr(torch, spec.observation_dtype))
+    command, action = torch.rand(n, 2), torch.randint(spec.n_actions, (n,))
+
+    def update() -> None:
+        loss = functional.cross_entropy(state.behavior(observation, command), action)
+        state.optimizer.zero_grad()
+        loss.backward()
+        state.optimizer.step()
+
+    return _seconds(update, 100)
 
 
 def _seed_of(config: Config, command_id: int) -> int:
@@ -295,12 +318,12 @@ def _random_speed(config: Config) -> float:
     return steps / (time.perf_counter() - began)
 
 
-def _reference_run(config: Config) -> Window:
+def _reference_run(config: Config, steps: int) -> Window:
     """Return the second half of a short run of the reference implementation."""
     reports: list[Window] = []
     algorithm1(
         msgspec.structs.replace(config, lead=0, eval_every=2**30),
-        Budget(max_env_steps=_REFERENCE_STEPS),
+        Budget(max_env_steps=steps),
         report=lambda run: reports.append(
             Window(time.perf_counter(), run.env_steps, run.iteration)
         ),
