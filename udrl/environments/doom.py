@@ -121,6 +121,7 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
     game = vizdoom.DoomGame()
     try:
         game.load_config(str(path.resolve()))
+        game.set_doom_config_path(os.devnull)  # written at its end, when its folder may be gone
         game.set_screen_resolution(vizdoom.ScreenResolution.RES_160X120)
         formats = vizdoom.ScreenFormat
         game.set_screen_format(formats.RGB24 if colour else formats.GRAY8)
@@ -149,9 +150,11 @@ def _start(game: Any, folder: str) -> None:
         if _keeper is None and Path("/proc/self/environ").exists():
             reads, _keeper = os.pipe()
             command = [sys.executable, "-I", "-S", engine_keeper.__file__, _mark]
+            # Not our output: whoever reads that to its end would wait for the keeper's.
+            silent = [(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_WRONLY, 0) for fd in (1, 2)]
             os.posix_spawn(
                 sys.executable, command, os.environ,
-                file_actions=[(os.POSIX_SPAWN_DUP2, reads, 0)], setsid=True,
+                file_actions=[(os.POSIX_SPAWN_DUP2, reads, 0), *silent], setsid=True,
             )  # fmt: skip
             os.close(reads)
         os.environ[engine_keeper.MARK] = _mark
