@@ -73,7 +73,7 @@ def main() -> None:
     if options.desired_return is not None:
         command = msgspec.structs.replace(command, desired_return=options.desired_return)
     (episode,) = generate_episodes(generator, [command], agent.behavior)
-    fps = int(generator._envs[0].metadata["render_fps"])
+    fps = int(films[-1].metadata["render_fps"])
     generator.close()
     last = int(options.seconds * fps / options.every)
     step = 256 // options.levels
