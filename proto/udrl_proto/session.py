@@ -89,6 +89,8 @@ def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
         # Silent losses are reported for shared memory when a receiver is descheduled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        # As many as may join; by default Zenoh turns the 1,001st away.
+        "transport/unicast/max_sessions": 11_000,
         **tls,
     }.items():
         config.insert_json5(path, json.dumps(value))
