@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from udrl.config import Config, build, preset
+from udrl.errors import ConfigError
+from udrl_launch.inspection import evaluate, load_agent
 from udrl_proto.messages import Status
 from whole_run import Cli, arguments, assert_conserved, digests, kill_at, reference
 
@@ -51,10 +53,15 @@ def test_the_preset_sets_nothing_else() -> None:
     assert preset("TakeCover-v0").keys() - {"max_env_steps"} <= TAKE_COVER.keys()
 
 
-def test_services_equal_the_reference(run: Runner) -> None:
+def test_services_equal_the_reference(run: Runner, tmp_path: Path) -> None:
     expected = reference(settings(), BUDGET)
     assert expected.evaluations
-    assert digests(run(settings(), BUDGET, actors=2, envs=3)) == digests(expected)
+    run_dir = tmp_path / "run"
+    assert digests(run(settings(), BUDGET, actors=2, envs=3, run_dir=run_dir)) == digests(expected)
+    agent = load_agent(run_dir)
+    assert evaluate(agent, episodes=2, desired_return=50.7).desired_horizon == 50
+    with pytest.raises(ConfigError, match="desired horizon 30: in this run it is the desired"):
+        evaluate(agent, episodes=2, desired_horizon=30)
 
 
 @pytest.mark.slow

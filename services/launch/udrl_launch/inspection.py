@@ -3,6 +3,7 @@
 import faulthandler
 import json
 import logging
+import math
 import os
 from contextlib import closing
 from pathlib import Path
@@ -16,7 +17,7 @@ from udrl.checkpoint import decode_weights
 from udrl.commands import Command, CommandSampler
 from udrl.config import Budget, Config, build, read_toml
 from udrl.episode import Episode
-from udrl.errors import StoreError, UdrlError
+from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl.evaluation import Evaluation, summarise
 from udrl.numerics import use_one_thread
 from udrl.replay import ReplayBuffer
@@ -173,7 +174,16 @@ def evaluate(
     """Evaluate an agent; without a command of its own, by that of section 2.3.6.
 
     With the run's own settings this repeats its closing evaluation exactly.
+
+    Raises:
+        ConfigError: a horizon is given, and the run's horizons follow from the returns.
     """
+    horizon_is_return = agent.config.desired_horizon == "return"
+    if horizon_is_return and desired_horizon is not None:
+        raise ConfigError(
+            f"desired horizon {desired_horizon}: in this run it is the desired return, as an "
+            f"integer, at every step; give the return only"
+        )
     use_one_thread()
     if greedy is None:
         greedy = agent.config.eval_greedy
@@ -183,6 +193,8 @@ def evaluate(
     changes: dict[str, Any] = {}
     if desired_return is not None:
         changes["desired_return"] = desired_return
+        if horizon_is_return:
+            changes["desired_horizon"] = max(1, math.floor(desired_return))
     if desired_horizon is not None:
         changes["desired_horizon"] = desired_horizon
     commands: list[Command] = [
