@@ -5,16 +5,10 @@ import socket
 import threading
 from collections.abc import Iterator
 
+from udrl_launch.training import free_port
+
 _CHUNK = 1 << 16
 _TRY_AGAIN_S = 0.2
-
-
-def free_port() -> int:
-    """Return a port of the loopback interface that nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class SeveredLink:

@@ -92,7 +92,7 @@ class CommandSampler:
         spread = self._config.horizon_spread
         numbers = self._stream(iteration).uniforms(2 * self._config.n_episodes_per_iter)
         desired = [
-            self._desired(mean + deviation * u, _round(horizon * (1 + spread * (2 * v - 1))))
+            self.desired(mean + deviation * u, _round(horizon * (1 + spread * (2 * v - 1))))
             for u, v in numbers.reshape(2, -1).T.tolist()
         ]
         return self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
@@ -109,10 +109,10 @@ class CommandSampler:
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
         mean, _, horizon = self._best(buffer)
-        desired = [self._desired(mean, horizon)] * self._config.eval_episodes
+        desired = [self.desired(mean, horizon)] * self._config.eval_episodes
         return self._commands("evaluate", iteration, first, desired, EVALUATION_SEEDS)
 
-    def _desired(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
+    def desired(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0 as it is said; section 3.1: in TakeCover both are the same integer."""
         if self._config.desired_horizon == "return":
             desired_horizon = max(1, min(math.floor(desired_return), 2**31))

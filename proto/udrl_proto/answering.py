@@ -78,7 +78,7 @@ def serve(
             request: Any
             payload = query.payload
             data = b"" if payload is None else payload.to_bytes()
-            if not inbox.has_room(len(data)):  # before the work of reading it
+            if not inbox.has_room(len(data), bulk=verb.bulk):  # before the work of reading it
                 query.drop()
                 return
             try:

@@ -18,9 +18,18 @@ def test_bulk_waits_for_all_else_and_nothing_overtakes_its_like() -> None:
 
 def test_length_is_bounded() -> None:
     inbox: Inbox[int] = Inbox(2, 1000)
-    assert [inbox.put(i, 1, bulk=i % 2 == 0) for i in range(4)] == [True, True, False, False]
-    assert inbox.take(1, 1000, NOW) == [1]
+    assert [inbox.put(i, 1) for i in range(4)] == [True, True, False, False]
+    assert inbox.take(1, 1000, NOW) == [0]
     assert inbox.put(4, 1)
+
+
+def test_bulk_takes_no_room_from_all_else() -> None:
+    inbox: Inbox[str] = Inbox(2, 10)
+    assert inbox.put("episode", 10, bulk=True)
+    assert not inbox.put("episode", 1, bulk=True)
+    assert inbox.has_room(10)
+    assert inbox.put("weights", 10)
+    assert inbox.take(5, 100, NOW) == ["weights", "episode"]
 
 
 def test_size_is_bounded_but_a_single_item_always_fits() -> None:

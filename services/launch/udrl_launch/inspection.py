@@ -3,7 +3,6 @@
 import faulthandler
 import json
 import logging
-import math
 import os
 from contextlib import closing
 from pathlib import Path
@@ -178,8 +177,7 @@ def evaluate(
     Raises:
         ConfigError: a horizon is given, and the run's horizons follow from the returns.
     """
-    horizon_is_return = agent.config.desired_horizon == "return"
-    if horizon_is_return and desired_horizon is not None:
+    if agent.config.desired_horizon == "return" and desired_horizon is not None:
         raise ConfigError(
             f"desired horizon {desired_horizon}: in this run it is the desired return, as an "
             f"integer, at every step; give the return only"
@@ -190,18 +188,17 @@ def evaluate(
     config = msgspec.structs.replace(agent.config, eval_episodes=episodes, eval_greedy=greedy)
     generator = EpisodeGenerator(config, environments)
     sampler = CommandSampler(config, generator.spec.max_episode_steps)
-    changes: dict[str, Any] = {}
-    if desired_return is not None:
-        changes["desired_return"] = desired_return
-        if horizon_is_return:
-            changes["desired_horizon"] = max(1, math.floor(desired_return))
-    if desired_horizon is not None:
-        changes["desired_horizon"] = desired_horizon
-    commands: list[Command] = [
-        msgspec.structs.replace(c, **changes) for c in sampler.close(agent.iteration, agent.buffer)
+    commands: list[Command] = sampler.close(agent.iteration, agent.buffer)
+    told = commands[0]
+    wanted = sampler.desired(
+        told.desired_return if desired_return is None else desired_return,
+        told.desired_horizon if desired_horizon is None else desired_horizon,
+    )
+    commands = [
+        msgspec.structs.replace(c, desired_return=wanted[0], desired_horizon=wanted[1])
+        for c in commands
     ]
     done = generate_episodes(generator, commands, agent.behavior)
     generator.close()
     returns = [e.episode_return for e in done]
-    told = commands[0]
-    return Result(told.desired_return, told.desired_horizon, greedy, summarise(returns), returns)
+    return Result(*wanted, greedy, summarise(returns), returns)
