@@ -298,8 +298,14 @@ class EpisodeGenerator:
         return np.arange(first, first + count) % self._capacity
 
     def _lay_out_uniforms(self, row: int, command: Command) -> None:
-        """Put number t of the command's stream where step t of its episode will look."""
+        """Put number t of the command's stream where step t of its episode will look.
+
+        Numbers of the warm-up are used ``warm_up_hold`` times, and so are the actions they choose.
+        """
         numbers = Stream(command.stream_key).uniforms(self._capacity)
+        if command.kind == "warm_up":
+            hold = self._config.warm_up_hold
+            numbers = numbers[np.arange(self._capacity) // hold * hold]
         self._uniforms[self._places(int(self._began[row]), self._capacity), row] = numbers
 
     def _make_room(self) -> None:

@@ -57,6 +57,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         n_episodes_per_iter: exploratory episodes in an iteration.
         n_updates_per_iter: gradient steps in an iteration.
         n_warm_up_episodes: episodes of random actions before the first iteration.
+        warm_up_hold: steps that a random action of the warm-up is held for; 1 is the paper's.
         replay_size: episodes that the replay buffer holds (2.3.1).
         max_age: iterations after which an episode leaves the replay buffer; None, as in the paper:
             never.
@@ -77,6 +78,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         inference_rows: rows that every inference call is padded to.
         precision: what the network computes in; weights and optimizer are float32 always.
             ``auto``: bfloat16 if the machine that creates the run is fast in it.
+        training_threads: threads that the learner computes with on a CPU; everything else has one.
         device: what the learner trains on; ``auto``: ``cuda`` if the machine that creates the run
             has it.
     """
@@ -98,6 +100,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20
     n_updates_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 100
     n_warm_up_episodes: Annotated[int, Meta(ge=1, le=100_000)] = 50
+    warm_up_hold: PositiveInt = 1
     replay_size: Annotated[int, Meta(ge=1, le=1_000_000)] = 500
     max_age: PositiveInt | None = None
     recent_size: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
@@ -116,6 +119,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     inference_rows: Annotated[int, Meta(ge=16, le=4096)] = 16
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
+    training_threads: Annotated[int, Meta(ge=1, le=256)] = 1
     device: Literal["auto", "cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:

@@ -1,6 +1,8 @@
 """Section 2.3.3: a fixed number of Adam updates turns weights version v-1 into version v."""
 
+import contextlib
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +62,16 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         experience.lengths,
         config.segments,
     )
+    with _threads(config.training_threads):
+        losses = _update(state, experience, segments, config)
+    state.version = version
+    state.loss = losses / config.n_updates_per_iter
+
+
+def _update(
+    state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
+) -> float:
+    """Make one Adam update for each row of ``segments``; return the sum of their losses."""
     batch = _Batch(config, state.behavior)
     parameters = list(state.behavior.parameters())
     losses = torch.zeros((), dtype=torch.float64, device=config.device)
@@ -72,8 +84,18 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         loss.backward(one)
         state.optimizer.step()
         losses += loss.detach()
-    state.version = version
-    state.loss = float(losses) / config.n_updates_per_iter
+    return float(losses)
+
+
+@contextlib.contextmanager
+def _threads(n: int) -> Iterator[None]:
+    """Let this thread's tensors be computed by n; torch keeps the number for each thread apart."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(n)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Batch:

@@ -72,6 +72,7 @@ CONFIG = Config(
     n_episodes_per_iter=15,
     n_updates_per_iter=100,
     n_warm_up_episodes=30,
+    warm_up_hold=5,
     replay_size=300,
     max_age=50,
     recent_size=100,

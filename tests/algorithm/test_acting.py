@@ -65,6 +65,7 @@ def algorithm2(
     s, _ = env.reset(seed=command.environment_seed)
     s = np.asarray(s, np.float32)
 
+    u = 0.0
     episode: list[tuple[Any, int, np.float32]] = []  # 1: E <- {}
     over = terminated = truncated = False
     while not over:  # 3
@@ -80,7 +81,9 @@ def algorithm2(
             with torch.inference_mode():
                 logits = behavior(states, commands)[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
-        u = float(stream.uniforms(1)[0])
+        number = float(stream.uniforms(1)[0])
+        if command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
+            u = number
         if command.greedy:
             a = logits.index(max(logits))
         else:
@@ -134,6 +137,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     config = settings(
         environment,
         n_warm_up_episodes=3,
+        warm_up_hold=3,
         n_episodes_per_iter=5,
         eval_episodes=4,
         max_train_steps=60,

@@ -249,3 +249,23 @@ def test_the_agent_does_as_it_is_told(segments: str, greedy: bool, slips: int) -
         if episode.episode_return != command.desired_return
     ]
     assert len(disobeyed) <= slips
+
+
+def test_training_has_the_threads_of_the_settings_and_leaves_the_others_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = set()
+
+    def counting(*args: Any) -> torch.Tensor:
+        seen.add(torch.get_num_threads())
+        return cross_entropy(*args)
+
+    cross_entropy = functional.cross_entropy
+    monkeypatch.setattr(functional, "cross_entropy", counting)
+    config = settings(training_threads=3)
+    one, other = (untrained(config, SPEC) for _ in range(2))
+    for state in (one, other):
+        train(state, ranked(config, EPISODES), config)
+        assert torch.get_num_threads() == 1
+    assert seen == {3}
+    assert digest(one) == digest(other)

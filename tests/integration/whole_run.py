@@ -29,6 +29,7 @@ SMALL: dict[str, Any] = {
     "hidden": [16, 16],
     "learning_rate": 3e-3,
     "n_warm_up_episodes": 12,
+    "warm_up_hold": 2,
     "n_episodes_per_iter": 6,
     "n_updates_per_iter": 10,
     "replay_size": 30,
