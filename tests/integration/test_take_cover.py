@@ -24,6 +24,8 @@ TAKE_COVER: dict[str, Any] = {
     "hidden": [8],
     "batch_size": 16,
     "precision": "auto",
+    "training_threads": 2,
+    "warm_up_hold": 7,
     "device": "auto",
     "initialisation": "orthogonal",
     "learning_rate": 1e-3,
