@@ -70,7 +70,8 @@ def check_udrl(words: list[str]) -> None:
     if name.startswith("-"):
         assert name in ("--help", "-h", "--version"), name
         return
-    command = cli.commands[name]
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None, name
     while isinstance(command, click.Group):
         name, *arguments = arguments
         command = command.commands[name]

@@ -19,7 +19,8 @@ class Rights(NamedTuple):
         asks: verbs that it may send to the replay service.
         hears: publications that it may receive.
         says: publications that it may send.
-        joins: whether it may say with a liveliness token that it is here.
+        joins: whether it may say with a liveliness token that it is here, and ask who else of its
+            role is.
     """
 
     asks: tuple[str, ...]
@@ -81,6 +82,8 @@ def _rules(role: str) -> list[dict[str, Any]]:
         ("hears", "egress", "put", hears),
         ("says", "ingress", "put", says),
         ("is here", "ingress", "liveliness_token", alive),
+        ("asks who is here", "ingress", "liveliness_query", alive),
+        ("is told who is here", "egress", "liveliness_token", alive),
     )
     return [
         {

@@ -1,7 +1,11 @@
 """The other commands: status, evaluate, and joining by hand."""
 
 import json
+import re
+import subprocess
+import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -84,8 +88,45 @@ def test_status_of_a_live_run_by_its_endpoint(cli: Callable[..., Cli], tmp_path:
     assert [actor.environments for actor in status.actors] == [16]
 
 
+def test_health_of_each_service(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    endpoint, config = f"tcp/127.0.0.1:{free_port()}", toml(TOY, tmp_path / "config.toml")
+
+    def health(role: str, patience: str = "20") -> tuple[int, str, str]:
+        return cli("health", role, "--connect", endpoint, "--patience", patience).finish()
+
+    def has_health(role: str, code: int) -> bool:
+        return health(role)[0] == code
+
+    code, _, error = health("replay", "0.1")
+    assert code == 6
+    assert f"nobody answers at '{endpoint}'" in error
+    cli("replay", "Figure2-v0", "--listen", endpoint, "--config", str(config),
+        "--max-env-steps", "10000000")  # fmt: skip
+    code, out, error = health("replay")
+    assert code == 0, error
+    assert f"answers at {endpoint}" in out
+    for role in ("learner", "actor"):
+        code, _, error = health(role)
+        assert code == 6
+        assert re.search(rf"no {role} of this machine \({role}-.*\) takes part in run", error)
+        service = cli(role, "--connect", endpoint)
+        wait_for(partial(has_health, role, 0), f"a healthy {role}")
+        service.process.kill()
+        wait_for(partial(has_health, role, 6), f"no {role} any more")
+
+
+def test_light_commands_do_not_load_torch(tmp_path: Path) -> None:
+    program = (
+        "import sys\nfrom udrl_launch.cli import cli\n"
+        "code = cli(['health', 'actor', '--help'], standalone_mode=False)\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert ended.returncode == 0, ended.stderr
+
+
 @pytest.mark.parametrize(
-    "name", ["train", "replay", "learner", "actor", "evaluate", "status", "keys create"]
+    "name", ["train", "replay", "learner", "actor", "evaluate", "status", "health", "keys create"]
 )
 def test_help_of_each_command_has_an_example(name: str, cli: Callable[..., Cli]) -> None:
     code, out, _ = cli(*name.split(), "--help").finish()

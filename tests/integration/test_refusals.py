@@ -15,6 +15,7 @@ from udrl.config import Budget
 from udrl.errors import ConfigError, Refused
 from udrl_actor.service import ActorService
 from udrl_launch import roles
+from udrl_launch.address import Address
 from udrl_learner.service import LearnerService
 from udrl_proto import keys
 from udrl_proto.asking import Asker
@@ -59,7 +60,7 @@ class Hosted:
 
     def finish(self) -> Status:
         """Let a good actor and a good learner end the run; return its last status."""
-        address = roles.Address(self.endpoint, patience_s=10)
+        address = Address(self.endpoint, patience_s=10)
         peers = [
             threading.Thread(target=roles.learner, args=(address, self.stop)),
             threading.Thread(target=roles.actor, args=(address, 4, self.stop)),

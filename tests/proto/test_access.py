@@ -325,15 +325,23 @@ def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> No
     assert heard.messages == [(keys.key("run", keys.PROGRESS), "true")]
 
 
+def there(client: zenoh.Session, role: str) -> list[str]:
+    """Return the tokens of a role that a client is told of."""
+    replies = client.liveliness().get(keys.alive("run", role, "t$*"), timeout=DEADLINE_S)
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
 @pytest.mark.parametrize(("role", "other"), [("actor", "learner"), ("learner", "actor")])
 def test_role_is_here_under_its_own_name_only(
     role: str, other: str, replay: Replay, connect: Connect
 ) -> None:
     client = connect(role)
-    client.liveliness().declare_token(keys.alive("run", other, "one"))
-    client.liveliness().declare_token(keys.alive("run", role, "two"))
+    declare = client.liveliness().declare_token
+    _kept = declare(keys.alive("run", other, "one")), declare(keys.alive("run", role, "two"))
     assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", role, "two")
-    # Nor does it see who else is here.
+    assert there(connect(role), role) == [keys.alive("run", role, "two")]
+    # Nor does it see who of another role is here.
+    assert there(connect(other), role) == []
     assert list(connect(other).liveliness().get("udrl/**", timeout=DEADLINE_S)) == []
     assert replay.tokens.empty()
 

@@ -2,16 +2,26 @@
 
 import os
 import sys
+from importlib import import_module
 from typing import NoReturn
 
 import click
 
 import udrl
 from udrl.errors import UdrlError
-from udrl_launch.commands.keys import keys
-from udrl_launch.commands.looking import evaluate, reproduce, status
-from udrl_launch.commands.services import actor, learner, replay
-from udrl_launch.commands.training import train
+
+#: Every command and the module that holds it, in the order of the help.
+_COMMANDS = {
+    "train": "training",
+    "replay": "services",
+    "learner": "services",
+    "actor": "services",
+    "evaluate": "looking",
+    "reproduce": "looking",
+    "status": "looking",
+    "health": "health",
+    "keys": "keys",
+}
 
 
 def main() -> NoReturn:
@@ -34,11 +44,21 @@ def main() -> NoReturn:
     os._exit(code or 0)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class _Commands(click.Group):
+    """Imports a command's module when it is wanted: most need torch, which takes a second."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return super().get_command(ctx, cmd_name)
+        module = import_module(f"udrl_launch.commands.{_COMMANDS[cmd_name]}")
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(udrl.__version__, prog_name="udrl")
 def cli() -> None:
     """Upside-Down Reinforcement Learning, exact and distributed."""
-
-
-for command in (train, replay, learner, actor, evaluate, reproduce, status, keys):
-    cli.add_command(command)

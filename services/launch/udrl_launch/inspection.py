@@ -20,7 +20,8 @@ from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl.evaluation import Evaluation, summarise
 from udrl.numerics import use_one_thread
 from udrl.replay import ReplayBuffer
-from udrl_launch.roles import ENDPOINT_FILE, Address, connected
+from udrl_launch.address import Address, connected
+from udrl_launch.roles import ENDPOINT_FILE
 from udrl_proto import keys
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Status, StatusRequest

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from udrl_launch import roles
+from udrl_launch.address import Address
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Supervisor
 from udrl_proto.access import REPLAY
@@ -114,7 +115,7 @@ class Threads:
                 audit=audit,
             ),
         )
-        address = roles.Address(endpoint, patience_s=float(_PATIENCE_S), keys=keys)
+        address = Address(endpoint, patience_s=float(_PATIENCE_S), keys=keys)
         self._start("learner", partial(roles.learner, address, self._stop))
         for number in range(1, fleet.actors + 1):
             self._start(

@@ -3,47 +3,24 @@
 import json
 import logging
 import os
-import platform
-import re
 import sys
 import threading
-import uuid
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
-
-import zenoh
 
 from udrl.config import Budget
 from udrl.errors import Deceived, RunFailed
 from udrl_actor.service import ActorService
+from udrl_launch.address import Address, connected, unique_name
 from udrl_learner.service import LearnerService
 from udrl_proto import session as sessions
-from udrl_proto.credentials import Credentials, load
-from udrl_proto.messages import Hello
+from udrl_proto.credentials import Credentials
 from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 
 ENDPOINT_FILE = "endpoint.json"
-
-
-class Address(NamedTuple):
-    """Where a run is.
-
-    Attributes:
-        endpoint: of its router.
-        run_id: which one, where the router carries several.
-        patience_s: seconds to try until somebody answers.
-        keys: folder with the keys that a service proves its role with; None: nobody is asked.
-    """
-
-    endpoint: str
-    run_id: str | None = None
-    patience_s: float = 3.0
-    keys: Path | None = None
 
 
 def replay(
@@ -110,26 +87,3 @@ def actor(
     sys.setswitchinterval(0.0005)
     with connected("actor", address, stop) as (session, hello):
         ActorService(session, hello, unique_name("actor"), environments, stop, hang_s).run()
-
-
-@contextmanager
-def connected(
-    role: str, address: Address, stop: threading.Event | None = None
-) -> Iterator[tuple[zenoh.Session, Hello]]:
-    """Connect to a run in a role, and find it.
-
-    Raises:
-        ConfigError: the endpoint or the keys cannot be used, or the run must be named.
-        Unreachable: nobody, or no such run, answers in time.
-        Interrupted: ``stop`` was set meanwhile.
-    """
-    endpoint, run_id, patience_s, keys = address
-    credentials = load(keys, role) if keys else None
-    with sessions.connect(endpoint, patience_s, stop, credentials) as session:
-        yield session, sessions.find_run(session, run_id, patience_s, stop)
-
-
-def unique_name(role: str) -> str:
-    """Return a name for a service that no other has."""
-    host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node())[:30] or "host"
-    return f"{role}-{host}-{os.getpid()}-{uuid.uuid4().hex[:6]}"

@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from udrl.errors import Interrupted, Unreachable
+from udrl_launch.address import Address, connected
 from udrl_launch.display import Display
 from udrl_launch.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
-from udrl_launch.roles import Address, connected
 from udrl_launch.settings import Settings
 from udrl_proto import keys as verbs
 from udrl_proto import session as sessions

@@ -9,9 +9,9 @@ import msgspec
 
 from udrl.errors import ConfigError, EnvironmentFault
 from udrl_launch import inspection
+from udrl_launch.address import Address
 from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
 from udrl_launch.display import panel
-from udrl_launch.roles import Address
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 

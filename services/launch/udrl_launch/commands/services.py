@@ -14,17 +14,9 @@ import click
 from udrl.errors import ConfigError, InexactArithmetic
 from udrl.numerics import STRICT_MKL
 from udrl_launch import roles
-from udrl_launch.commands.options import (
-    AUDIT,
-    KEYS,
-    PARENT,
-    PATIENCE,
-    RUN,
-    RUN_DIR,
-    gather_settings,
-    new_run_dir,
-    settings_options,
-)
+from udrl_launch.address import Address
+from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
+from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Settings
 from udrl_proto.access import REPLAY
@@ -118,9 +110,7 @@ def learner(
 
     Example: udrl learner --connect tcp/127.0.0.1:7447
     """
-    address = roles.Address(
-        check_endpoint(connect, secure=keys is not None), run_id, patience, keys
-    )
+    address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
     return _as_service(parent, partial(roles.learner, address))
 
 
@@ -155,9 +145,7 @@ def actor(
     Example: udrl actor --connect tcp/127.0.0.1:7447 --envs 16
     """
     os.nice(nice)
-    address = roles.Address(
-        check_endpoint(connect, secure=keys is not None), run_id, patience, keys
-    )
+    address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
     code = _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))
     if code == InexactArithmetic.exit_code and not STRICT_MKL.items() <= os.environ.items():
         log.warning("starting again with slower arithmetic that is exact")

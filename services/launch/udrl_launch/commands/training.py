@@ -10,14 +10,8 @@ import msgspec
 
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch import inspection
-from udrl_launch.commands.options import (
-    AUDIT,
-    KEYS,
-    RUN_DIR,
-    gather_settings,
-    new_run_dir,
-    settings_options,
-)
+from udrl_launch.commands.options import AUDIT, KEYS, RUN_DIR
+from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
 from udrl_launch.curve import draw
 from udrl_launch.display import Display
 from udrl_launch.process import log_to_stderr, run_service
