@@ -371,6 +371,10 @@ class Run:
                 iteration, closing, source, command.desired_return, command.desired_horizon, result
             )
         )
+        log.info(
+            "iteration %d, evaluation at %d env steps: mean return %.1f (95 %% from %.1f to %.1f)",
+            iteration, source, result.mean, result.ci95_low, result.ci95_high,
+        )  # fmt: skip
         best = self.progress.best_mean
         if not closing and (best is None or result.mean > best):
             self.progress.best_mean, self.progress.best_version = result.mean, version
