@@ -1,0 +1,38 @@
+# One image for every role: `docker build -t udrl .`
+#
+# BASE_IMAGE   a slim image with Python 3.11 or newer as python3; what runs is built on it
+# BUILD_IMAGE  the same, with what pip needs to reach a package index here, if anything
+# TORCH_INDEX  an index of CPU-only torch wheels, which saves gigabytes without a GPU
+ARG BASE_IMAGE=python:3.11-slim-bookworm
+ARG BUILD_IMAGE=${BASE_IMAGE}
+
+FROM ${BUILD_IMAGE} AS build
+ARG TORCH_INDEX=
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+WORKDIR /src
+RUN python3 -m venv /opt/udrl
+# What changes rarely comes first, so that a change of code does not fetch torch again.
+COPY pyproject.toml constraints.txt ./
+RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+extras = p["optional-dependencies"]; \
+print(*p["dependencies"], *extras["box2d"], *extras["doom"], *extras["secure"], sep="\n")' \
+        > requirements.txt \
+    && /opt/udrl/bin/pip install --constraint constraints.txt \
+        ${TORCH_INDEX:+--extra-index-url ${TORCH_INDEX}} --requirement requirements.txt
+COPY README.md LICENSE ./
+COPY udrl udrl
+COPY proto proto
+COPY services services
+# Nothing is built against torch here, and nobody installs anything later.
+RUN /opt/udrl/bin/pip install --no-deps . \
+    && rm -rf /opt/udrl/lib/python3*/site-packages/torch/include \
+    && /opt/udrl/bin/pip uninstall --yes pip setuptools
+
+FROM ${BASE_IMAGE}
+RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin udrl \
+    && mkdir /runs /keys && chown udrl:udrl /runs /keys
+COPY --from=build /opt/udrl /opt/udrl
+ENV PATH=/opt/udrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1
+USER udrl
+WORKDIR /runs
+ENTRYPOINT ["udrl"]
