@@ -30,7 +30,8 @@ RUN /opt/udrl/bin/pip install --no-deps . \
 
 FROM ${BASE_IMAGE}
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin udrl \
-    && mkdir /runs /keys && chown udrl:udrl /runs /keys
+    && mkdir -p /runs /keys/ca /keys/replay /keys/learner /keys/actor /keys/observer \
+    && chown -R udrl:udrl /runs /keys
 COPY --from=build /opt/udrl /opt/udrl
 ENV PATH=/opt/udrl/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1
 USER udrl

@@ -78,10 +78,25 @@ def test_keys_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
 
 
+def test_empty_folders_may_be_there_and_keys_may_be_wanted_once(tmp_path: Path) -> None:
+    for role in ROLES:
+        (tmp_path / role).mkdir()
+    command = ["keys", "create", str(tmp_path), "--if-missing"]
+    results = [CliRunner().invoke(cli, command) for _ in range(2)]
+    assert [result.exit_code for result in results] == [0, 0]
+    assert "already" in results[1].output
+    (tmp_path / "actor" / "key.pem").unlink()
+    incomplete = CliRunner().invoke(cli, command)
+    assert isinstance(incomplete.exception, ConfigError)
+    assert "is not empty" in str(incomplete.exception)
+
+
 def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "keys"):
-        with pytest.raises(ConfigError, match=rf"cannot write keys to {folder}: Not a directory"):
+        with pytest.raises(
+            ConfigError, match=rf"cannot write keys to {folder}: (File exists|Not a directory)"
+        ):
             authority.create(folder)
 
 

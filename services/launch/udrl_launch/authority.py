@@ -35,7 +35,7 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
     """Make an authority, and a folder with key and certificate for each role.
 
     Args:
-        folder: where; it must not exist, or be empty.
+        folder: where; it must not exist, or hold nothing but folders, such as volumes.
         hosts: names and IP addresses by which others reach the replay service; those of the
             loopback interface are always among them.
         valid: how long everything is.
@@ -57,7 +57,7 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
         )
         files[Path(role, KEY)] = _pem(key)
     try:
-        if folder.exists() and any(folder.iterdir()):
+        if any(not path.is_dir() for path in folder.rglob("*")):
             raise ConfigError(
                 f"{folder} is not empty, and keys are never overwritten; name another folder, or "
                 f"remove this one first"
@@ -67,6 +67,13 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
         raise ConfigError(
             f"cannot write keys to {folder}: {error.strerror}; name another folder"
         ) from error
+
+
+def are_there(folder: Path) -> bool:
+    """Say whether a folder holds keys for every role."""
+    return all(
+        (folder / role / name).is_file() for role in ROLES for name in (CA, CERTIFICATE, KEY)
+    )
 
 
 class _Authority:

@@ -144,6 +144,8 @@ class ReplayService:
             *serve(self._session, run_id, self._verbs(), self._inbox),
         ]
         log.info("replay serves run %s", run_id)
+        if self.run.progress.state == "ended":
+            log.info("the run has ended; with a greater --max-env-steps it goes on")
         try:
             self._answer_until_ended(stop)
             # Only here: after an error, what is in memory may be ahead of what is on disk.
