@@ -1,0 +1,139 @@
+"""``docker compose up``, what is done to it, and that the result is the one of a single process."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from compose_project import IMAGE, Project, run
+from udrl_proto.messages import Status
+from whole_run import Cli, assert_conserved, digests, free_port, wait_for
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(2400)]
+
+PLAIN = ("--connect", "tcp/127.0.0.1:7447")
+WITH_KEYS = ("--connect", "tls/127.0.0.1:7447", "--keys", "/keys")
+SECURE = ["compose.yaml", "compose.secure.yaml"]
+OUTSIDE = "udrl-test-outside"
+#: Of the network that the actor from outside is in; its gateway is this machine.
+SUBNET, GATEWAY = "10.213.7.0/24", "10.213.7.1"
+
+
+def arguments(env_steps: int) -> str:
+    return f"--seed 5 --max-env-steps {env_steps}"
+
+
+def alone(cli: Callable[..., Cli], env_steps: int, run_dir: Path) -> Status:
+    """Return the status of the same run in one process, without containers."""
+    given = ["train", "CartPole-v1", "--in-process", "--run-dir", str(run_dir), "--json"]
+    return cli(*given, *arguments(env_steps).split()).status(timeout=600)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def image() -> None:
+    """The image of this checkout; nothing is done where there is no engine."""
+    Project("udrl-test-image", ["compose.yaml"], {}).compose("build", timeout=1800)
+
+
+@pytest.fixture
+def outside() -> Iterator[str]:
+    """A network that reaches nothing of the project but its published port."""
+    run("docker", "network", "create", "--subnet", SUBNET, "--gateway", GATEWAY, OUTSIDE)
+    yield OUTSIDE
+    run("docker", "network", "rm", OUTSIDE)
+
+
+def test_down_and_up_go_on_and_no_port_is_published(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    steps = 60_000
+    project = Project(
+        "udrl-test-plain", ["compose.yaml"], {"ENV": "CartPole-v1", "ARGS": arguments(steps)}
+    )
+    try:
+        project.compose("up", "--detach")
+        wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "some iterations", 120)
+        for service in ("replay", "learner", "actor"):
+            for container in project.containers(service):
+                assert run("docker", "port", container) == ""
+        began = time.monotonic()
+        project.compose("down")
+        assert time.monotonic() - began < 10
+        project.compose("up", "--detach")
+        assert project.exit_codes("replay") == [0]
+        ended = project.status()
+    finally:
+        project.down()
+    assert_conserved(ended)
+    assert digests(ended) == digests(alone(cli, steps, tmp_path / "alone"))
+
+
+def test_faults_and_an_actor_from_outside_change_nothing(
+    cli: Callable[..., Cli], tmp_path: Path, outside: str
+) -> None:
+    steps, port = 700_000, free_port()
+    variables = {"ENV": "CartPole-v1", "ARGS": arguments(steps), "UDRL_HOST": GATEWAY}
+    project = Project("udrl-test-secure", SECURE, variables | {"UDRL_PORT": str(port)})
+
+    def goes_on(what: str, actors: int | None = None) -> None:
+        """Wait until two more iterations are done, with so many actors."""
+        first: list[int] = []
+
+        def further() -> bool:
+            status = project.live(*WITH_KEYS)
+            if status is None or actors not in (None, len(status.actors)):
+                return False
+            first.append(status.iteration)
+            return status.iteration > first[0] + 1
+
+        wait_for(further, f"the run to go on {what}", 120)
+
+    try:
+        project.compose("up", "--detach")
+        goes_on("at the start", 2)
+        project.scale(4)
+        goes_on("with four actors", 4)
+        project.scale(1)
+        goes_on("with one actor", 1)
+        project.kill("replay")
+        goes_on("after the replay service was killed")
+        project.kill("learner")
+        goes_on("after the learner was killed")
+
+        (actor,) = project.containers("actor")
+        network = f"{project.name}_run"
+        run("docker", "network", "disconnect", network, actor)
+        wait_for(
+            lambda: (s := project.live(*WITH_KEYS)) and not s.actors, "the actor to be missed", 60
+        )
+        run("docker", "network", "connect", network, actor)
+        goes_on("after the network was cut", 1)
+
+        project.scale(0)
+        stranger = run(
+            "docker", "run", "--detach", "--init", "--network", outside,
+            "--volume", f"{project.name}_keys-actor:/keys/actor:ro", IMAGE,
+            "actor", "--connect", f"tls/{GATEWAY}:{port}", "--keys", "/keys", "--patience", "60",
+        ).strip()  # fmt: skip
+        try:
+            goes_on("with the actor from outside alone", 1)
+            project.scale(2)
+            assert project.exit_codes("replay") == [0]
+            assert run("docker", "wait", stranger, timeout=60).strip() == "0"
+        finally:
+            run("docker", "rm", "--force", stranger)
+        ended = project.status()
+    finally:
+        project.down()
+    assert_conserved(ended)
+    assert digests(ended) == digests(alone(cli, steps, tmp_path / "alone"))
+
+
+def test_image_runs_as_nobody_special_and_holds_nothing_to_build_with() -> None:
+    inside = ["docker", "run", "--rm", "--read-only", "--entrypoint", "sh", IMAGE, "-c"]
+    assert run(*inside, "id -u").strip() == "10001"
+    assert run(*inside, "command -v gcc cc make || echo none").strip() == "none"
+    assert run(*inside, "python -c 'import pip' 2>/dev/null || echo none").strip() == "none"
+    ours = "find /opt/udrl/lib/python3*/site-packages/udrl* /runs -name 'test_*'"
+    assert run(*inside, ours).strip() == ""
