@@ -18,6 +18,7 @@ from udrl.algorithm1 import Run, algorithm1
 from udrl.config import Budget, Config, build
 from udrl.errors import UdrlError
 from udrl_launch.inspection import status_of
+from udrl_launch.settings import gather
 from udrl_proto.messages import Status
 
 #: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
@@ -53,6 +54,7 @@ TOY: dict[str, Any] = SMALL | {
 LANDER: dict[str, Any] = SMALL | {
     "environment": "LunarLander-v3",
     "max_return": None,
+    "max_train_steps": 500,
     "n_warm_up_episodes": 20,
     "n_episodes_per_iter": 10,
     "eval_every": 5000,
@@ -116,13 +118,15 @@ class Cli:
 def arguments(config: dict[str, Any], max_env_steps: int, run_dir: Path) -> list[str]:
     """Return the arguments of ``udrl train`` for a configuration."""
     given = [
-        item
+        f"{name}={json.dumps(value)}"
         for name, value in config.items()
         if name != "environment" and value is not None
-        for item in ("--set", f"{name}={json.dumps(value)}")
     ]
+    understood = gather(config["environment"], options={}, assignments=given).config
+    assert understood == build(Config, config), "a preset has what this configuration leaves out"
     return [
-        "train", config["environment"], "--run-dir", str(run_dir), "--json", *given,
+        "train", config["environment"], "--run-dir", str(run_dir), "--json",
+        *(item for assignment in given for item in ("--set", assignment)),
         "--max-env-steps", str(max_env_steps),
     ]  # fmt: skip
 
