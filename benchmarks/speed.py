@@ -45,6 +45,7 @@ from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 from udrl_launch.inspection import load_agent, status_of
+from udrl_launch.process import keep_freed_memory
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.run import Progress
@@ -90,6 +91,8 @@ def main() -> None:
     parser.add_argument("--reference-steps", type=int, default=300_000)
     parser.add_argument("--parts", type=Path, metavar="RUN_DIR", help="time a run's parts only")
     options = parser.parse_args()
+    if options.parts:
+        keep_freed_memory()
     use_one_thread()
     if options.parts:
         print(json.dumps(_parts(*_recorded(options.parts))))
@@ -242,6 +245,8 @@ def _time_parts(run_dir: Path, processes: int) -> Parts:
 
 
 def _parts(config: Config, episodes: list[Episode]) -> Parts:
+    # The limit counts the time of cores; more threads an update would take more of them.
+    config = msgspec.structs.replace(config, training_threads=1)
     generator = EpisodeGenerator(config, 1)
     spec = generator.spec
     env = make_environment(config)

@@ -17,7 +17,12 @@ from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
-from udrl_launch.process import die_with_parent, log_to_stderr, run_service
+from udrl_launch.process import (
+    die_with_parent,
+    keep_freed_memory,
+    log_to_stderr,
+    run_service,
+)
 from udrl_launch.settings import Settings
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
@@ -111,6 +116,7 @@ def learner(
     Example: udrl learner --connect tcp/127.0.0.1:7447
     """
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
+    keep_freed_memory()
     return _as_service(parent, partial(roles.learner, address))
 
 
