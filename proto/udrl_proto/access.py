@@ -4,7 +4,8 @@ A service proves its role with a certificate whose common name is that role
 (:mod:`udrl_proto.credentials`). The router that the replay service hosts lets pass what stands
 here, and drops everything else without an answer. The replay service itself has no row: it talks
 within its own session, to which a router's rules do not apply. So nobody who connects can answer in
-its place.
+its place. To a router that somebody else hosts it connects like the others, and there it may answer
+what they ask.
 """
 
 from typing import Any, NamedTuple
@@ -52,14 +53,38 @@ RIGHTS = {
 ROLES = (REPLAY, *RIGHTS)
 
 
-def access_control() -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` setting for a run's router."""
-    rules = {role: _rules(role) for role in RIGHTS}
+#: What passes a router: what it is for, the flow, and the kind of message, as Zenoh calls them.
+Rule = tuple[str, str, str]
+
+
+def access_control(*, hosted: bool = True) -> dict[str, Any]:
+    """Return Zenoh's ``access_control`` setting for a run's router.
+
+    Args:
+        hosted: the replay service hosts it; otherwise it connects to it.
+    """
+    wanted = {role: _of_client(role) for role in RIGHTS}
+    if not hosted:
+        wanted[REPLAY] = _of_replay()
+    rules = {
+        role: [
+            {
+                "id": f"{role} {what}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": [message],
+                "key_exprs": expressions,
+            }
+            for (what, flow, message), expressions in of_role.items()
+            if expressions
+        ]
+        for role, of_role in wanted.items()
+    }
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for of_role in rules.values() for rule in of_role],
-        "subjects": [{"id": role, "cert_common_names": [role]} for role in RIGHTS],
+        "subjects": [{"id": role, "cert_common_names": [role]} for role in rules],
         "policies": [
             {"subjects": [role], "rules": [rule["id"] for rule in of_role]}
             for role, of_role in rules.items()
@@ -67,32 +92,41 @@ def access_control() -> dict[str, Any]:
     }
 
 
-def _rules(role: str) -> list[dict[str, Any]]:
+def _question(verb: str) -> str:
+    # A run is looked for whatever protocol it speaks, so that the difference can be told.
+    return keys.every_hello() if verb == keys.HELLO else keys.key("*", verb)
+
+
+def _of_client(role: str) -> dict[Rule, list[str]]:
     """Return what the router lets in from a role, and what it lets out to it."""
     rights = RIGHTS[role]
-    # A run is looked for whatever protocol it speaks, so that the difference can be told.
-    asks = [keys.every_hello() if v == keys.HELLO else keys.key("*", v) for v in rights.asks]
+    asks = [_question(verb) for verb in rights.asks]
     hears = [keys.key("*", name) for name in rights.hears]
     says = [keys.key("*", name) for name in rights.says]
     alive = [keys.alive("*", role, "*")] if rights.joins else []
-    wanted = (
-        ("asks", "ingress", "query", asks),
-        ("is answered", "egress", "reply", asks),
-        ("listens", "ingress", "declare_subscriber", hears),
-        ("hears", "egress", "put", hears),
-        ("says", "ingress", "put", says),
-        ("is here", "ingress", "liveliness_token", alive),
-        ("asks who is here", "ingress", "liveliness_query", alive),
-        ("is told who is here", "egress", "liveliness_token", alive),
-    )
-    return [
-        {
-            "id": f"{role} {what}",
-            "permission": "allow",
-            "flows": [flow],
-            "messages": [message],
-            "key_exprs": expressions,
-        }
-        for what, flow, message, expressions in wanted
-        if expressions
-    ]
+    return {
+        ("asks", "ingress", "query"): asks,
+        ("is answered", "egress", "reply"): asks,
+        ("listens", "ingress", "declare_subscriber"): hears,
+        ("hears", "egress", "put"): hears,
+        ("says", "ingress", "put"): says,
+        ("is here", "ingress", "liveliness_token"): alive,
+        ("asks who is here", "ingress", "liveliness_query"): alive,
+        ("is told who is here", "egress", "liveliness_token"): alive,
+    }
+
+
+def _of_replay() -> dict[Rule, list[str]]:
+    """Return the counterpart: what a router lets in from the replay service, and out to it."""
+    answers = [_question(verb) for verb in keys.VERBS]
+    says = [keys.key("*", keys.PROGRESS)]
+    alive = [keys.alive("*", role, "*") for role, rights in RIGHTS.items() if rights.joins]
+    watches = [keys.alive("*", "*", "*")]
+    return {
+        ("offers answers", "ingress", "declare_queryable"): answers,
+        ("is asked", "egress", "query"): answers,
+        ("answers", "ingress", "reply"): answers,
+        ("says", "ingress", "put"): says,
+        ("watches", "ingress", "declare_liveliness_subscriber"): watches,
+        ("is told who is here", "egress", "liveliness_token"): alive,
+    }

@@ -5,6 +5,7 @@ one folder for each role. Nothing here, and no log line, holds more of a key tha
 """
 
 import logging
+import os
 import socket
 import ssl
 from pathlib import Path
@@ -113,6 +114,9 @@ def load(folder: Path, role: str) -> Credentials:
     own = (folder / role if (folder / role).is_dir() else folder).absolute()
     found = Credentials(own / CA, own / CERTIFICATE, own / KEY)
     certificates.check(*found, role)
-    if found.key.stat().st_mode & 0o077:
+    file = found.key.stat()
+    # Where root gives a key to a service, as Kubernetes does, it can only be by way of a group.
+    may = 0o640 if file.st_uid == 0 and os.geteuid() != 0 else 0o600
+    if file.st_mode & 0o777 & ~may:
         log.warning("%s can be read by others; chmod 600 it", found.key)
     return found

@@ -25,6 +25,9 @@ _ENDPOINT = re.compile(
 #: A hung or cut-off service is noticed after this many milliseconds.
 LEASE_MS = 2000
 
+#: As many as may join; by default Zenoh turns the 1,001st away.
+MAX_SESSIONS = 11_000
+
 
 def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
     """Return an endpoint as it came.
@@ -89,8 +92,7 @@ def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
         # Silent losses are reported for shared memory when a receiver is descheduled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
-        # As many as may join; by default Zenoh turns the 1,001st away.
-        "transport/unicast/max_sessions": 11_000,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         **tls,
     }.items():
         config.insert_json5(path, json.dumps(value))

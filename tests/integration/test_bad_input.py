@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from whole_run import TOY, Cli, arguments, live_status, wait_for
+from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 
 #: Importing torch takes a second or two on a busy machine, before anything can be checked.
 PROMPT_S = 15
@@ -58,13 +58,6 @@ def taken_port() -> Iterator[int]:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         yield taken.getsockname()[1]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_port_in_use_is_refused(taken_port: int, cli: Callable[..., Cli], tmp_path: Path) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from test_bad_input import free_port
 from udrl_proto.messages import Status
-from whole_run import SMALL, TOY, Cli, arguments, digests, live_status, small, wait_for
+from whole_run import SMALL, TOY, Cli, arguments, digests, free_port, live_status, small, wait_for
 
 BUDGET = 3000
 

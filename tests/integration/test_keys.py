@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from test_bad_input import free_port
 from test_commands import toml
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch.cli import cli as command_line
@@ -17,7 +16,9 @@ from whole_run import (
     TOY,
     Cli,
     arguments,
+    configured_router,
     digests,
+    free_port,
     kill_at,
     live_status,
     small,
@@ -57,6 +58,28 @@ def test_services_that_have_only_their_own_keys_equal_one_process(
         code, out, error = process.finish()
         assert code == 0, error
         assert not [secret for secret in secrets_of(keys_dir) if secret in out + error]
+    status = live_status(run_dir)
+    assert status is not None
+    assert digests(status) == digests(run(small(), BUDGET))
+
+
+def test_services_meet_at_a_router_of_somebody_else(
+    cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
+) -> None:
+    endpoint, run_dir = f"tls/127.0.0.1:{free_port()}", tmp_path / "run"
+    config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
+    given = {"replay": ["CartPole-v1", "--run-dir", str(run_dir), "--config", str(config)]}
+    with configured_router(endpoint, keys_dir):
+        others = [
+            cli(
+                role, *given.get(role, ()), "--connect", endpoint,
+                "--keys", str(keys_dir / role),
+            )
+            for role in ("replay", "learner", "actor")
+        ]  # fmt: skip
+        for process in others:
+            code, _, error = process.finish()
+            assert code == 0, error
     status = live_status(run_dir)
     assert status is not None
     assert digests(status) == digests(run(small(), BUDGET))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import zenoh
 
-from test_bad_input import free_port
 from udrl.config import Budget
 from udrl.errors import ConfigError, Refused
 from udrl_actor.service import ActorService
@@ -33,7 +32,7 @@ from udrl_proto.messages import (
 )
 from udrl_proto.session import connect, find_run
 from udrl_replay.creation import create
-from whole_run import assert_conserved, digests, reference, toy
+from whole_run import assert_conserved, digests, free_port, reference, toy
 
 BUDGET = 300
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import zenoh
 
 from udrl.algorithm1 import Run, algorithm1
 from udrl.config import Budget, Config, build
@@ -178,6 +179,13 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def configured_router(endpoint: str, keys_dir: Path) -> zenoh.Session:
+    """Return a router with the configuration that ``zenohd`` is to be given, for this endpoint."""
+    text = (Path(__file__).parents[2] / "deploy" / "zenohd.json5").read_text(encoding="utf-8")
+    text = text.replace("tls/0.0.0.0:7447", endpoint)
+    return zenoh.open(zenoh.Config.from_json5(text.replace("/etc/udrl", f"{keys_dir}/replay")))
 
 
 def kill_at(process: Cli, run_dir: Path, role: str, iteration: int) -> None:

@@ -1,6 +1,7 @@
 """Keys that do not fit are named, with the remedy, before anybody is talked to."""
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -109,6 +110,21 @@ def test_key_that_others_can_read_is_warned_of(
     (folder / KEY).chmod(0o640)
     load(folder, "actor")
     assert caplog.messages == [f"{folder / KEY} can be read by others; chmod 600 it"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can own the file")
+@pytest.mark.parametrize(("mode", "warnings"), [(0o640, 0), (0o644, 1), (0o660, 1)])
+def test_key_that_root_gives_by_way_of_a_group_is_not(
+    mode: int,
+    warnings: int,
+    folder: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (folder / KEY).chmod(mode)
+    monkeypatch.setattr(os, "geteuid", lambda: 10001)
+    load(folder, "actor")
+    assert len(caplog.messages) == warnings
 
 
 def test_settings_hold_paths_only(folder: Path) -> None:
