@@ -1,0 +1,123 @@
+"""Where containers run: the files agree with each other, with the schemas, and with the program."""
+
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from tests.markdown import ROOT
+from tests.test_docs_examples import check_udrl
+
+KUBERNETES = ROOT / "deploy" / "kubernetes"
+MANIFESTS = sorted(KUBERNETES.glob("*.yaml"))
+VERSION = "1.31"
+
+#: What a Swarm reads elsewhere, below ``deploy``, or not at all.
+ONLY_COMPOSE = {"build", "depends_on", "restart", "scale", "security_opt"}
+
+
+def load(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def services(file: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = load(ROOT / file)["services"]
+    return found
+
+
+def documents(path: Path) -> Iterator[dict[str, Any]]:
+    yield from yaml.safe_load_all(path.read_text(encoding="utf-8"))
+
+
+def test_swarm_runs_the_services_of_compose() -> None:
+    stack, compose = services("deploy/stack.yaml"), services("compose.yaml")
+    assert stack.keys() == compose.keys()
+    for name, service in compose.items():
+        same = {key: value for key, value in service.items() if key not in ONLY_COMPOSE}
+        deploy = stack[name].pop("deploy")
+        assert stack[name] == same
+        assert deploy.get("replicas", 1) == service.get("scale", 1)
+        assert deploy["restart_policy"]["condition"] == service["restart"]
+
+
+def commands(file: str) -> Iterator[list[str]]:
+    for service in services(file).values():
+        if "command" in service:
+            filled = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", service["command"])
+            yield shlex.split(filled)
+        if "healthcheck" in service:
+            yield service["healthcheck"]["test"][2:]
+
+
+@pytest.mark.parametrize(
+    "file", ["compose.yaml", "compose.secure.yaml", "compose.gpu.yaml", "deploy/stack.yaml"]
+)
+def test_containers_are_given_commands_that_there_are(file: str) -> None:
+    found = list(commands(file))
+    assert found
+    for words in found:
+        check_udrl(words)
+
+
+@pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.name)
+def test_kubernetes_accepts_the_manifests(path: Path) -> None:
+    for document in documents(path):
+        if document["kind"] != "Kustomization":  # it is for a program, not for the cluster
+            kubernetes_validate.validate(document, VERSION, strict=True)
+
+
+def test_the_schemas_refuse_a_misspelt_field() -> None:
+    document = next(documents(KUBERNETES / "actor.yaml"))
+    document["spec"]["replica"] = 2
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(document, VERSION, strict=True)
+
+
+def workloads() -> Iterator[dict[str, Any]]:
+    for path in MANIFESTS:
+        yield from (d for d in documents(path) if d["kind"] in ("Deployment", "StatefulSet"))
+
+
+def test_kubernetes_runs_the_services_of_compose() -> None:
+    found = {workload["metadata"]["name"]: workload for workload in workloads()}
+    assert found.keys() == services("compose.yaml").keys()
+    settings = load(KUBERNETES / "kustomization.yaml")["configMapGenerator"][0]["literals"]
+    values = dict(text.split("=") for text in settings)
+    for name, workload in found.items():
+        (container,) = workload["spec"]["template"]["spec"]["containers"]
+        words = [re.sub(r"\$\((\w+)\)", lambda m: values[m[1]], w) for w in container["args"]]
+        assert words[0] == name
+        check_udrl(words)
+        for probe in ("readinessProbe", "livenessProbe"):
+            if probe in container:
+                program, *arguments = container[probe]["exec"]["command"]
+                assert program == "udrl"
+                check_udrl(arguments)
+
+
+def test_an_autoscaler_may_scale_actors_and_nothing_else() -> None:
+    counted = {w["metadata"]["name"]: w["spec"].get("replicas") for w in workloads()}
+    assert counted == {"replay": 1, "learner": 1, "actor": None}
+
+
+def test_kustomization_names_every_manifest() -> None:
+    named = load(KUBERNETES / "kustomization.yaml")["resources"]
+    assert sorted([*named, "kustomization.yaml"]) == [path.name for path in MANIFESTS]
+
+
+def test_slurm_script_says_what_it_needs() -> None:
+    script = ROOT / "deploy" / "slurm" / "actors.sbatch"
+    done = subprocess.run(
+        ["bash", str(script)], capture_output=True, text=True, timeout=10, env={"PATH": "/bin"}
+    )
+    assert done.returncode == 1
+    assert "UDRL_ENDPOINT: is not set; e.g." in done.stderr
+    (command,) = re.findall(r"^exec udrl (.*)$", script.read_text(), flags=re.MULTILINE)
+    filled = command.replace('"$UDRL_ENDPOINT"', "tls/host:7447").replace('"$UDRL_KEYS"', "keys")
+    check_udrl(shlex.split(filled))
