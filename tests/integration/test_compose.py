@@ -1,5 +1,6 @@
 """``docker compose up``, what is done to it, and that the result is the one of a single process."""
 
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -137,3 +138,63 @@ def test_image_runs_as_nobody_special_and_holds_nothing_to_build_with() -> None:
     assert run(*inside, "python -c 'import pip' 2>/dev/null || echo none").strip() == "none"
     ours = "find /opt/udrl/lib/python3*/site-packages/udrl* /runs -name 'test_*'"
     assert run(*inside, ours).strip() == ""
+
+
+# What is wrong is told in the log of the container that suffers, and by its exit code.
+
+
+def told(*arguments: str, options: tuple[str, ...] = (), image: str = IMAGE) -> tuple[int, str]:
+    """Return exit code and log of a container that ends by itself."""
+    command = ["docker", "run", "--rm", "--init", "--read-only", "--tmpfs", "/tmp", *options]
+    done = subprocess.run([*command, image, *arguments], capture_output=True, text=True, timeout=90)
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stderr
+
+
+def test_volume_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)  # of whoever runs the tests, and not of user 10001
+    code, log = told(
+        "replay", "CartPole-v1", "--run-dir", "/runs/one", "--listen", "tcp/127.0.0.1:7447",
+        options=("--volume", f"{tmp_path}:/runs"),
+    )  # fmt: skip
+    assert code == 8
+    assert "/runs/one" in log
+    assert "Permission denied" in log
+
+
+def test_keys_that_are_not_there_are_told() -> None:
+    code, log = told("actor", "--connect", "tls/replay:7447", "--keys", "/keys")
+    assert code == 2
+    assert "/keys/actor/ca.pem: No such file" in log
+    assert "udrl keys create" in log
+
+
+def test_replay_service_that_does_not_come_is_told() -> None:
+    code, log = told("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
+    assert code == 6
+    assert "waiting for a replay service or router at tcp/127.0.0.1:7447" in log
+    assert "nobody answers at 'tcp/127.0.0.1:7447' after" in log
+
+
+def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
+    tag = "udrl-test-other-protocol"
+    (tmp_path / "Dockerfile").write_text(
+        f"FROM {IMAGE}\nUSER root\n"
+        "RUN sed -i 's/^PROTOCOL = .*/PROTOCOL = 999/' /opt/udrl/lib/python3*/site-packages/"
+        "udrl_proto/__init__.py\nUSER udrl\n"
+    )
+    run("docker", "build", "--tag", tag, str(tmp_path))
+    project = Project(
+        "udrl-test-other", ["compose.yaml"], {"ENV": "CartPole-v1", "ARGS": arguments(10**8)}
+    )
+    try:
+        project.compose("up", "--detach")
+        network = ("--network", f"{project.name}_run")
+        code, log = told("actor", "--connect", "tcp/replay:7447", options=network, image=tag)
+        assert code == 2
+        assert "the run speaks protocol 1, this program speaks 999" in log
+        assert "install the same version of udrl on both sides" in log
+        wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "the run to go on", 120)
+    finally:
+        project.down()
+        run("docker", "image", "rm", tag)

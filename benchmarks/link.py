@@ -1,0 +1,193 @@
+"""What an actor on another machine sends and receives, and what a slow link costs.
+
+Replay service and learner run here; one actor reaches them through a proxy that counts the bytes,
+lets only so many pass in a second, and holds each for a while. Counted is what TCP carries, without
+its own headers. With mutual TLS some percent are added.
+
+::
+
+    .venv/bin/python benchmarks/link.py
+    .venv/bin/python benchmarks/link.py --env TakeCover-v0 --links 0:0 10:20
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from udrl.errors import UdrlError
+from udrl_launch.inspection import status_of
+from udrl_launch.training import free_port
+from udrl_proto.messages import Status
+
+_CHUNK = 16 * 1024
+
+
+class Link(NamedTuple):
+    """Mbit/s in each direction, 0: as fast as loopback; and the milliseconds of one way."""
+
+    mbit_s: float
+    delay_ms: float
+
+    @classmethod
+    def parse(cls, text: str) -> "Link":
+        """Return a link written as ``MBIT_S:DELAY_MS``."""
+        mbit_s, delay_ms = text.split(":")
+        return cls(float(mbit_s), float(delay_ms))
+
+
+class Proxy:
+    """Forwards connections to a port of loopback, in a thread.
+
+    Attributes:
+        port: where it listens.
+        up, down: bytes that clients have sent and were sent.
+    """
+
+    def __init__(self, link: Link, target: int) -> None:
+        self._link, self._target = link, target
+        self.up = self.down = 0
+        self._loop = asyncio.new_event_loop()
+        self._server = self._loop.run_until_complete(
+            asyncio.start_server(self._serve, "127.0.0.1", 0)
+        )
+        self.port: int = self._server.sockets[0].getsockname()[1]
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            to_reader, to_writer = await asyncio.open_connection("127.0.0.1", self._target)
+        except OSError:
+            writer.close()
+            return
+        await asyncio.gather(
+            self._pump(reader, to_writer, up=True), self._pump(to_reader, writer, up=False)
+        )
+
+    async def _pump(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool
+    ) -> None:
+        """Forward one direction: a queue of what is on its way, and who takes it out in time."""
+        # What the sender may have on its way is what the link holds, and no more.
+        held = max(4, int(self._link.mbit_s * 125 * self._link.delay_ms / _CHUNK) + 4)
+        way: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(held)
+
+        async def arrive() -> None:
+            while True:
+                due, data = await way.get()
+                await asyncio.sleep(due - self._loop.time())
+                if not data:
+                    break
+                writer.write(data)
+                await writer.drain()
+
+        arriving = asyncio.create_task(arrive())
+        free = self._loop.time()
+        with contextlib.suppress(OSError):
+            while data := await reader.read(_CHUNK):
+                if up:
+                    self.up += len(data)
+                else:
+                    self.down += len(data)
+                if self._link.mbit_s:
+                    free = max(free, self._loop.time()) + len(data) / (self._link.mbit_s * 125_000)
+                    await asyncio.sleep(free - self._loop.time())
+                await way.put((self._loop.time() + self._link.delay_ms / 1000, data))
+        await way.put((self._loop.time(), b""))
+        with contextlib.suppress(OSError):
+            await arriving
+        writer.close()
+
+
+@contextlib.contextmanager
+def _started(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "udrl_launch", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+def _status(run_dir: Path) -> Status | None:
+    with contextlib.suppress(UdrlError):
+        return status_of(run_dir)
+    return None
+
+
+def _completed(run_dir: Path, iteration: int) -> Status:
+    """Return the status when an iteration is complete.
+
+    Raises:
+        TimeoutError: it takes more than ten minutes.
+    """
+    deadline = time.monotonic() + 600
+    while time.monotonic() < deadline:
+        status = _status(run_dir)
+        if status is not None and status.iteration >= iteration:
+            return status
+        time.sleep(0.1)
+    raise TimeoutError(f"iteration {iteration} was not complete after 600 s")
+
+
+def measure(environment: str, link: Link, seconds: float, run_dir: Path) -> dict[str, float]:
+    """Return what one actor did over a link, from the first iterations on."""
+    port = free_port()
+    proxy = Proxy(link, port)
+    coordinator = _started(
+        "train", environment, "--actors", "0", "--listen", f"tcp/127.0.0.1:{port}",
+        "--max-env-steps", "100000000", "--run-dir", str(run_dir),
+    )  # fmt: skip
+    actor = _started("actor", "--connect", f"tcp/127.0.0.1:{proxy.port}", "--patience", "60")
+    with coordinator, actor:
+        first = _completed(run_dir, 3)
+        up, down, began = proxy.up, proxy.down, time.monotonic()
+        time.sleep(seconds)
+        last = _completed(run_dir, _completed(run_dir, 0).iteration + 1)
+        took = time.monotonic() - began
+        up, down = proxy.up - up, proxy.down - down
+    steps = last.env_steps + last.eval_env_steps - first.env_steps - first.eval_env_steps
+    return {
+        "env steps/s": steps / took,
+        "up, KB/s": up / took / 1000,
+        "down, KB/s": down / took / 1000,
+        "up, bytes per env step": up / steps,
+        "down, KB per iteration": down / (last.iteration - first.iteration) / 1000,
+        "iterations": last.iteration - first.iteration,
+        "failures": last.env_failures,
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="LunarLander-v3")
+    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument(
+        "--links", nargs="+", type=Link.parse, metavar="MBIT_S:DELAY_MS",
+        default=[Link(0, 0), Link(100, 10), Link(10, 20), Link(2, 40)],
+    )  # fmt: skip
+    options = parser.parse_args()
+    print(f"{options.env}, one actor of 16 environments, {os.cpu_count()} cores")
+    for link in options.links:
+        with tempfile.TemporaryDirectory() as folder:
+            found = measure(options.env, link, options.seconds, Path(folder) / "run")
+        values = {name: round(value, 1) for name, value in found.items()}
+        print(f"{link.mbit_s:g} Mbit/s, {link.delay_ms:g} ms each way: {json.dumps(values)}")
+
+
+if __name__ == "__main__":
+    main()
