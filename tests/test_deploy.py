@@ -18,8 +18,8 @@ KUBERNETES = ROOT / "deploy" / "kubernetes"
 MANIFESTS = sorted(KUBERNETES.glob("*.yaml"))
 VERSION = "1.31"
 
-#: What a Swarm reads elsewhere, below ``deploy``, or not at all.
-ONLY_COMPOSE = {"build", "depends_on", "restart", "scale", "security_opt"}
+#: What a Swarm reads elsewhere, below ``deploy`` or ``volumes``, or not at all.
+ONLY_COMPOSE = {"build", "depends_on", "restart", "scale", "security_opt", "tmpfs"}
 
 
 def load(path: Path) -> Any:
@@ -40,6 +40,10 @@ def test_swarm_runs_the_services_of_compose() -> None:
     assert stack.keys() == compose.keys()
     for name, service in compose.items():
         same = {key: value for key, value in service.items() if key not in ONLY_COMPOSE}
+        same["volumes"] = [
+            *({"type": "tmpfs", "target": target} for target in service["tmpfs"]),
+            *service.get("volumes", ()),
+        ]
         deploy = stack[name].pop("deploy")
         assert stack[name] == same
         assert deploy.get("replicas", 1) == service.get("scale", 1)
