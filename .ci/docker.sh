@@ -3,7 +3,8 @@
 # Where none answers and this is Debian with root's rights, the distribution's packages give one. No image
 # is pulled: the base is made of the distribution's own packages, and what pip needs here to reach a package
 # index (certificates, folders of wheels) goes into the image that is only built in.
-# Sets BASE_IMAGE, BUILD_IMAGE if it made them, and NO_DOCKER to the reason if there is no engine.
+# Sets BASE_IMAGE, BUILD_IMAGE if it made them, ENGINE to the process that it started, and NO_DOCKER to
+# the reason if there is no engine.
 
 docker_log=${TMPDIR:-/tmp}/udrl-docker.log
 
@@ -16,7 +17,8 @@ engine() {
     timeout 600 apt-get -qq install --no-install-recommends docker.io docker-compose debootstrap iptables \
         >>"$docker_log" 2>&1 || return 1
     NO_DOCKER="the engine does not start; see $docker_log"
-    (setsid dockerd >>"$docker_log" 2>&1 &)
+    setsid dockerd >>"$docker_log" 2>&1 &
+    ENGINE=$!
     for _ in $(seq 60); do
         docker info >/dev/null 2>&1 && { unset NO_DOCKER; return; }
         sleep 1
