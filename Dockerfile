@@ -1,12 +1,13 @@
 # One image for every role: `docker build -t udrl .`
 #
-# BASE_IMAGE   a slim image with Python 3.11 or newer as python3; what runs is built on it
-# BUILD_IMAGE  the same, with what pip needs to reach a package index here, if anything
+# BASE_IMAGE   a slim image with Python 3.11 or newer as python3, python:3.11-slim-bookworm by default;
+#              what runs is built on it
+# BUILD_IMAGE  the same, with what pip needs to reach a package index here; by default just the same
 # TORCH_INDEX  an index of CPU-only torch wheels, which saves gigabytes without a GPU
-ARG BASE_IMAGE=python:3.11-slim-bookworm
-ARG BUILD_IMAGE=${BASE_IMAGE}
+ARG BASE_IMAGE
+ARG BUILD_IMAGE
 
-FROM ${BUILD_IMAGE} AS build
+FROM ${BUILD_IMAGE:-${BASE_IMAGE:-python:3.11-slim-bookworm}} AS build
 ARG TORCH_INDEX=
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
@@ -28,7 +29,7 @@ RUN /opt/udrl/bin/pip install --no-deps . \
     && rm -rf /opt/udrl/lib/python3*/site-packages/torch/include \
     && /opt/udrl/bin/pip uninstall --yes pip setuptools
 
-FROM ${BASE_IMAGE}
+FROM ${BASE_IMAGE:-python:3.11-slim-bookworm}
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin udrl \
     && mkdir -p /runs /keys/ca /keys/replay /keys/learner /keys/actor /keys/observer \
     && chown -R udrl:udrl /runs /keys

@@ -1,55 +1,66 @@
 # Sourced by .ci/run: a Docker engine, if this machine can have one.
 #
-# Where none answers and this is Debian with root's rights, the distribution's packages give one. No image
-# is pulled: the base is made of the distribution's own packages, and what pip needs here to reach a package
-# index (certificates, folders of wheels) goes into the image that is only built in.
+# Where none answers and this is Debian with root's rights, the distribution's packages give one. Where the
+# usual base image cannot be pulled, one is made of the distribution's own packages; the certificates and
+# folders of wheels that pip is configured with here go into the image that is only built in.
 # Sets BASE_IMAGE, BUILD_IMAGE if it made them, ENGINE to the process that it started, and NO_DOCKER to
-# the reason if there is no engine.
+# the reason if nothing can be tested.
 
 docker_log=${TMPDIR:-/tmp}/udrl-docker.log
 
+answers() {
+    docker info >/dev/null 2>&1 && { docker compose version || docker-compose version; } >/dev/null 2>&1
+}
+
 engine() {
-    docker info >/dev/null 2>&1 && return
-    [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null || { NO_DOCKER="no engine answers"; return 1; }
+    answers && return
+    NO_DOCKER="no Docker engine with Compose answers"
+    [ "$(id -u)" = 0 ] && grep -qx ID=debian /etc/os-release || return 1
     NO_DOCKER="the engine cannot be installed; see $docker_log"
     export DEBIAN_FRONTEND=noninteractive
     timeout 600 apt-get -qq update >"$docker_log" 2>&1 || return 1
     timeout 600 apt-get -qq install --no-install-recommends docker.io docker-compose debootstrap iptables \
         >>"$docker_log" 2>&1 || return 1
+    unset NO_DOCKER
+    answers && return  # the package has started it
     NO_DOCKER="the engine does not start; see $docker_log"
     setsid dockerd >>"$docker_log" 2>&1 &
     ENGINE=$!
     for _ in $(seq 60); do
-        docker info >/dev/null 2>&1 && { unset NO_DOCKER; return; }
+        answers && { unset NO_DOCKER; return; }
         sleep 1
     done
     return 1
 }
 
-images() {
-    export BASE_IMAGE=udrl-ci-base BUILD_IMAGE=udrl-ci-build
-    docker image inspect $BASE_IMAGE $BUILD_IMAGE >/dev/null 2>&1 && return
-    local made; made=$(mktemp -d)
-    timeout 600 debootstrap --variant=minbase \
-        --include=python3,python3-venv,python3-pip,ca-certificates \
-        "$(. /etc/os-release && echo "$VERSION_CODENAME")" "$made/root" >>"$docker_log" 2>&1
-    tar -C "$made/root" -c . | docker import - $BASE_IMAGE >/dev/null
+images() (
+    # A subshell of its own, since what stands before || does not end at the first failure.
+    docker image inspect udrl-ci-base udrl-ci-build >/dev/null 2>&1 && exit
+    exec >>"$docker_log" 2>&1
+    made=$(mktemp -d)
+    trap 'rm -rf "$made"' EXIT
     mkdir -p "$made/build/links"
-    local links=() folder cert
-    for folder in $(python3 -m pip config get global.find-links 2>/dev/null); do
-        [ -d "$folder" ] && cp "$folder"/*.whl "$made/build/links" && links=(/links)
+    . /etc/os-release
+    timeout 600 debootstrap --variant=minbase \
+        --include=python3,python3-venv,ca-certificates "$VERSION_CODENAME" "$made/root" || exit
+    tar -C "$made/root" -c . | docker import - udrl-ci-base || exit
+    links=
+    for folder in $(python3 -m pip config get global.find-links); do
+        if [ -d "$folder" ]; then
+            cp "$folder"/*.whl "$made/build/links" && links=/links || exit
+        fi
     done
-    cert=$(python3 -m pip config get global.cert 2>/dev/null || echo /etc/ssl/certs/ca-certificates.crt)
-    cp "$cert" "$made/build/cert.pem"
-    printf '[global]\ncert = /cert.pem\nfind-links = %s\n' "${links[@]}" >"$made/build/pip.conf"
-    printf 'FROM %s\nCOPY links /links\nCOPY cert.pem /cert.pem\nCOPY pip.conf /etc/pip.conf\n' \
-        $BASE_IMAGE >"$made/build/Dockerfile"
-    docker build --quiet --tag $BUILD_IMAGE "$made/build" >>"$docker_log" 2>&1
-    rm -rf "$made"
-}
+    cert=$(python3 -m pip config get global.cert || echo /etc/ssl/certs/ca-certificates.crt)
+    cp "$cert" "$made/build/cert.pem" || exit
+    printf '[global]\ncert = /cert.pem\nfind-links = %s\n' "$links" >"$made/build/pip.conf"
+    printf '%s\n' 'FROM udrl-ci-base' 'COPY links /links' 'COPY cert.pem /cert.pem' \
+        'COPY pip.conf /etc/pip.conf' >"$made/build/Dockerfile"
+    docker build --tag udrl-ci-build "$made/build"
+)
 
 if engine; then
-    # Without an image to build on, Compose tries to pull the default one.
     docker image inspect python:3.11-slim-bookworm >/dev/null 2>&1 ||
-        timeout 300 docker pull --quiet python:3.11-slim-bookworm >>"$docker_log" 2>&1 || images
+        timeout 300 docker pull --quiet python:3.11-slim-bookworm >>"$docker_log" 2>&1 ||
+        { images && export BASE_IMAGE=udrl-ci-base BUILD_IMAGE=udrl-ci-build; } ||
+        NO_DOCKER="there is no image to build on; see $docker_log"
 fi

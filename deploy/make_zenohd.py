@@ -18,7 +18,8 @@ _HEAD = """\
 //
 // A router that carries runs, where the replay service connects to it like all others:
 //   udrl replay ENV --connect tls/ROUTER:7447 --keys keys
-// Its own keys are the folder keys/replay of `udrl keys create keys --host ROUTER`, as /etc/udrl.
+// Its own keys are the folder keys/replay of `udrl keys create keys --host ROUTER`, as /etc/udrl,
+// where the user that zenohd runs as must be able to read them.
 //
 // Written by deploy/make_zenohd.py.
 """

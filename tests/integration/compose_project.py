@@ -53,17 +53,22 @@ class Project:
     """``compose.yaml`` and its overrides, under a name of their own.
 
     Args:
-        name: of the project.
+        name: of the project; what an earlier one of that name left is removed.
         files: in the repository's root.
         variables: what the files are given.
     """
 
     def __init__(self, name: str, files: list[str], variables: Mapping[str, str]) -> None:
         self.name = name
-        self._variables = variables
+        self._variables = dict(variables)
         self._command = [*compose_command(), "--project-name", name]
         for file in files:
             self._command += ["--file", str(ROOT / file)]
+        self.down()
+
+    def give(self, **variables: str) -> None:
+        """Give the files other values from the next command on."""
+        self._variables |= variables
 
     def compose(self, *arguments: str, timeout: float = 120) -> str:
         """Call Compose."""
@@ -79,8 +84,8 @@ class Project:
         """Have so many actors."""
         self.compose("up", "--detach", "--scale", f"actor={actors}")
 
-    def status(self) -> Status:
-        """Return what the store of an ended run says."""
+    def store(self) -> Status:
+        """Return what the run's store says, whoever works on it."""
         volume = ["--volume", f"{self.name}_runs:/runs"]
         command = ["status", f"/runs/{self._variables['ENV']}", "--json"]
         return _status(run("docker", "run", "--rm", "--read-only", *volume, IMAGE, *command))

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from test_commands import toml
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch.cli import cli as command_line
-from udrl_launch.inspection import status_of
+from udrl_launch.inspection import load_agent, status_of
 from udrl_proto.messages import Status
 from whole_run import (
     SMALL,
@@ -61,6 +61,7 @@ def test_services_that_have_only_their_own_keys_equal_one_process(
     status = live_status(run_dir)
     assert status is not None
     assert digests(status) == digests(run(small(), BUDGET))
+    assert load_agent(run_dir).weights == (run_dir / "weights.safetensors").read_bytes()
 
 
 def test_services_meet_at_a_router_of_somebody_else(

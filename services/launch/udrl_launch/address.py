@@ -3,6 +3,7 @@
 It imports no torch, for commands that look in for a moment.
 """
 
+import hashlib
 import os
 import platform
 import re
@@ -18,6 +19,9 @@ import zenoh
 from udrl_proto import session as sessions
 from udrl_proto.credentials import load
 from udrl_proto.messages import Hello
+
+#: Characters of a machine's name in the names of its services, which are keys.
+_LONGEST_HOST = 30
 
 
 class Address(NamedTuple):
@@ -60,5 +64,14 @@ def unique_name(role: str) -> str:
 
 def host_name(role: str) -> str:
     """Return what the names of all services of a role on this machine begin with."""
-    host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node())[:30] or "host"
+    host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node()) or "host"
+    if len(host) > _LONGEST_HOST:
+        # Names of pods and of nodes differ at their ends.
+        digest = hashlib.sha256(host.encode()).hexdigest()[:8]
+        host = f"{host[: _LONGEST_HOST - 9]}-{digest}"
     return f"{role}-{host}"
+
+
+def is_of_this_machine(name: str, role: str) -> bool:
+    """Say whether a name is :func:`unique_name`'s, of a service of this role on this machine."""
+    return re.fullmatch(rf"{re.escape(host_name(role))}-\d+-[0-9a-f]{{6}}", name) is not None

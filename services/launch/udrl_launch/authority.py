@@ -19,7 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from udrl.errors import ConfigError
 from udrl_proto.access import REPLAY, ROLES
-from udrl_proto.credentials import CA, CERTIFICATE, KEY
+from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
 
 #: Where the authority itself is kept, beside the roles' folders; it goes to no other machine.
 AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
@@ -69,11 +69,26 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
         ) from error
 
 
-def are_there(folder: Path) -> bool:
-    """Say whether a folder holds keys for every role."""
-    return all(
-        (folder / role / name).is_file() for role in ROLES for name in (CA, CERTIFICATE, KEY)
-    )
+def are_there(folder: Path, hosts: Iterable[str] = ()) -> bool:
+    """Say whether a folder holds keys for every role, good for these hosts.
+
+    Raises:
+        ConfigError: it holds keys that are expired, do not fit together or lack a host.
+    """
+    files = [folder / role / name for role in ROLES for name in (CA, CERTIFICATE, KEY)]
+    if not all(file.is_file() for file in files):
+        return False
+    for role in ROLES:
+        load(folder, role)
+    certificate = x509.load_pem_x509_certificate((folder / REPLAY / CERTIFICATE).read_bytes())
+    named = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    for host in hosts:
+        if _alternative(host) not in named:
+            raise ConfigError(
+                f"the keys in {folder} are not good for --host {host}; remove them and give all "
+                f"services new ones, or use a name that they have"
+            )
+    return True
 
 
 class _Authority:

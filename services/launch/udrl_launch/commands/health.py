@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from udrl.errors import Unreachable
-from udrl_launch.address import Address, connected, host_name
+from udrl_launch.address import Address, connected, host_name, is_of_this_machine
 from udrl_launch.commands.options import KEYS, PATIENCE, RUN
 from udrl_proto import keys as expressions
 from udrl_proto.access import REPLAY
@@ -35,12 +35,14 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
             click.echo(f"run {hello.run_id} answers at {connect}")
             return 0
         wanted = expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
-        there = [str(r.ok.key_expr) for r in session.liveliness().get(wanted, timeout=_ANSWER_S)
+        found = [str(r.ok.key_expr).rpartition("/")[2]
+                 for r in session.liveliness().get(wanted, timeout=_ANSWER_S)
                  if r.ok is not None]  # fmt: skip
+    there = [name for name in found if is_of_this_machine(name, role)]
     if not there:
         raise Unreachable(
             f"no {role} of this machine ({host_name(role)}) takes part in run {hello.run_id}; "
             f"see its log"
         )
-    click.echo(f"{there[0].rpartition('/')[2]} takes part in run {hello.run_id}")
+    click.echo(f"{there[0]} takes part in run {hello.run_id}")
     return 0

@@ -21,7 +21,11 @@ def keys() -> None:
               "localhost, 127.0.0.1 and ::1 are always among them.")  # fmt: skip
 @click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True,
               help="How long the keys are valid.")  # fmt: skip
-@click.option("--if-missing", is_flag=True, help="Do nothing if the keys are there.")
+@click.option(
+    "--if-missing",
+    is_flag=True,
+    help="Do nothing if the keys are there, valid, and good for every --host.",
+)
 def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool) -> int:
     """Make an authority of your own, and a folder with key and certificate for each role.
 
@@ -33,7 +37,7 @@ def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool)
         raise ConfigError(
             'making keys needs cryptography; install it with: pip install "udrl[secure]"'
         ) from error
-    if if_missing and authority.are_there(directory):
+    if if_missing and authority.are_there(directory, hosts):
         click.echo(f"{directory} holds keys for every role already")
         return 0
     authority.create(directory, hosts, timedelta(days))

@@ -104,9 +104,8 @@ def _finish(run_dir: Path, status: Status) -> None:
             f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
             f"{status.wall_s:.0f} s"
         )
-    if status.weights_version:
-        weights = run_dir / "weights.safetensors"
-        weights.write_bytes(inspection.load_agent(run_dir).weights)
+    weights = inspection.write_weights(run_dir)
+    if weights is not None:
         click.echo(f"weights:        {weights} (version {status.weights_version})")
     else:
         click.echo("weights:        none; the budget was spent in the warm-up")
