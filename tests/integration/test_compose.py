@@ -47,12 +47,18 @@ def outside() -> Iterator[str]:
     run("docker", "network", "rm", OUTSIDE)
 
 
-def finished(project: Project) -> Status:
-    """Let a run, which has no end in sight, end soon, and return what became of it."""
+def finished(project: Project, *up: str) -> Status:
+    """Let a run, which has no end in sight, end soon, and return what became of it.
+
+    Args:
+        project: not up, or without what is given here.
+        up: what ``docker compose up`` is given.
+    """
     status = project.store()
-    steps = status.env_steps + 20_000
+    # Longer than it takes until a new replay service is found healthy, and the others start.
+    steps = status.env_steps + 150_000
     project.give(ARGS=arguments(steps))
-    project.compose("up", "--detach")
+    project.compose("up", "--detach", *up)
     assert project.exit_codes("replay") == [0]
     ended = project.store()
     assert_conserved(ended)
@@ -131,7 +137,7 @@ def test_faults_and_an_actor_from_outside_change_nothing(
         ).strip()  # fmt: skip
         try:
             goes_on("with the actor from outside alone", 1)
-            ended = finished(project)
+            ended = finished(project, "--no-deps", "replay")
             assert run("docker", "wait", stranger, timeout=60).strip() == "0"
         finally:
             run("docker", "rm", "--force", stranger)
