@@ -33,7 +33,7 @@ _CHUNK = 16 * 1024
 
 
 class Link(NamedTuple):
-    """Mbit/s in each direction, 0: as fast as loopback; and the milliseconds of one way."""
+    """Mbit/s in each direction, 0: not limited; and the milliseconds of one way."""
 
     mbit_s: float
     delay_ms: float
@@ -78,7 +78,8 @@ class Proxy:
     ) -> None:
         """Forward one direction: a queue of what is on its way, and who takes it out in time."""
         # What the sender may have on its way is what the link holds, and no more.
-        held = max(4, int(self._link.mbit_s * 125 * self._link.delay_ms / _CHUNK) + 4)
+        mbit_s = self._link.mbit_s or 1000
+        held = int(mbit_s * 125 * self._link.delay_ms / _CHUNK) + 4
         way: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(held)
 
         async def arrive() -> None:
@@ -87,8 +88,9 @@ class Proxy:
                 await asyncio.sleep(due - self._loop.time())
                 if not data:
                     break
-                writer.write(data)
-                await writer.drain()
+                with contextlib.suppress(OSError):  # the receiver is gone; empty the queue
+                    writer.write(data)
+                    await writer.drain()
 
         arriving = asyncio.create_task(arrive())
         free = self._loop.time()
@@ -103,8 +105,7 @@ class Proxy:
                     await asyncio.sleep(free - self._loop.time())
                 await way.put((self._loop.time() + self._link.delay_ms / 1000, data))
         await way.put((self._loop.time(), b""))
-        with contextlib.suppress(OSError):
-            await arriving
+        await arriving
         writer.close()
 
 

@@ -1,4 +1,4 @@
-"""The actor's messenger: a thread that fetches commands and weights and delivers episodes.
+"""The actor's messenger: a thread that fetches commands and weights; an outbox delivers episodes.
 
 The loop that steps environments never waits for the network while it has something to do; the
 loop rests when ``capacity`` episodes wait for delivery.
@@ -19,6 +19,7 @@ from udrl.checkpoint import decode_weights
 from udrl.commands import Command
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage, Refused
+from udrl_actor.outbox import Outbox
 from udrl_proto import keys
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, encode_episode
@@ -36,6 +37,10 @@ from udrl_proto.messages import (
 )
 
 log = logging.getLogger("udrl")
+
+
+#: Seconds that the announcement of a version may come later than a command that needs it.
+_ANNOUNCEMENT_S = 0.25
 
 
 class Order(NamedTuple):
@@ -75,11 +80,12 @@ class Courier(threading.Thread):
         self._capacity = capacity
         self._changed = threading.Condition()
         self._orders: deque[Order] = deque()
-        self._outbox: deque[Episode | Failure] = deque()
+        self._outbox = Outbox(f"outbox of {join.id}", self._deliver, self._fail)
         self._held: set[int] = set()
         self._free = 0
         self._steps = 0
         self._announced: bytes | None = None
+        self._acknowledged = False
         self._behaviors: dict[int, BehaviorFunction] = {}
         self._newest = 0
         self.ended = False
@@ -98,8 +104,8 @@ class Courier(threading.Thread):
             steps: env steps made since the last call.
             wait_s: seconds to wait for news when there are no orders.
         """
+        self._outbox.put(outcomes)
         with self._changed:
-            self._outbox.extend(outcomes)
             self._free = free
             self._steps += steps
             self._changed.notify_all()
@@ -131,29 +137,31 @@ class Courier(threading.Thread):
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
-            self.error = error
+            self._fail(error)
         finally:
+            self._outbox.close()
             subscriber.undeclare()
             with self._changed:
                 self._changed.notify_all()
+
+    def _fail(self, error: Exception) -> None:
+        with self._changed:
+            self.error = error
+            self._changed.notify_all()
 
     def _work(self) -> None:
         ask_at = 0.0
         rate_at, rate = time.monotonic(), 0.0
         while self._alive():
             with self._changed:
-                now = time.monotonic()
                 wants = self._free > len(self._orders)
-                if not self._outbox and not (wants and now >= ask_at):
-                    pause = ask_at - now if wants else 0.5
-                    self._changed.wait(min(max(pause, 0.0), 0.5))
-                if self._announced is not None:
-                    ask_at = 0.0
-                outcome = self._outbox[0] if self._outbox else None
+                pause = ask_at - time.monotonic() if wants else 0.5
+                if pause > 0 and not (wants and self._has_news):
+                    self._changed.wait(min(pause, 0.5))
+                if self._has_news:
+                    ask_at, self._acknowledged = 0.0, False
                 wanted = self._free - len(self._orders)
-            if outcome is not None:
-                self._deliver(outcome)
-            elif wanted > 0 and time.monotonic() >= ask_at:
+            if wanted > 0 and time.monotonic() >= ask_at:
                 now = time.monotonic()
                 if now - rate_at >= 1.0:
                     with self._changed:
@@ -161,13 +169,20 @@ class Courier(threading.Thread):
                     rate_at = now
                 ask_at = self._fetch(wanted, rate)
 
+    @property
+    def _has_news(self) -> bool:
+        """Whether there may be commands that were not there when it was asked last."""
+        return self._announced is not None or self._acknowledged
+
     def _fetch(self, wanted: int, rate: float) -> float:
         """Ask for commands; return when to ask again at the earliest."""
         self._learn_announced()
+        with self._changed:
+            running = tuple(sorted(self._held))
         request = CommandsRequest(
             actor=self._join.id,
             wanted=wanted,
-            running=tuple(sorted(self._held)),
+            running=running,
             spare_cores=(os.cpu_count() or 1) - os.getloadavg()[0],
             env_steps_per_s=round(rate, 1),
             weights_version=self._newest,
@@ -181,7 +196,8 @@ class Courier(threading.Thread):
             return 0.0
         if reply.ended:
             self.ended = True
-        self._held |= {command.id for command in reply.commands}
+        with self._changed:
+            self._held |= {command.id for command in reply.commands}
         orders = [order for c in reply.commands if (order := self._order(c)) is not None]
         with self._changed:
             self._orders.extend(orders)
@@ -206,8 +222,8 @@ class Courier(threading.Thread):
                 # Cancelled: the run has ended meanwhile.
                 log.info("episode %d was rejected: %s", command_id, refusal)
         with self._changed:
-            self._outbox.popleft()
             self._held.discard(command_id)
+            self._acknowledged = True
             self._changed.notify_all()
 
     # Weights.
@@ -236,17 +252,28 @@ class Courier(threading.Thread):
             if refusal.code != "unknown_version":
                 raise
             log.info("command %d is dropped: %s", command.id, refusal)
-            self._held.discard(command.id)
+            with self._changed:
+                self._held.discard(command.id)
             return None
 
     def _behavior(self, version: int) -> BehaviorFunction | None:
         """Return a weights version, asking for it if it was not announced."""
         if version == 0:
             return None
+        if version > self._newest:
+            self._await_announcement(version)
         if version not in self._behaviors:
             request = WeightsRequest(version=version)
             self._learn(self._asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
         return self._behaviors[version]
+
+    def _await_announcement(self, version: int) -> None:
+        """Wait a moment for weights that may be on their way, so that they travel once."""
+        deadline = time.monotonic() + _ANNOUNCEMENT_S
+        while self._newest < version and (left := deadline - time.monotonic()) > 0:
+            with self._changed:
+                self._changed.wait_for(lambda: self._announced is not None, left)
+            self._learn_announced()
 
     def _learn(self, message: Weights) -> None:
         config, spec = self._hello.config, self._hello.environment

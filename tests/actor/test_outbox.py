@@ -1,0 +1,112 @@
+"""Deliveries: several at once, large ones alone, and what ends them."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from udrl.acting import Failure
+from udrl.episode import Episode
+from udrl_actor import outbox as outboxes
+from udrl_actor.outbox import Outbox
+from whole_run import wait_for
+
+DEADLINE_S = 10.0
+
+
+def episode(command_id: int, n_bytes: int = 100) -> Episode:
+    return Episode(
+        command_id=command_id,
+        observations=np.zeros((1, n_bytes), dtype=np.uint8),
+        actions=np.zeros(1, dtype=np.uint8),
+        rewards=np.zeros(1, dtype=np.float32),
+        terminated=True,
+        truncated=False,
+    )
+
+
+class ReplayService:
+    """Acknowledges when it is told to."""
+
+    def __init__(self) -> None:
+        self.came: queue.Queue[int] = queue.Queue()
+        self.may_answer = threading.Semaphore(0)
+        self.errors: queue.Queue[Exception] = queue.Queue()
+        self.problem: Exception | None = None
+
+    def deliver(self, outcome: Episode | Failure) -> None:
+        assert isinstance(outcome, Episode)
+        self.came.put(outcome.command_id)
+        assert self.may_answer.acquire(timeout=DEADLINE_S)
+        if self.problem is not None:
+            raise self.problem
+
+    def next(self, count: int) -> set[int]:
+        return {self.came.get(timeout=DEADLINE_S) for _ in range(count)}
+
+
+@pytest.fixture
+def replay() -> ReplayService:
+    return ReplayService()
+
+
+@pytest.fixture
+def outbox(replay: ReplayService) -> Iterator[Outbox]:
+    one = Outbox("test", replay.deliver, replay.errors.put)
+    yield one
+    one.close()
+    replay.may_answer.release(100)
+
+
+def emptied(outbox: Outbox) -> Callable[[], bool]:
+    return lambda: len(outbox) == 0
+
+
+def test_small_ones_go_together_and_all_arrive_once(replay: ReplayService, outbox: Outbox) -> None:
+    outbox.put(episode(i) for i in range(20))
+    at_once = replay.next(outboxes._LINES)
+    assert at_once == set(range(outboxes._LINES))
+    assert replay.came.empty()
+    assert len(outbox) == 20
+    replay.may_answer.release(20)
+    assert replay.next(20 - outboxes._LINES) == set(range(20)) - at_once
+    wait_for(emptied(outbox), "the last acknowledgement")
+    assert replay.came.empty()
+
+
+def test_large_ones_go_one_after_another(replay: ReplayService, outbox: Outbox) -> None:
+    large = outboxes._BYTES_UNDER_WAY + 1
+    outbox.put([episode(0, large), episode(1, large), episode(2)])
+    for expected in range(3):
+        assert replay.next(1) == {expected}
+        assert replay.came.empty()
+        replay.may_answer.release()
+    wait_for(emptied(outbox), "the last acknowledgement")
+
+
+def test_small_one_goes_beside_one_that_leaves_room(replay: ReplayService, outbox: Outbox) -> None:
+    outbox.put([episode(0, outboxes._BYTES_UNDER_WAY - 100), episode(1), episode(2)])
+    assert replay.next(2) == {0, 1}
+    assert replay.came.empty()
+    replay.may_answer.release()
+    assert replay.next(1) == {2}
+
+
+def test_what_a_delivery_raises_is_told(replay: ReplayService, outbox: Outbox) -> None:
+    replay.problem = ValueError("no")
+    outbox.put([episode(0)])
+    replay.may_answer.release()
+    assert replay.errors.get(timeout=DEADLINE_S) is replay.problem
+    # It was not acknowledged.
+    assert len(outbox) == 1
+
+
+def test_closed_one_begins_nothing(replay: ReplayService, outbox: Outbox) -> None:
+    outbox.put([episode(0, outboxes._BYTES_UNDER_WAY), episode(1)])
+    assert replay.next(1) == {0}
+    outbox.close()
+    replay.may_answer.release()
+    wait_for(lambda: len(outbox) == 1, "the end of the first")
+    assert replay.came.empty()
