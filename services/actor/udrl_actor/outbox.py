@@ -71,7 +71,7 @@ class Outbox:
             with self._changed:
                 self._under_way -= 1
                 self._bytes -= _size(outcome)
-                self._changed.notify_all()
+                self._changed.notify(len(self._waiting))
 
     def _next(self) -> Episode | Failure | None:
         """Return the next to deliver when there is room on the way; None: closed."""

@@ -129,24 +129,6 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         )
 
 
-def write_weights(run_dir: Path) -> Path | None:
-    """Write a run's latest weights beside its store, and return where; None: there are none.
-
-    Raises:
-        StoreError: there is no run, or they cannot be written.
-    """
-    if read_status(run_dir).weights_version == 0:
-        return None
-    path = run_dir / "weights.safetensors"
-    unfinished = path.with_suffix(".new")
-    try:
-        unfinished.write_bytes(load_agent(run_dir).weights)
-        unfinished.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be written: {error}; free some disk space") from error
-    return path
-
-
 def reproduce(run_dir: Path, command_id: int) -> Episode:
     """Carry out one outstanding command of a run.
 

@@ -19,6 +19,7 @@ from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
 from udrl_proto.messages import Status, StatusRequest
 from udrl_replay.creation import config_of, create, exists, resume, write_config
+from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run
 
 log = logging.getLogger("udrl")
@@ -75,7 +76,9 @@ def train(
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
         write_config(run_dir, config_of(store), budget)
-        if Run(store, budget).progress.state == "ended":
+        progress = Run(store, budget).progress
+        if progress.state == "ended":
+            write_weights(run_dir, store, progress.latest_version)
             return read_status(run_dir)
         unless_it_goes_on.pop_all()
     kind = Threads if in_process else Processes

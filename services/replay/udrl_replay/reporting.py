@@ -1,6 +1,7 @@
-"""What a run tells about itself: its status, and the file ``metrics.csv``."""
+"""What a run tells about itself: its status, ``metrics.csv``, ``weights.safetensors``."""
 
 import csv
+import logging
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -27,6 +28,8 @@ COLUMNS = (
     "eval_std", "eval_ci95_low", "eval_ci95_high", "loss", "weights_version", "return_min",
     "return_mean", "return_max", "explored_return", "eval_desired_return", "eval_desired_horizon",
 )  # fmt: skip
+
+log = logging.getLogger("udrl")
 
 _WINDOW_S = 10.0
 #: Waits that are remembered; who waits need not have joined.
@@ -58,6 +61,28 @@ class MetricsFile:
                 f"{self._path} cannot be written: {error}; free some disk space and start again "
                 f"with --resume; nothing is lost"
             ) from error
+
+
+def write_weights(run_dir: Path, store: Store, version: int) -> None:
+    """Write the weights that a run ended with beside its store; version 0 has none.
+
+    Raises:
+        StoreError: they cannot be written.
+    """
+    found = store.version(version)
+    if found is None:
+        return
+    path = run_dir / "weights.safetensors"
+    unfinished = path.with_suffix(".new")
+    try:
+        unfinished.write_bytes(found.weights)
+        unfinished.replace(path)
+    except OSError as error:
+        raise StoreError(
+            f"{path} cannot be written: {error}; free some disk space and start again with "
+            f"--resume; nothing is lost"
+        ) from error
+    log.info("the weights are in %s", path)
 
 
 class Throughput:

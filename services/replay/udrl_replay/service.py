@@ -52,7 +52,7 @@ from udrl_proto.messages import (
 )
 from udrl_replay.arrival import Arrival, Malformed, inspect
 from udrl_replay.dealing import MOST_ACTORS
-from udrl_replay.reporting import MetricsFile, Throughput, Waits, status
+from udrl_replay.reporting import MetricsFile, Throughput, Waits, status, write_weights
 from udrl_replay.run import Run
 from udrl_replay.store import Store, Version
 
@@ -92,7 +92,7 @@ class ReplayService:
         session: the run's router, or a client of one.
         store: the run.
         budget: when it ends.
-        run_dir: where ``metrics.csv`` goes.
+        run_dir: where ``metrics.csv`` and, at the end, the weights go.
         audit: share of the episodes that a second actor makes again, 0 to 1.
     """
 
@@ -107,6 +107,7 @@ class ReplayService:
         self.run = Run(store, budget, audit)
         self._session = session
         self._store = store
+        self._run_dir = run_dir
         self._metrics = MetricsFile(run_dir, store)
         self._metrics.update(self.run.progress.iteration)
         self._inbox: Inbox[Question | _Presence] = Inbox(_INBOX, _INBOX_BYTES)
@@ -151,6 +152,8 @@ class ReplayService:
             # Only here: after an error, what is in memory may be ahead of what is on disk.
             with self._store.transaction():
                 self.run.save()
+            if self.run.progress.state == "ended":
+                write_weights(self._run_dir, self._store, self.run.progress.latest_version)
         finally:
             for declaration in declared:
                 declaration.undeclare()

@@ -17,7 +17,6 @@ from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
-from udrl_launch.inspection import read_status, write_weights
 from udrl_launch.process import (
     die_with_parent,
     keep_freed_memory,
@@ -85,8 +84,6 @@ def replay(
             run_dir, store, settings.budget, stop, listen=listen, connect=connect,
             insecure=insecure, credentials=credentials, audit=audit,
         )  # fmt: skip
-        if read_status(run_dir).state == "ended":
-            log.info("the weights are in %s", write_weights(run_dir))
 
     return _as_service(parent, service)
 

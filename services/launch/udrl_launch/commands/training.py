@@ -9,7 +9,6 @@ import click
 import msgspec
 
 from udrl.errors import ConfigError, UdrlError
-from udrl_launch import inspection
 from udrl_launch.commands.options import AUDIT, KEYS, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
 from udrl_launch.curve import draw
@@ -104,8 +103,8 @@ def _finish(run_dir: Path, status: Status) -> None:
             f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
             f"{status.wall_s:.0f} s"
         )
-    weights = inspection.write_weights(run_dir)
-    if weights is not None:
+    if status.weights_version:
+        weights = run_dir / "weights.safetensors"
         click.echo(f"weights:        {weights} (version {status.weights_version})")
     else:
         click.echo("weights:        none; the budget was spent in the warm-up")
