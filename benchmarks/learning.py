@@ -61,7 +61,7 @@ def train(env: str, seed: int, run_dir: Path) -> Trained:
         rows = [r for r in csv.DictReader(file) if r["eval_mean"]]
     kept = run_dir / "greedy.json"
     if not kept.exists():
-        result = evaluate(load_agent(run_dir), episodes=100, greedy=True)
+        result = evaluate(load_agent(run_dir), episodes=100, temperature=0.0)
         kept.write_text(json.dumps(result.evaluation._asdict()), encoding="utf-8")
     return Trained(seed, read_status(run_dir), rows, json.loads(kept.read_text(encoding="utf-8")))
 

@@ -22,7 +22,9 @@ def files(pattern: str) -> list[Path]:
 
 
 PAGES = files("*.md")
-SOURCES = [path for path in files("*.py") if path.parts[0] in ("udrl", "proto", "services")]
+SOURCES = [
+    path for path in files("*.py") if path.parts[0] in ("udrl", "proto", "services", "experiments")
+]
 
 
 def text_of(page: str | Path) -> str:

@@ -15,6 +15,7 @@ import udrl.environments  # noqa: F401 - registers environments
 from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
 from udrl.config import Budget, Config, parse_assignment
 from udrl.errors import UdrlError
+from udrl_experiments.protocol import TASKS, Plan, parse_seeds, parse_steps
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, gather
 from udrl_proto.session import check_endpoint
@@ -73,6 +74,8 @@ def check_udrl(words: list[str]) -> None:
     command = cli.get_command(click.Context(cli), name)
     assert command is not None, name
     while isinstance(command, click.Group):
+        if not arguments:
+            return  # a mention of the group
         name, *arguments = arguments
         command = command.commands[name]
     if not arguments:
@@ -85,7 +88,14 @@ def check_udrl(words: list[str]) -> None:
     for endpoint in (given.get("listen"), given.get("connect")):
         if endpoint is not None:
             check_endpoint(endpoint, secure=given.get("keys") is not None)
-    if "assignments" in given:
+    if "side_by_side" in given:  # a study: its callback parses more
+        Plan(
+            given["scale"],
+            parse_seeds(given["seeds"] or "1"),
+            parse_steps(given["max_env_steps"] or "1"),
+            given["assignments"],
+        ).config(TASKS["lander"], 1)
+    elif "assignments" in given:
         settings = {*Config.__struct_fields__, *Budget.__struct_fields__, *Fleet.__struct_fields__}
         options = {n: v for n, v in given.items() if n in settings}
         gather(

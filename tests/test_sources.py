@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(
     path
-    for folder in ("udrl", "proto", "services", "benchmarks", "docs")
+    for folder in ("udrl", "proto", "services", "experiments", "benchmarks", "docs")
     for path in (ROOT / folder).rglob("*.py")
 )
 

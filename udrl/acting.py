@@ -105,6 +105,7 @@ class EpisodeGenerator:
         self._command = np.zeros((n_environments, 2), np.float32)
         self._reward = np.zeros(n_environments, np.float32)
         self._logits = np.zeros((n_environments, self.spec.n_actions))
+        self._temperature = np.ones((n_environments, 1))
         self._cap = np.full(n_environments, np.inf)
         self._horizon_is_return = config.desired_horizon == "return"
         self._least = np.array([1.0 if self._horizon_is_return else -np.inf, 1.0])
@@ -157,8 +158,9 @@ class EpisodeGenerator:
         self._commands[row] = command
         self._behaviors[row] = behavior
         self._calls = None
-        if command.greedy:
+        if command.temperature == 0:
             self._greedy.append(row)
+        self._temperature[row] = command.temperature or 1.0
         self._desired[row] = command.desired_return, command.desired_horizon
         self._cap[row] = np.inf
         if command.kind == "evaluate" and self.spec.max_return is not None:
@@ -227,7 +229,8 @@ class EpisodeGenerator:
                 observation.take(padded, axis=0, out=observation_in, mode="clip")
                 command.take(padded, axis=0, out=command_in, mode="clip")
                 logits[rows] = act(self._observation_in, self._command_in).numpy()[: len(rows)]
-        weights = np.exp(logits - np.maximum.reduce(logits, axis=1, keepdims=True))
+        below = logits - np.maximum.reduce(logits, axis=1, keepdims=True)
+        weights = np.exp(below / self._temperature)
         cumulative = np.add.accumulate(weights, axis=1)
         threshold = uniforms * cumulative[:, -1]
         actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)

@@ -5,14 +5,16 @@ An episode is a pure function of its command. Sections 2.3.4 (exploratory comman
 """
 
 import math
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from udrl.config import COMMANDS_PER_ITERATION, Config
+from udrl.config import COMMANDS_PER_ITERATION, Config, Temperature
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
+from udrl.strategies import Best, CommandStrategy, ask, make_strategy, nearest
 from udrl.streams import Purpose, Stream, stream_key
 
 Kind = Literal["warm_up", "explore", "evaluate"]
@@ -38,7 +40,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         stream_key: 16 bytes, the key of the stream whose number t decides action t.
         weights_version: the behavior function to act with; 0 in the warm-up: act at random.
         max_steps: the episode is truncated after so many steps.
-        greedy: take the mode of the action distribution instead of a sample.
+        temperature: logits are divided by it before an action is sampled; 0: take the mode.
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
@@ -49,7 +51,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     stream_key: Annotated[bytes, Meta(min_length=16, max_length=16)]
     weights_version: Annotated[int, Meta(ge=0, le=2**62)]
     max_steps: Annotated[int, Meta(ge=1, le=2**31)]
-    greedy: bool = False
+    temperature: Temperature = 1.0
 
     @property
     def iteration(self) -> int:
@@ -75,6 +77,10 @@ class CommandSampler:
         self._max_episode_steps = max_episode_steps
         self._max_train_steps = min(max_episode_steps, config.max_train_steps or max_episode_steps)
 
+    @cached_property
+    def _strategy(self) -> CommandStrategy:
+        return make_strategy(self._config)  # evaluating does without, wherever its module is
+
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
         n = self._config.n_warm_up_episodes
@@ -83,18 +89,23 @@ class CommandSampler:
     def explore(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's exploratory commands (section 2.3.4).
 
-        The desired horizon is the mean length of the ``last_few`` best episodes; the desired
-        returns are uniform in [M, M + S], with M and S the mean and the (population) standard
-        deviation of their returns. Not in the paper: with a ``horizon_spread`` s, the desired
-        horizons are uniform in [1 - s, 1 + s] times that.
+        What they ask for is the strategy's choice (:mod:`udrl.strategies`): in the paper the mean
+        length of the ``last_few`` best episodes, and a return that is uniform in [M, M + S]. Not in
+        the paper: with a ``horizon_spread`` s, the desired horizon is then multiplied with a number
+        that is uniform in [1 - s, 1 + s].
+
+        Raises:
+            ConfigError: the strategy cannot be imported, or asks for what cannot be.
         """
-        mean, deviation, horizon = self._best(buffer)
+        best = buffer.best(self._config.last_few)
         spread = self._config.horizon_spread
         numbers = self._stream(iteration).uniforms(2 * self._config.n_episodes_per_iter)
-        desired = [
-            self.desired(mean + deviation * u, _round(horizon * (1 + spread * (2 * v - 1))))
-            for u, v in numbers.reshape(2, -1).T.tolist()
-        ]
+        desired = []
+        for u, v in numbers.reshape(2, -1).T.tolist():
+            desired_return, horizon = ask(self._strategy, best, u)
+            desired.append(
+                self.desired(desired_return, nearest(horizon * (1 + spread * (2 * v - 1))))
+            )
         return self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
@@ -108,9 +119,10 @@ class CommandSampler:
         return [msgspec.structs.replace(c, weights_version=iteration) for c in closing]
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
-        mean, _, horizon = self._best(buffer)
-        desired = [self.desired(mean, horizon)] * self._config.eval_episodes
-        return self._commands("evaluate", iteration, first, desired, EVALUATION_SEEDS)
+        best = Best.of(buffer.best(self._config.last_few))
+        desired = [self.desired(best.mean, best.horizon)] * self._config.eval_episodes
+        seeds = EVALUATION_SEEDS if self._config.eval_seeds == "final" else SEARCH_SEEDS
+        return self._commands("evaluate", iteration, first, desired, seeds)
 
     def desired(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0 as it is said; section 3.1: in TakeCover both are the same integer."""
@@ -118,16 +130,6 @@ class CommandSampler:
             desired_horizon = max(1, min(math.floor(desired_return), 2**31))
             desired_return = float(desired_horizon)
         return desired_return, max(1, desired_horizon)
-
-    def _best(self, buffer: ReplayBuffer) -> tuple[float, float, int]:
-        """Return M, S and the mean length, rounded, of the best episodes."""
-        best = buffer.best(self._config.last_few)
-        n = len(best)
-        # fsum rounds once, so that the result does not depend on the order of summation.
-        mean = math.fsum(e.episode_return for e in best) / n
-        variance = math.fsum((e.episode_return - mean) ** 2 for e in best) / n
-        mean_length = sum(e.length for e in best) / n
-        return mean, math.sqrt(variance), _round(mean_length)
 
     def _stream(self, iteration: int, index: int = -1) -> Stream:
         return Stream(stream_key(self._config.seed, Purpose.COMMANDS, iteration, index))
@@ -152,14 +154,9 @@ class CommandSampler:
                 stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
                 weights_version=weights_version(iteration, self._config.lead),
                 max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
-                greedy=evaluation and self._config.eval_greedy,
+                temperature=self._config.eval_temperature if evaluation else 1.0,
             )
             for index, ((desired_return, desired_horizon), seed) in enumerate(
                 zip(desired, environment_seeds.tolist(), strict=True), start=first
             )
         ]
-
-
-def _round(number: float) -> int:
-    """Round to the nearest integer, halves up."""
-    return math.floor(number + 0.5)

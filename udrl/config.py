@@ -21,6 +21,7 @@ from udrl.errors import ConfigError
 
 PositiveInt = Annotated[int, Meta(ge=1, le=2**31)]
 Count = Annotated[int, Meta(ge=0, le=2**31)]
+Temperature = Annotated[float, Meta(ge=0, le=1000)]
 Scale = Annotated[float, Meta(gt=0, le=1e6)]
 Widths = Annotated[
     tuple[Annotated[int, Meta(ge=1, le=65_536)], ...], Meta(min_length=1, max_length=16)
@@ -46,6 +47,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         seed: the seed that every random stream is keyed by.
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
         batch_size: examples in one update.
+        command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
+            ``record``, or a class of your own as ``package.module:Class``
+            (:mod:`udrl.strategies`).
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
@@ -74,7 +78,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
         eval_every: env steps between two evaluations.
         eval_episodes: episodes in one evaluation.
-        eval_greedy: act by the mode of the action distribution in evaluations (2.3.6).
+        eval_temperature: of the action distribution in evaluations (2.3.6): logits are divided by
+            it; 1 is the paper's, 0 takes the mode.
+        eval_seeds: reset seeds of evaluations: ``final``, in [1, 0.5M), or ``search``, in
+            [0.5M, 1M), for choosing hyperparameters (3.2).
         inference_rows: rows that every inference call is padded to.
         precision: what the network computes in; weights and optimizer are float32 always.
             ``auto``: bfloat16 if the machine that creates the run is fast in it.
@@ -92,6 +99,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     lead: Annotated[int, Meta(ge=0, le=64)] = 0
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
+    command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
     desired_horizon: Literal["mean", "return"] = "mean"
     horizon_scale: Scale = 0.01
     horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
@@ -115,7 +123,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     eval_every: PositiveInt = 50_000
     eval_episodes: Annotated[int, Meta(ge=1, le=100_000)] = 100
-    eval_greedy: bool = False
+    eval_temperature: Temperature = 1.0
+    eval_seeds: Literal["final", "search"] = "final"
 
     inference_rows: Annotated[int, Meta(ge=16, le=4096)] = 16
     precision: Literal["auto", "float32", "bfloat16"] = "float32"

@@ -255,7 +255,8 @@ mean. All files here are written by `make.py` and checked by the tests.
 - `streams.json` holds random streams: what the key is made from, the key, the first 64-bit words of
   Philox4x64-10 and the numbers that are made of them.
 - `choices.json` holds choices of the first action of an episode: the key of its stream, the first
-  number u of that, float32 logits, and the action; `greedy` is the action of a greedy command.
+  number u of that, float32 logits, and the action; `half` and `mode` are the actions
+  at the temperatures 0.5 and 0, `action` that at 1.
 
 """
 
@@ -302,7 +303,8 @@ def choices() -> list[dict[str, Any]]:
                     "u": u,
                     "logits": list(logits),
                     "action": choose(logits, u),
-                    "greedy": logits.index(max(logits)),
+                    "half": choose(tuple(2 * x for x in logits), u),
+                    "mode": logits.index(max(logits)),
                 }
             )
     return found

@@ -84,10 +84,10 @@ def algorithm2(
         number = float(stream.uniforms(1)[0])
         if command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
             u = number
-        if command.greedy:
+        if command.temperature == 0:
             a = logits.index(max(logits))
         else:
-            weights = np.exp(np.array(logits) - max(logits)).tolist()
+            weights = np.exp((np.array(logits) - max(logits)) / command.temperature).tolist()
             cumulative = [weights[0]]
             for weight in weights[1:]:
                 cumulative.append(cumulative[-1] + weight)
@@ -154,7 +154,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     orders += [(command, one) for command in sample.explore(1, buffer)]
     orders += [(command, other) for command in sample.explore(2, buffer) + evaluation]
     orders += [
-        (msgspec.structs.replace(command, id=command.id + 100, greedy=True), other)
+        (msgspec.structs.replace(command, id=command.id + 100, temperature=0.0), other)
         for command in evaluation
     ]
     return config, orders, [episode_digest(algorithm2(config, *each)) for each in orders]
@@ -388,13 +388,30 @@ def test_an_action_of_probability_zero_is_never_taken(
     assert episode.actions.tolist() == actions
 
 
-def test_greedy_actions_are_the_mode() -> None:
+def test_at_temperature_0_actions_are_the_mode() -> None:
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 100).make)
     spy = Spy(generator, config, [0.1, 0.3, 0.2])
-    greedy, sampled = generate_episodes(generator, [order(1, greedy=True), order(2)], spy)
-    assert set(greedy.actions.tolist()) == {1}
+    mode, sampled = generate_episodes(generator, [order(1, temperature=0.0), order(2)], spy)
+    assert set(mode.actions.tolist()) == {1}
     assert set(sampled.actions.tolist()) == {0, 1, 2}
+
+
+def test_temperatures_sharpen_and_flatten_each_episodes_own_actions() -> None:
+    n, logits = 3000, [0.0, 1.0, -0.5]
+    config = settings(max_episode_steps=n)
+    generator = EpisodeGenerator(config, 2, World(script=lambda _: [0.0] * n).make)
+    spy = Spy(generator, config, logits)
+    temperatures = (0.25, 1.0, 4.0)
+    orders = [order(i, temperature=t, max_steps=n) for i, t in enumerate(temperatures)]
+    for temperature, episode in zip(
+        temperatures, generate_episodes(generator, orders, spy), strict=True
+    ):
+        weights = np.exp(np.array(logits) / temperature)
+        expected = weights / weights.sum()
+        found = np.bincount(episode.actions, minlength=3) / n
+        # Four standard deviations of a frequency, and what the rest of the text rounds away.
+        assert np.abs(found - expected).max() < 4 * 0.5 / np.sqrt(n)
 
 
 @pytest.mark.parametrize("ends", [(True, False), (False, True), (True, True)])

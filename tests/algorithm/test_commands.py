@@ -180,14 +180,14 @@ def test_a_training_limit_above_the_environments_changes_nothing() -> None:
     assert {command.max_steps for command in sampler(max_train_steps=900).warm_up()} == {500}
 
 
-def test_only_evaluations_are_greedy_and_only_on_request() -> None:
+def test_only_evaluations_have_another_temperature_and_only_on_request() -> None:
     buffer = buffer_of([1.0])
-    for request in (False, True):
-        sample = sampler(eval_greedy=request)
+    for request in (1.0, 0.5, 0.0):
+        sample = sampler(eval_temperature=request)
         training = sample.warm_up() + sample.explore(1, buffer)
         evaluation = sample.evaluate(1, buffer) + sample.close(1, buffer)
-        assert {command.greedy for command in training} == {False}
-        assert {command.greedy for command in evaluation} == {request}
+        assert {command.temperature for command in training} == {1.0}
+        assert {command.temperature for command in evaluation} == {request}
 
 
 def test_seed_ranges_are_the_papers_and_do_not_meet() -> None:

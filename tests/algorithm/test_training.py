@@ -205,9 +205,9 @@ def test_table_1(seed: int) -> None:
 # Sampled actions slip where the network is not quite certain: over 8 seeds and 8 sets of commands,
 # at most 2 of 180 did. Acting at random obeys about 20 of them.
 @pytest.mark.parametrize(
-    ("segments", "greedy", "slips"), [("all", False, 3), ("trailing", True, 0)]
+    ("segments", "temperature", "slips"), [("all", 1.0, 3), ("trailing", 0.0, 0)]
 )
-def test_the_agent_does_as_it_is_told(segments: str, greedy: bool, slips: int) -> None:
+def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: int) -> None:
     config = settings(
         environment="Obedience-v0",
         segments=segments,
@@ -238,7 +238,7 @@ def test_the_agent_does_as_it_is_told(segments: str, greedy: bool, slips: int) -
             stream_key=stream_key(1, Purpose.PROBE, 0, i),
             weights_version=1,
             max_steps=generator.spec.max_episode_steps,
-            greedy=greedy,
+            temperature=temperature,
         )
         for i in range(180)
     ]

@@ -57,7 +57,7 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
         "--desired-horizon", "40", "--weights", "best",
     ).finish()  # fmt: skip
     assert code == 0, error
-    assert "commanded return 30.0 within 40 steps, greedy" in out
+    assert "commanded return 30.0 within 40 steps, temperature 0," in out
 
     for name in ("run.sqlite", "metrics.csv", "config.toml", "weights.safetensors"):
         assert (run_dir / name).stat().st_size > 0

@@ -61,12 +61,12 @@ def logits(weights: Weights, config: dict[str, Any], s: torch.Tensor, c: torch.T
     return layer("action", x)
 
 
-def choose(row: list[float], u: float, greedy: bool) -> int:
-    if greedy:
+def choose(row: list[float], u: float, temperature: float) -> int:
+    if temperature == 0:
         return row.index(max(row))
     total, cumulative = 0.0, []
     for x in row:
-        total += math.exp(x - max(row))
+        total += math.exp((x - max(row)) / temperature)
         cumulative.append(total)
     return min(sum(c <= u * total for c in cumulative), len(row) - 1)
 
@@ -96,7 +96,7 @@ def run_episode(
             scaled = config["return_scale"] * desired, config["horizon_scale"] * max(horizon, 1.0)
             c[0] = torch.tensor(scaled, dtype=torch.float64)
             row = logits(weights, config, s, c)[0].tolist()
-        action = choose(row, u[len(actions)], command["greedy"])
+        action = choose(row, u[len(actions)], command["temperature"])
         observations.append(np.asarray(observation, np.float32))
         actions.append(action)
         observation, reward, terminated, truncated, _ = env.step(action)
@@ -170,7 +170,7 @@ def numerics_class(hello: dict[str, Any]) -> str:
         "max_steps": n,
         "environment_seed": 1_000_000,
         "stream_key": stream_key(0, "probe", 1, 0),
-        "greedy": False,
+        "temperature": 1.0,
     }
     episode = run_episode(command, hello, weights)
     digests = arrays_digest({"logits": found.numpy()}) + episode_digest(0, episode)

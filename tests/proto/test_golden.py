@@ -89,9 +89,11 @@ def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
     assert Stream(key).uniforms(9).tolist() == vector["numbers"]
 
 
-@pytest.mark.parametrize("greedy", [False, True])
+@pytest.mark.parametrize(("temperature", "key"), [(1.0, "action"), (0.5, "half"), (0.0, "mode")])
 @pytest.mark.parametrize("vector", CHOICES, ids=lambda v: f"{v['logits']}-{v['u']:.3f}")
-def test_actor_chooses_as_the_vectors_say(vector: dict[str, Any], greedy: bool) -> None:
+def test_actor_chooses_as_the_vectors_say(
+    vector: dict[str, Any], temperature: float, key: str
+) -> None:
     class Fixed(BehaviorFunction):
         def frozen(self) -> Acting:
             logits = torch.tensor(vector["logits"])
@@ -108,8 +110,8 @@ def test_actor_chooses_as_the_vectors_say(vector: dict[str, Any], greedy: bool) 
         stream_key=bytes.fromhex(vector["key"]),
         weights_version=1,
         max_steps=2,
-        greedy=greedy,
+        temperature=temperature,
     )
     (episode,) = generate_episodes(generator, [command], Fixed(generator.spec, config))
-    assert episode.actions[0] == vector["greedy" if greedy else "action"]
+    assert episode.actions[0] == vector[key]
     generator.close()

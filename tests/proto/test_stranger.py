@@ -66,11 +66,11 @@ def test_probe_has_the_same_digest(activation: Any, initialisation: Any) -> None
 
 
 @pytest.mark.parametrize(
-    ("kind", "version", "greedy"),
-    [("warm_up", 0, False), ("explore", 1, False), ("evaluate", 1, False), ("evaluate", 1, True)],
+    ("kind", "version", "temperature"),
+    [("warm_up", 0, 1.0), ("explore", 1, 1.0), ("evaluate", 1, 0.3), ("evaluate", 1, 0.0)],
 )
 def test_episode_has_the_same_bytes(
-    kind: Kind, version: int, greedy: bool, generator: EpisodeGenerator
+    kind: Kind, version: int, temperature: float, generator: EpisodeGenerator
 ) -> None:
     commands = [
         Command(
@@ -82,7 +82,7 @@ def test_episode_has_the_same_bytes(
             stream_key=stream_key(7, Purpose.EPISODE, 1, index),
             weights_version=version,
             max_steps=25,
-            greedy=greedy,
+            temperature=temperature,
         )
         for index in range(5)
     ]

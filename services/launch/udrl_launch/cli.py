@@ -12,15 +12,17 @@ from udrl.errors import UdrlError
 
 #: Every command and the module that holds it, in the order of the help.
 _COMMANDS = {
-    "train": "training",
-    "replay": "services",
-    "learner": "services",
-    "actor": "services",
-    "evaluate": "looking",
-    "reproduce": "looking",
-    "status": "looking",
-    "health": "health",
-    "keys": "keys",
+    "train": "udrl_launch.commands.training",
+    "replay": "udrl_launch.commands.services",
+    "learner": "udrl_launch.commands.services",
+    "actor": "udrl_launch.commands.services",
+    "evaluate": "udrl_launch.commands.looking",
+    "reproduce": "udrl_launch.commands.looking",
+    "status": "udrl_launch.commands.looking",
+    "health": "udrl_launch.commands.health",
+    "keys": "udrl_launch.commands.keys",
+    # It stands above this package, and imports it.
+    "study": "udrl_experiments.command",
 }
 
 
@@ -53,7 +55,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return super().get_command(ctx, cmd_name)
-        module = import_module(f"udrl_launch.commands.{_COMMANDS[cmd_name]}")
+        module = import_module(_COMMANDS[cmd_name])
         command: click.Command = getattr(module, cmd_name)
         return command
 

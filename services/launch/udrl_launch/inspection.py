@@ -157,7 +157,7 @@ class Result(NamedTuple):
 
     desired_return: float
     desired_horizon: int
-    greedy: bool
+    temperature: float
     evaluation: Evaluation
     returns: list[float]
 
@@ -166,7 +166,7 @@ def evaluate(
     agent: Agent,
     *,
     episodes: int,
-    greedy: bool | None = None,
+    temperature: float | None = None,
     desired_return: float | None = None,
     desired_horizon: int | None = None,
     environments: int = 16,
@@ -184,9 +184,11 @@ def evaluate(
             f"integer, at every step; give the return only"
         )
     use_one_thread()
-    if greedy is None:
-        greedy = agent.config.eval_greedy
-    config = msgspec.structs.replace(agent.config, eval_episodes=episodes, eval_greedy=greedy)
+    if temperature is None:
+        temperature = agent.config.eval_temperature
+    config = msgspec.structs.replace(
+        agent.config, eval_episodes=episodes, eval_temperature=temperature
+    )
     generator = EpisodeGenerator(config, environments)
     sampler = CommandSampler(config, generator.spec.max_episode_steps)
     commands: list[Command] = sampler.close(agent.iteration, agent.buffer)
@@ -202,4 +204,4 @@ def evaluate(
     done = generate_episodes(generator, commands, agent.behavior)
     generator.close()
     returns = [e.episode_return for e in done]
-    return Result(*wanted, greedy, summarise(returns), returns)
+    return Result(*wanted, temperature, summarise(returns), returns)

@@ -15,6 +15,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
 from udrl.errors import OtherConfiguration, StoreError
 from udrl.numerics import environment_replays, settle, settle_as
+from udrl.strategies import make_strategy
 from udrl_proto import PROTOCOL
 from udrl_proto.messages import Hello
 from udrl_replay.run import Progress
@@ -45,10 +46,12 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
     replay an episode after another one; if it cannot, the run is marked inexact, and goes on.
 
     Raises:
+        ConfigError: the command strategy cannot be made.
         UnsupportedEnvironment: the environment does not exist or is not supported.
         StoreError: the directory holds a run already, or cannot be written.
     """
     config = settle(config)
+    make_strategy(config)
     generator = EpisodeGenerator(config, 1)
     exact = environment_replays(config, generator)
     generator.close()

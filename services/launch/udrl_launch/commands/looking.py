@@ -28,9 +28,10 @@ def _version(text: str) -> int | Literal["latest", "best"]:
 @click.argument("run_dir", type=RUN_DIR)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=100, show_default=True,
               help="Episodes to run.")  # fmt: skip
-@click.option("--greedy/--sampled", default=None,
-              help="Act by the mode of the action distribution, or sample. Default: as the run's "
+@click.option("--temperature", type=click.FloatRange(0, 1000),
+              help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip
+@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
 @click.option("--desired-return", type=float, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @click.option("--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
@@ -39,7 +40,8 @@ def _version(text: str) -> int | Literal["latest", "best"]:
 def evaluate(
     run_dir: Path,
     episodes: int,
-    greedy: bool | None,
+    temperature: float | None,
+    greedy: bool,
     desired_return: float | None,
     desired_horizon: int | None,
     weights: str,
@@ -51,13 +53,15 @@ def evaluate(
     """
     agent = inspection.load_agent(run_dir, _version(weights))
     result = inspection.evaluate(
-        agent, episodes=episodes, greedy=greedy, desired_return=desired_return,
+        agent, episodes=episodes, temperature=0.0 if greedy else temperature,
+        desired_return=desired_return,
         desired_horizon=desired_horizon,
     )  # fmt: skip
     if as_json:
         report = {
-            "run_dir": str(run_dir), "weights_version": agent.version, "greedy": result.greedy,
-            "desired_return": result.desired_return, "desired_horizon": result.desired_horizon,
+            "run_dir": str(run_dir), "weights_version": agent.version,
+            "temperature": result.temperature, "desired_return": result.desired_return,
+            "desired_horizon": result.desired_horizon,
             **result.evaluation._asdict(), "returns": result.returns,
         }  # fmt: skip
         click.echo(msgspec.json.encode(report).decode())
@@ -65,7 +69,7 @@ def evaluate(
     found = result.evaluation
     click.echo(
         f"commanded return {result.desired_return:.1f} within {result.desired_horizon} steps, "
-        f"{'greedy' if result.greedy else 'sampled'}, weights version {agent.version}: mean return "
+        f"temperature {result.temperature:g}, weights version {agent.version}: mean return "
         f"{found.mean:.1f} (95 % interval {found.ci95_low:.1f} to {found.ci95_high:.1f}), "
         f"standard deviation {found.std:.1f}, {found.episodes} episodes"
     )

@@ -1,0 +1,244 @@
+"""DQN and A2C from Stable-Baselines3 under UDRL's protocol (section 3.2).
+
+Networks, reset seeds and evaluations are UDRL's: an evaluation is Algorithm 2, with commands that
+nobody hears. ``python -m udrl_experiments.baselines FOLDER --max-env-steps N`` does the run that
+FOLDER/baseline.json describes, or goes on with it.
+"""
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, cast
+
+import click
+import msgspec
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import BehaviorFunction
+from udrl.commands import Command, CommandSampler
+from udrl.config import Config, KeywordValue
+from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.evaluation import summarise
+from udrl.numerics import settle
+from udrl.replay import Entry, ReplayBuffer
+from udrl_experiments.records import Evaluated, write
+from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
+
+#: Environments that an evaluation runs in at the same time; its result does not depend on it.
+_ENVIRONMENTS = 16
+
+
+class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a baseline's run is.
+
+    Attributes:
+        algorithm: who learns.
+        config: environment and its time limit, ``frame_stack``, ``convolutions`` and ``hidden``,
+            seed, evaluations (DQN's are greedy always) and device; what else it says is UDRL's.
+        hyperparameters: those of :class:`~udrl_experiments.tuned.DqnHyperparameters` or
+            :class:`~udrl_experiments.tuned.A2cHyperparameters` that differ from their defaults.
+
+    Raises:
+        ConfigError: a hyperparameter is unknown or impossible.
+    """
+
+    algorithm: Literal["DQN", "A2C"]
+    config: Config
+    hyperparameters: dict[str, KeywordValue] = {}
+
+    def __post_init__(self) -> None:
+        self.complete()
+
+    def complete(self) -> Hyperparameters:
+        """Return all hyperparameters."""
+        return complete(self.algorithm, self.hyperparameters)
+
+
+class _State(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a run is, besides what lies in tensors.
+
+    Attributes:
+        exploration_steps: env steps in which the part of random actions falls; 0 for A2C.
+        counters: the model's.
+        rows: the evaluations.
+    """
+
+    exploration_steps: int
+    counters: dict[str, int]
+    rows: list[Evaluated]
+
+
+def run(
+    baseline: Baseline, max_env_steps: int, folder: Path, exploration_steps: int | None = None
+) -> list[Evaluated]:
+    """Train, or go on with the training in a folder, and evaluate every ``eval_every`` env steps.
+
+    Who asks for more env steps than a run has made extends it. What is resumed goes on from its
+    last evaluation, but is not bit-identical to what was never stopped: episodes in progress begin
+    anew, and random numbers are others.
+
+    Args:
+        baseline: what to train.
+        max_env_steps: the training ends at the first update that reaches them, with an evaluation.
+        folder: of this run alone. ``evaluations.csv`` grows with every evaluation.
+        exploration_steps: env steps in which DQN's part of random actions falls; None: its
+            ``exploration_fraction`` of ``max_env_steps``. A resumed run keeps what it began with.
+
+    Returns:
+        All evaluations.
+
+    Raises:
+        ConfigError: the folder holds another run, or Stable-Baselines3 is not installed.
+        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        EnvironmentFault: the environment failed repeatedly in an evaluation.
+        InvalidData: what the folder holds is damaged.
+    """
+    _require_stable_baselines3()
+    from udrl_experiments import policies
+
+    torch.set_num_threads(1)
+    _claim(folder, baseline)
+    config, hyperparameters = settle(baseline.config), baseline.complete()
+    path = folder / "state.safetensors"
+    held: dict[str, Tensor] = {}
+    if path.exists():
+        with _reading(path):
+            state, held = _load(path)
+        write(folder / "evaluations.csv", Evaluated, state.rows)  # it may have stopped before that
+    else:
+        if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
+            exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
+        state = _State(exploration_steps=exploration_steps or 0, counters={}, rows=[])
+    rows = state.rows
+    began = time.monotonic() - (rows[-1].wall_s if rows else 0.0)
+
+    with contextlib.ExitStack() as opened:
+        model = policies.make(
+            baseline.algorithm, msgspec.structs.asdict(hyperparameters), config, part=len(rows)
+        )
+        assert model.env is not None
+        opened.callback(model.env.close)
+        if held:
+            with _reading(path):
+                policies.restore(model, held, state.counters)
+        held.clear()
+        policies.explore_for(model, state.exploration_steps)
+        generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.eval_episodes))
+        opened.callback(generator.close)
+        while (env_steps := model.num_timesteps) < max_env_steps:
+            due = (env_steps // config.eval_every + 1) * config.eval_every
+            model.learn(min(due, max_env_steps) - env_steps, reset_num_timesteps=False)
+            # The generator asks no more of a behavior function than this.
+            behavior = cast(BehaviorFunction, policies.InPlaceOfBehavior(model))
+            commands = _commands(baseline, generator, len(rows) + 1)
+            episodes = generate_episodes(generator, commands, behavior)
+            evaluation = summarise([episode.episode_return for episode in episodes])
+            row = Evaluated(
+                environment=config.environment, algorithm=baseline.algorithm, variant="",
+                seed=config.seed, env_steps=model.num_timesteps,
+                wall_s=time.monotonic() - began, mean=evaluation.mean, std=evaluation.std,
+                episodes=evaluation.episodes,
+            )  # fmt: skip
+            rows.append(row)
+            state = msgspec.structs.replace(state, counters=policies.counters(model))
+            _save(path, state, policies.tensors(model))
+            write(folder / "evaluations.csv", Evaluated, rows)
+    return rows
+
+
+def _require_stable_baselines3() -> None:
+    try:
+        import stable_baselines3  # noqa: F401 - whether it can be
+    except ImportError as error:
+        raise ConfigError(
+            f'DQN and A2C are Stable-Baselines3\'s: {error}; pip install "udrl[studies]"'
+        ) from error
+
+
+def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> list[Command]:
+    """Return the commands of an evaluation: the seeds of UDRL's in the iteration ``number``."""
+    config = baseline.config
+    if baseline.algorithm == "DQN":
+        config = msgspec.structs.replace(config, eval_temperature=0.0)
+    sampler = CommandSampler(config, generator.spec.max_episode_steps)
+    return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
+
+
+def read_baseline(folder: Path) -> Baseline:
+    """Return the baseline of a folder.
+
+    Raises:
+        InvalidData: there is none.
+    """
+    path = folder / "baseline.json"
+    with _reading(path):
+        return msgspec.json.decode(path.read_bytes(), type=Baseline)
+
+
+def _claim(folder: Path, baseline: Baseline) -> None:
+    path = folder / "baseline.json"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _put(path, msgspec.json.format(msgspec.json.encode(baseline)))
+    elif read_baseline(folder) != baseline:
+        raise ConfigError(
+            f"{path} describes another run than the one that is asked for; choose another folder"
+        )
+
+
+def _put(path: Path, content: bytes) -> None:
+    """Write a file; it is there whole or not at all."""
+    aside = path.with_name(path.name + ".part")
+    aside.write_bytes(content)
+    os.replace(aside, path)
+
+
+def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:
+    aside = path.with_name(path.name + ".part")
+    metadata = {"state": msgspec.json.encode(state).decode()}
+    safetensors.torch.save_file(tensors, aside, metadata)
+    os.replace(aside, path)
+
+
+def _load(path: Path) -> tuple[_State, dict[str, Tensor]]:
+    with safetensors.safe_open(path, "pt") as file:
+        state = msgspec.json.decode(file.metadata()["state"], type=_State)
+        return state, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what reading a file raises into :class:`InvalidData`."""
+    try:
+        yield
+    except (
+        OSError, KeyError, TypeError, ValueError, msgspec.DecodeError, safetensors.SafetensorError
+    ) as error:  # fmt: skip
+        raise InvalidData(
+            f"{path}: {type(error).__name__}: {error}; "
+            f"delete the folder {path.parent} to have the run made again"
+        ) from error
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--max-env-steps", type=click.IntRange(1), required=True, metavar="N")
+def main(folder: Path, max_env_steps: int) -> None:
+    """Do the run that FOLDER/baseline.json describes, or go on with it."""
+    try:
+        run(read_baseline(folder), max_env_steps, folder)
+    except UdrlError as error:
+        click.echo(f"udrl: error: {error}", err=True)
+        sys.exit(error.exit_code)
+    _put(folder / "done.json", msgspec.json.encode({"max_env_steps": max_env_steps}))
+
+
+if __name__ == "__main__":
+    main()

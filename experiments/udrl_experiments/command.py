@@ -1,0 +1,203 @@
+"""``udrl study``: the paper's experiments from the command line."""
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import click
+
+from udrl_experiments.comparison import comparison
+from udrl_experiments.protocol import TASKS, Algorithm, Plan, Scale, parse_seeds, parse_steps, tasks
+from udrl_experiments.search import search as make_search
+from udrl_experiments.sensitivity import EPISODES
+from udrl_experiments.sensitivity import sensitivity as make_sensitivity
+from udrl_experiments.study import Study, conduct
+from udrl_experiments.variants import commands as make_commands
+from udrl_experiments.variants import lead as make_lead
+from udrl_experiments.variants import segments as make_segments
+from udrl_launch.process import log_to_stderr, run_service
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+_ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
+
+
+@click.group()
+def study() -> None:
+    """Conduct one of the paper's experiments.
+
+    Example: udrl study lander --seeds 1-3 --max-env-steps 3M
+    """
+
+
+def _options(command: Command) -> Command:
+    """Add the options that all studies have."""
+    options = (
+        click.option("--scale", type=click.Choice(get_args(Scale)), default="small",
+                     show_default=True, help="Seeds and steps for an evening on two cores, or the "
+                     "paper's."),
+        click.option("--seeds", metavar="SEEDS", help="E.g. 1-20 or 1,2,7-9."),
+        click.option("--max-env-steps", metavar="STEPS", help="Of each run, e.g. 500K or 10M."),
+        click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
+                     help="Change a setting of all UDRL runs; may be repeated."),
+        click.option("--folder", type=click.Path(path_type=Path, file_okay=False),
+                     default=Path("runs/studies"), show_default=True,
+                     help="Where studies live. They share their runs."),
+        click.option("--side-by-side", type=click.IntRange(1, 1024), metavar="N",
+                     help="Runs at a time. Default: one for every two cores."),
+        click.option("--resume", is_flag=True, help="Go on with the study that is in the folder."),
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _tasks(*default: str) -> Callable[[Command], Command]:
+    """Add the option that names tasks."""
+    return click.option(
+        "--task", "names", multiple=True, type=click.Choice(list(TASKS)), default=default,
+        show_default=True, help="On which; may be repeated.",
+    )  # fmt: skip
+
+
+def _algorithms(command: Command) -> Command:
+    """Add the option that names algorithms."""
+    return click.option(
+        "--algorithm", "algorithms", multiple=True, type=click.Choice(_ALGORITHMS),
+        default=_ALGORITHMS, show_default=True, help="Who takes part; may be repeated.",
+    )(command)  # fmt: skip
+
+
+def _conduct(
+    make: Callable[[Plan], Study],
+    *,
+    scale: Scale,
+    seeds: str | None,
+    max_env_steps: str | None,
+    assignments: tuple[str, ...],
+    folder: Path,
+    side_by_side: int | None,
+    resume: bool,
+) -> int:
+    log_to_stderr(logging.WARNING)
+    plan = Plan(
+        scale,
+        None if seeds is None else parse_seeds(seeds),
+        None if max_env_steps is None else parse_steps(max_env_steps),
+        assignments,
+    )
+    planned = make(plan)
+    cores = len(os.sched_getaffinity(0))
+
+    def service(stop: threading.Event) -> None:
+        conduct(
+            planned, folder, side_by_side=side_by_side or max(1, cores // 2), resume=resume,
+            stop=stop, say=lambda text: click.echo(text, err=True),
+        )  # fmt: skip
+
+    return run_service(service)
+
+
+@study.command()
+@_options
+@_algorithms
+def lander(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+    """Figure 4a: UDRL, DQN and A2C on LunarLander.
+
+    Example: udrl study lander --seeds 1-20 --max-env-steps 10M
+    """
+    return _conduct(lambda plan: comparison("lander", plan, algorithms), **options)
+
+
+@study.command()
+@_options
+@_algorithms
+def takecover(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+    """Figure 4b: UDRL, DQN and A2C on TakeCover.
+
+    Example: udrl study takecover --algorithm UDRL
+    """
+    return _conduct(lambda plan: comparison("takecover", plan, algorithms), **options)
+
+
+@study.command()
+@_options
+@_algorithms
+def sparse(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+    """Figure 5: UDRL, DQN and A2C on LunarLanderSparse.
+
+    Example: udrl study sparse --scale paper
+    """
+    return _conduct(lambda plan: comparison("sparse", plan, algorithms), **options)
+
+
+@study.command()
+@_options
+@_tasks(*TASKS)
+@click.option("--episodes", type=click.IntRange(1, 100_000), default=EPISODES, show_default=True,
+              help="For each desired return.")  # fmt: skip
+def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
+    """Figure 6: what trained agents obtain, against what they are told.
+
+    Example: udrl study sensitivity --task lander --task sparse
+    """
+    return _conduct(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
+
+
+@study.command()
+@_options
+@_tasks("lander")
+def lead(names: tuple[str, ...], **options: Any) -> int:
+    """What asynchrony costs: lead 0, 1, 2, 4 and 8.
+
+    Example: udrl study lead --side-by-side 1
+    """
+    return _conduct(lambda plan: make_lead(plan, tasks(names)), **options)
+
+
+@study.command()
+@_options
+@_tasks("lander", "sparse")
+def segments(names: tuple[str, ...], **options: Any) -> int:
+    """Trailing segments against all (section 2.3.3).
+
+    Example: udrl study segments --task sparse
+    """
+    return _conduct(lambda plan: make_segments(plan, tasks(names)), **options)
+
+
+@study.command()
+@_options
+@_tasks("lander", "sparse")
+@click.option("--strategy", "strategies", multiple=True, metavar="PACKAGE.MODULE:CLASS",
+              help="One of your own besides; may be repeated.")  # fmt: skip
+def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any) -> int:
+    """Strategies for exploratory commands (sections 2.3.4 and 6).
+
+    Example: udrl study commands --strategy mine.strategies:Patient
+    """
+    return _conduct(lambda plan: make_commands(plan, tasks(names), strategies), **options)
+
+
+@study.command()
+@_options
+@_tasks("lander")
+@_algorithms
+@click.option("--configurations", type=click.IntRange(1, 100_000), metavar="N",
+              help="Of each algorithm. Default: 8, or the paper's.")  # fmt: skip
+def search(
+    names: tuple[str, ...],
+    algorithms: tuple[Algorithm, ...],
+    configurations: int | None,
+    **options: Any,
+) -> int:
+    """Appendix B: random search over the paper's spaces, on Ray Tune.
+
+    Example: udrl study search --algorithm UDRL --configurations 16
+    """
+    return _conduct(
+        lambda plan: make_search(plan, tasks(names), algorithms, configurations), **options
+    )

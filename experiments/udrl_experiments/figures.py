@@ -1,0 +1,182 @@
+"""The pictures of the studies, drawn from tidy tables alone, in the layout of the paper's figures.
+
+Colours are those of Okabe and Ito, which the colour-blind can tell apart; every line has a dash
+pattern and marker of its own as well, so that a figure can be read in grey.
+"""
+
+import itertools
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from udrl.errors import ConfigError
+from udrl_experiments.records import Obtained
+from udrl_experiments.statistics import CurvePoint
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: The palette without its yellow, which is too light for a line on white.
+_COLOURS = ("#009E73", "#0072B2", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Their numbers have no common divisor: 36 lines pass before a pair comes again.
+_DASHES = ("-", "--", "-.", ":")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
+#: Algorithms that look the same in every figure; UDRL is green as in the paper.
+_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2}
+
+_AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
+
+
+def learning_curves(
+    points: Sequence[CurvePoint],
+    title: str,
+    *,
+    x: Literal["env_steps", "wall_s"] = "env_steps",
+    references: Mapping[str, float] | None = None,
+) -> "Figure":
+    """Draw mean returns with their 95 % bootstrap bands (Figures 4 and 5), a line for each agent.
+
+    Args:
+        points: at least one; those of an agent in the order of env steps.
+        title: of the figure.
+        x: what the returns are drawn against.
+        references: horizontal lines, from the label to the return.
+
+    Raises:
+        ConfigError: there are no points, or matplotlib is not installed.
+    """
+    lines: dict[tuple[str, str, str], list[CurvePoint]] = {}
+    for point in points:
+        key = (point.environment, point.algorithm, point.variant)
+        lines.setdefault(key, []).append(point)
+    xlabel, unit = _AXES[x]
+    figure, axes = _empty(title, xlabel, "mean return", rows=len(points))
+    for label, value in (references or {}).items():
+        axes.axhline(value, color="0.5", lw=0.8)
+        axes.annotate(
+            label, (1, value), xycoords=("axes fraction", "data"), xytext=(4, 0),
+            textcoords="offset points", va="center", fontsize="small",
+        )  # fmt: skip
+    several = len({environment for environment, _, _ in lines}) > 1
+    styles = _styles([algorithm for _, algorithm, _ in lines])
+    for (key, line), (rank, style) in zip(lines.items(), enumerate(styles), strict=True):
+        seeds = line[0].seeds
+        words = [word for word in key[0 if several else 1 :] if word]
+        label = f"{' '.join(words)} ({seeds} {'seed' if seeds == 1 else 'seeds'})"
+        at = [getattr(point, x) / unit for point in line]
+        low, mean, high = ([getattr(p, name) for p in line] for name in ("low", "mean", "high"))
+        axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
+        # Ten markers, each line's at other places, lest they hide each other.
+        step = max(1, len(line) // 10)
+        axes.plot(at, mean, label=label, markevery=(step * rank // len(lines), step), **style)
+    _legend(figure, axes, "mean over seeds, 95 % bootstrap interval")
+    return figure
+
+
+def sensitivity(rows: Sequence[Obtained], title: str) -> "Figure":
+    """Draw obtained against desired returns (section 3.5, Figure 6), a line for each run.
+
+    The error bars are the standard deviation of the episodes' returns, as the paper's.
+
+    Args:
+        rows: at least one, in any order.
+        title: of the figure.
+
+    Raises:
+        ConfigError: there are no rows, or matplotlib is not installed.
+    """
+    runs: dict[tuple[str, int], list[Obtained]] = {}
+    for row in sorted(rows, key=lambda row: row.desired_return):
+        runs.setdefault((row.environment, row.seed), []).append(row)
+    figure, axes = _empty(title, "desired return", "obtained return", rows=len(rows))
+    ends = [min(row.desired_return for row in rows), max(row.desired_return for row in rows)]
+    axes.plot(ends, ends, ":", color="0.5", lw=1.5, label="obtained = desired")
+    several = len({environment for environment, _ in runs}) > 1
+    styles = _styles([""] * len(runs))
+    for ((environment, seed), run), style in zip(sorted(runs.items()), styles, strict=True):
+        axes.errorbar(
+            [row.desired_return for row in run],
+            [row.mean for row in run],
+            [row.std for row in run],
+            label=f"{environment} seed {seed}" if several else f"seed {seed}",
+            capsize=2,
+            elinewidth=1,
+            **style,
+        )
+    _legend(figure, axes, "mean and standard deviation of the episodes")
+    return figure
+
+
+def save(figure: "Figure", path: Path) -> list[Path]:
+    """Write a figure as PNG and SVG, the same bytes for the same figure; return the two files.
+
+    Each file is there whole or not at all. Text in the SVG stays text.
+
+    Args:
+        figure: of this module; its layout is settled by saving it.
+        path: without suffix.
+    """
+    from matplotlib import rc_context
+
+    # Every drawing would move the layout a little further, and the SVG comes after the PNG.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    saved = []
+    # Matplotlib would write its version, the time and random ids.
+    for suffix, unwanted in ((".png", "Software"), (".svg", "Date")):
+        picture = path.with_name(path.name + suffix)
+        aside = path.with_name(picture.name + ".part")
+        with rc_context({"svg.hashsalt": "udrl", "svg.fonttype": "none"}):
+            figure.savefig(aside, format=suffix[1:], dpi=130, metadata={unwanted: None})
+        os.replace(aside, picture)
+        saved.append(picture)
+    return saved
+
+
+def _empty(title: str, xlabel: str, ylabel: str, *, rows: int) -> "tuple[Figure, Axes]":
+    """Return a figure without lines, and its axes."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            'the figures need matplotlib; install it with: pip install "udrl[studies]"'
+        ) from error
+    if not rows:
+        raise ConfigError(f"{title}: a figure of an empty table; expected at least one row")
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
+    axes.grid(alpha=0.3)
+    axes.margins(x=0.02)
+    return figure, axes
+
+
+def _styles(algorithms: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield a style for each line; the first line of a known algorithm has that algorithm's."""
+    own = {name: rank for name, rank in _OWN_STYLES.items() if name in algorithms}
+    taken = set(own.values())
+    others = (rank for rank in itertools.count() if rank not in taken)
+    for algorithm in algorithms:
+        rank = own.pop(algorithm) if algorithm in own else next(others)
+        yield {
+            "color": _COLOURS[rank % len(_COLOURS)],
+            "linestyle": _DASHES[rank % len(_DASHES)],
+            "marker": _MARKERS[rank % len(_MARKERS)],
+            "markersize": 5,
+            "linewidth": 1.5,
+        }
+
+
+def _legend(figure: "Figure", axes: "Axes", title: str) -> None:
+    """Put the legend below the axes, where it hides nothing."""
+    _, labels = axes.get_legend_handles_labels()
+    # A line of small print across the figure has some 110 characters, a handle takes twelve.
+    columns = min(len(labels), max(1, 110 // (max(map(len, labels)) + 12)))
+    figure.set_figheight(4.6 + 0.17 * math.ceil(len(labels) / columns))
+    figure.legend(
+        loc="outside lower center", ncols=columns, fontsize="small", title=title,
+        title_fontsize="small", handlelength=3.5,
+    )  # fmt: skip

@@ -1,0 +1,85 @@
+"""One run of a study in a process of its own: ``python -m udrl_experiments.job FOLDER``."""
+
+import csv
+import json
+import logging
+import os
+import sys
+import threading
+from pathlib import Path
+
+import click
+
+from udrl.config import Budget
+from udrl.errors import RunFailed, UdrlError
+from udrl_experiments import baselines
+from udrl_experiments.jobs import Job, read_job
+from udrl_experiments.records import Evaluated, write
+from udrl_launch.process import die_with_parent, log_to_stderr, run_service
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from udrl_proto.messages import Status
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--parent", type=int)
+def main(folder: Path, parent: int | None) -> None:
+    """Do the run that FOLDER/job.json describes, or go on with it."""
+    if parent is not None:
+        die_with_parent(parent)
+    log_to_stderr(logging.WARNING)
+    try:
+        job = read_job(folder)
+        code = run_service(lambda stop: carry_out(job, folder, stop))
+    except UdrlError as error:
+        click.echo(f"udrl: error: {error}", err=True)
+        code = error.exit_code
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # as the command `udrl` ends, for the same reason
+
+
+def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
+    """Do the run and leave its evaluations and a note that it is done."""
+    if job.algorithm == "UDRL":
+        settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
+        status = train(settings, folder / "run", stop, go_on=True)
+        if status.problem:
+            raise RunFailed(status.problem)
+        write(folder / "evaluations.csv", Evaluated, _evaluations(job, folder / "run", status))
+    else:
+        baselines.run(
+            baselines.Baseline(
+                algorithm=job.algorithm, config=job.config, hyperparameters=job.hyperparameters
+            ),
+            job.max_env_steps,
+            folder,
+        )
+    done = folder / "done.json.part"
+    done.write_text(json.dumps({"max_env_steps": job.max_env_steps}) + "\n", encoding="utf-8")
+    done.replace(folder / "done.json")
+
+
+def _evaluations(job: Job, run_dir: Path, status: Status) -> list[Evaluated]:
+    def row(env_steps: int, wall_s: float, mean: float, std: float) -> Evaluated:
+        return Evaluated(
+            environment=job.config.environment, algorithm=job.algorithm, variant="",
+            seed=job.config.seed, env_steps=env_steps, wall_s=wall_s, mean=mean, std=std,
+            episodes=job.config.eval_episodes,
+        )  # fmt: skip
+
+    with (run_dir / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        rows = [
+            row(int(r["eval_at_env_steps"]), float(r["wall_s"]), float(r["eval_mean"]),
+                float(r["eval_std"]))
+            for r in csv.DictReader(file) if r["eval_mean"]
+        ]  # fmt: skip
+    closing = status.closing_evaluation
+    if closing is not None:
+        rows.append(row(closing.env_steps, status.wall_s, closing.mean, closing.std))
+    return rows
+
+
+if __name__ == "__main__":
+    main()

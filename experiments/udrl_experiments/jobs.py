@@ -1,0 +1,184 @@
+"""Training runs, the unit of every study: a process each, side by side, resumed where they stopped.
+
+A run is a function of its settings, so studies share runs: whoever asks for the same settings gets
+the same run, and asks only for as many of its steps as it wants.
+"""
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from udrl.config import Config
+from udrl.errors import Interrupted, InvalidData, RunFailed
+from udrl_experiments.protocol import Algorithm
+from udrl_experiments.records import Evaluated, read
+
+#: What is said when a study is stopped.
+INTERRUPTED = "stopped; go on with the same command and --resume"
+
+_PROGRAM = ("-m", "udrl_experiments.job")
+_POLL_S = 0.2
+#: Seconds that a run gets to end when it is told to.
+_END_S = 10.0
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A run that a study needs.
+
+    Attributes:
+        algorithm: who learns.
+        config: UDRL's settings; of another algorithm's, environment, networks and evaluations.
+        hyperparameters: of DQN and A2C.
+        max_env_steps: how far.
+        variant: what sets it apart within the study; not a part of what the run is.
+    """
+
+    algorithm: Algorithm
+    config: Config
+    hyperparameters: dict[str, bool | int | float | str] = {}
+    max_env_steps: int
+    variant: str = ""
+
+    @property
+    def name(self) -> str:
+        """A name that only runs of equal settings have."""
+        identity = msgspec.json.encode([self.algorithm, self.config, self.hyperparameters])
+        digest = hashlib.sha256(identity).hexdigest()[:12]
+        environment = re.sub(r"[^a-z0-9]+", "-", self.config.environment.lower()).strip("-")
+        return f"{self.algorithm.lower()}-{environment}-seed{self.config.seed}-{digest}"
+
+    @property
+    def described(self) -> str:
+        """What it is, in a line."""
+        variant = f", {self.variant}" if self.variant else ""
+        return (
+            f"{self.algorithm}, {self.config.environment}, seed {self.config.seed}{variant}: "
+            f"{self.max_env_steps:,} env steps"
+        )
+
+    def folder(self, root: Path) -> Path:
+        """Return where the run lives."""
+        return root / "runs" / self.name
+
+    def done(self, root: Path) -> bool:
+        """Say whether the run has got as far as is asked."""
+        try:
+            done = json.loads((self.folder(root) / "done.json").read_text(encoding="utf-8"))
+            return int(done["max_env_steps"]) >= self.max_env_steps
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+    def evaluations(self, root: Path) -> list[Evaluated]:
+        """Return the run's evaluations up to the last multiple of ``eval_every`` asked for.
+
+        Raises:
+            InvalidData: they cannot be read.
+        """
+        every = self.config.eval_every
+        return [
+            msgspec.structs.replace(row, variant=self.variant)
+            for row in read(self.folder(root) / "evaluations.csv", Evaluated)
+            if row.env_steps // every * every <= self.max_env_steps
+        ]
+
+
+def read_job(folder: Path) -> Job:
+    """Return the job of a folder.
+
+    Raises:
+        InvalidData: there is none.
+    """
+    try:
+        return msgspec.json.decode((folder / "job.json").read_bytes(), type=Job)
+    except (OSError, msgspec.DecodeError) as error:
+        raise InvalidData(f"{folder / 'job.json'}: {error}; expected a study's run") from error
+
+
+def carry_out(
+    jobs: Iterable[Job],
+    root: Path,
+    side_by_side: int,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> None:
+    """Do all runs that are not done, some side by side; the first that fails ends the others.
+
+    Args:
+        jobs: equal runs are done once, as far as the one that asks for most.
+        root: where runs live.
+        side_by_side: how many at a time.
+        stop: ends them early; they go on next time.
+        say: is told what begins and what ends.
+
+    Raises:
+        RunFailed: a run failed.
+        Interrupted: ``stop`` was set.
+    """
+    waiting = [job for job in furthest(jobs) if not job.done(root)][::-1]
+    n, running = len(waiting), dict[str, subprocess.Popen[bytes]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < side_by_side:
+                job = waiting.pop()
+                say(f"[{n - len(waiting)}/{n}] {job.described}")
+                running[job.name] = _start(job, root)
+            if stop.wait(_POLL_S):
+                raise Interrupted(INTERRUPTED)
+            for name, process in list(running.items()):
+                code = process.poll()
+                if code is None:
+                    continue
+                del running[name]
+                if code != 0:
+                    raise _failure(root / "runs" / name, code)
+    finally:
+        _end(running.values())
+
+
+def furthest(jobs: Iterable[Job]) -> Sequence[Job]:
+    """Return jobs of different runs, each as far as anyone asks, in order of first appearance."""
+    furthest: dict[str, Job] = {}
+    for job in jobs:
+        held = furthest.setdefault(job.name, job)
+        if job.max_env_steps > held.max_env_steps:
+            furthest[job.name] = job
+    return list(furthest.values())
+
+
+def _start(job: Job, root: Path) -> subprocess.Popen[bytes]:
+    folder = job.folder(root)
+    folder.mkdir(parents=True, exist_ok=True)
+    aside = folder / "job.json.part"
+    aside.write_bytes(msgspec.json.format(msgspec.json.encode(job)))
+    os.replace(aside, folder / "job.json")
+    with (folder / "log.txt").open("ab") as output:
+        return subprocess.Popen(  # noqa: S603 - our own program
+            [sys.executable, *_PROGRAM, str(folder), "--parent", str(os.getpid())],
+            stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
+        )  # fmt: skip
+
+
+def _failure(folder: Path, code: int) -> RunFailed:
+    words = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
+    failure = RunFailed(f"the run in {folder} ended with code {code}:\n" + "\n".join(words))
+    failure.exit_code = code if code > 0 else failure.exit_code
+    return failure
+
+
+def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

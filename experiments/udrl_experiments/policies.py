@@ -1,0 +1,244 @@
+"""DQN and A2C from Stable-Baselines3, with the behavior function's networks (section 3.2).
+
+Importing it needs Stable-Baselines3; :mod:`udrl_experiments.baselines` does so when it trains.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from itertools import pairwise
+from typing import Any, Literal
+
+import gymnasium as gym
+import torch
+from gymnasium import spaces
+from stable_baselines3 import A2C, DQN
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import Tensor, nn
+
+from udrl.behavior import Acting
+from udrl.commands import TRAINING_SEEDS
+from udrl.config import Config
+from udrl.environments.making import Environment, make_environment
+from udrl.streams import Purpose, Stream, stream_key
+
+_ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+#: Stable-Baselines3's default, which naming another decay would lose.
+_RMS_PROP_EPS = 1e-5
+
+#: What a model counts, besides what lies in its tensors.
+_COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
+_TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class TrainingResets(gym.Wrapper[Any, Any, Any, Any]):
+    """Resets an environment with the paper's seeds for training, whatever it is asked for.
+
+    Args:
+        env: the environment.
+        stream: what the seeds are drawn from.
+    """
+
+    def __init__(self, env: Environment, stream: Stream) -> None:
+        super().__init__(env)
+        self._stream = stream
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        (seed,) = self._stream.integers(1, *TRAINING_SEEDS).tolist()
+        return self.env.reset(seed=seed, options=options)
+
+
+class Convolutions(BaseFeaturesExtractor):
+    """The behavior function's convolutional layers (Appendix B.2).
+
+    Args:
+        observation_space: uint8 images, [frame_stack, channels, height, width].
+        channels: of each layer.
+    """
+
+    def __init__(self, observation_space: spaces.Box, channels: tuple[int, ...]) -> None:
+        frames, colours, *size = observation_space.shape
+        layers: list[nn.Module] = []
+        for before, after in pairwise((frames * colours, *channels)):
+            layers += [nn.Conv2d(before, after, 3, 2, 1), nn.ReLU()]
+        embed = nn.Sequential(*layers, nn.Flatten())
+        with torch.no_grad():
+            embedding = embed(torch.zeros(1, frames * colours, *size))
+        super().__init__(observation_space, embedding.shape[1])
+        self.embed = embed
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return the embedding of images.
+
+        Args:
+            observations: float32 [n, frame_stack, channels, height, width], from 0 to 255.
+
+        Returns:
+            float32 [n, features_dim].
+        """
+        embedding: Tensor = self.embed(observations.flatten(1, 2) * (1 / 255))
+        return embedding
+
+
+def make(
+    algorithm: Literal["DQN", "A2C"],
+    hyperparameters: Mapping[str, Any],
+    config: Config,
+    part: int = 0,
+) -> DQN | A2C:
+    """Return an untrained model with its environments.
+
+    Args:
+        algorithm: which.
+        hyperparameters: all of the algorithm's (:mod:`udrl_experiments.tuned`), by name.
+        config: environment, networks, seed and device, which must not be ``auto``.
+        part: evaluations before; what goes on with a run draws other random numbers.
+
+    Raises:
+        UnsupportedEnvironment: the environment cannot be made or is not supported.
+    """
+    chosen = dict(hyperparameters)
+    envs = DummyVecEnv(
+        [partial(_environment, config, part, i) for i in range(chosen.pop("n_envs", 1))]
+    )
+    networks: dict[str, Any] = {
+        "net_arch": list(config.hidden),
+        "activation_fn": _ACTIVATIONS[chosen.pop("activation")],
+    }
+    policy = "MlpPolicy"
+    if len(envs.observation_space.shape or ()) == 4:
+        policy = "CnnPolicy"
+        networks["features_extractor_class"] = Convolutions
+        networks["features_extractor_kwargs"] = {"channels": config.convolutions}
+    # numpy's global generator, which Stable-Baselines3 seeds, takes 32 bits.
+    (seed,) = Stream(stream_key(config.seed, Purpose.INITIALISE, part)).integers(1, 0, 2**32)
+    common: dict[str, Any] = {"policy_kwargs": networks, "seed": int(seed), "device": config.device}
+    model: DQN | A2C
+    if algorithm == "DQN":
+        del chosen["exploration_fraction"]  # see `explore_for`
+        model = DQN(policy, envs, **chosen, **common)
+    else:
+        networks["optimizer_class"] = torch.optim.RMSprop
+        networks["optimizer_kwargs"] = {
+            "alpha": chosen.pop("rms_prop_decay"), "eps": _RMS_PROP_EPS,
+        }  # fmt: skip
+        model = A2C(policy, envs, **chosen, **common)
+    model.set_logger(Logger(None, []))  # the default one makes a folder in /tmp
+    return model
+
+
+def _environment(config: Config, part: int, index: int) -> Environment:
+    env = make_environment(config)
+    # Even with one frame, a dimension of their own keeps Stable-Baselines3 from guessing which one
+    # of an image's holds the channels.
+    env = gym.wrappers.FrameStackObservation(env, config.frame_stack)
+    return TrainingResets(env, Stream(stream_key(config.seed, Purpose.TRAINING, part, index)))
+
+
+def explore_for(model: DQN | A2C, env_steps: int) -> None:
+    """Let the part of random actions fall linearly for so many env steps, if the model is DQN.
+
+    Stable-Baselines3's own schedule begins anew with every call of ``learn``.
+    """
+    if not isinstance(model, DQN):
+        return
+    last = model.exploration_final_eps
+
+    def rate(_: float = 1.0) -> float:
+        return last + (1.0 - last) * max(0.0, 1.0 - model.num_timesteps / max(1, env_steps))
+
+    model.exploration_schedule, model.exploration_rate = rate, rate()
+
+
+class InPlaceOfBehavior:
+    """A model in the place of a behavior function (:mod:`udrl.acting`); it hears no command."""
+
+    def __init__(self, model: DQN | A2C) -> None:
+        self._model = model
+
+    def frozen(self) -> Acting:
+        """Return what acts; the model must not be trained meanwhile."""
+        self._model.policy.set_training_mode(mode=False)
+        return self._logits
+
+    def _logits(self, observation: Tensor, command: Tensor) -> Tensor:
+        """Return A2C's logits, or DQN's Q-values, of which the greatest one is meant."""
+        model = self._model
+        shape = model.observation_space.shape
+        assert shape is not None
+        seen = observation.reshape(-1, *shape).to(model.device)
+        if isinstance(model, DQN):
+            logits: Tensor = model.q_net(seen)
+        else:
+            distribution = model.policy.get_distribution(seen).distribution
+            assert isinstance(distribution, torch.distributions.Categorical)
+            logits = distribution.logits
+        return logits.cpu()
+
+
+def counters(model: DQN | A2C) -> dict[str, int]:
+    """Return what a model has counted, by name."""
+    counted = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+    if isinstance(model, DQN):
+        assert model.replay_buffer is not None
+        counted["pos"] = model.replay_buffer.pos
+    return counted
+
+
+def tensors(model: DQN | A2C) -> dict[str, Tensor]:
+    """Return weights, optimizer and the filled part of the replay buffer, by name.
+
+    They are the model's own, and no two share memory.
+    """
+    held = {f"policy.{n}": p.detach() for n, p in model.policy.named_parameters()}
+    for index, state in model.policy.optimizer.state_dict()["state"].items():
+        held |= {f"optimizer.{index}.{key}": value for key, value in state.items()}
+    if isinstance(model, DQN):
+        buffer = model.replay_buffer
+        assert buffer is not None
+        for name in _TRANSITIONS:
+            held[f"replay.{name}"] = torch.from_numpy(getattr(buffer, name)[: buffer.size()])
+    return held
+
+
+def restore(model: DQN | A2C, held: Mapping[str, Tensor], counted: Mapping[str, int]) -> None:
+    """Give a model the :func:`tensors` and :func:`counters` of another one.
+
+    Raises:
+        KeyError: something is missing.
+        ValueError: something has another shape.
+    """
+    for name in _COUNTERS:
+        if hasattr(model, name):
+            setattr(model, name, counted[name])
+    for name, parameter in model.policy.named_parameters():
+        value = held[f"policy.{name}"]
+        if value.shape != parameter.shape:
+            raise ValueError(f"{name} is {tuple(value.shape)}, not {tuple(parameter.shape)}")
+        parameter.data.copy_(value)
+    optimizer = model.policy.optimizer
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in held.items():
+        if name.startswith("optimizer."):
+            _, index, key = name.split(".", 2)
+            state.setdefault(int(index), {})[key] = value.clone()
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
+    if isinstance(model, DQN):
+        _restore_replay(model, held, counted["pos"])
+
+
+def _restore_replay(model: DQN, held: Mapping[str, Tensor], pos: int) -> None:
+    buffer = model.replay_buffer
+    assert buffer is not None
+    for name in _TRANSITIONS:
+        value = held[f"replay.{name}"].numpy()
+        getattr(buffer, name)[: len(value)] = value
+    buffer.pos, buffer.full = pos, len(value) == buffer.buffer_size
+    if model.n_steps > 1:
+        # The episode in progress is lost: its return must not go on in another one's.
+        buffer.timeouts[pos - 1] = 1 - buffer.dones[pos - 1]

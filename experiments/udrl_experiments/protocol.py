@@ -1,0 +1,149 @@
+"""Section 3.2: what all studies share, at the paper's scale and at one for two cores."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from udrl.config import Config, build, parse_assignment, preset
+from udrl.errors import ConfigError
+
+Algorithm = Literal["UDRL", "DQN", "A2C"]
+Scale = Literal["small", "paper"]
+
+#: Evaluations that a score is the mean of (Appendix B).
+LAST = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """An environment of the paper, and what is asked of its agents.
+
+    Attributes:
+        environment: Gymnasium's id; its preset has the same name.
+        title: in pictures.
+        small: env steps of a run at the small scale: UDRL's, and the other algorithms'.
+        desired_returns: what trained agents are told in the study of section 3.5.
+        landmarks: returns that the paper names, by what they mean.
+    """
+
+    environment: str
+    title: str
+    small: dict[Algorithm, int]
+    desired_returns: tuple[float, ...]
+    landmarks: dict[str, float]
+
+
+_LANDING = {"lands": 100.0, "close to optimal": 200.0}
+_SMALL: dict[Algorithm, int] = {"UDRL": 3_000_000, "DQN": 1_000_000, "A2C": 1_000_000}
+
+TASKS = {
+    "lander": Task(
+        "LunarLander-v3", "LunarLander", _SMALL, tuple(range(-150, 301, 25)), _LANDING
+    ),
+    "sparse": Task(
+        "LunarLanderSparse-v3", "LunarLanderSparse", _SMALL, tuple(range(-150, 301, 25)), _LANDING
+    ),
+    "takecover": Task(
+        "TakeCover-v0", "TakeCover", {"UDRL": 300_000, "DQN": 100_000, "A2C": 100_000},
+        tuple(range(100, 2101, 200)), {"solved": 750.0},
+    ),
+}  # fmt: skip
+
+#: Env steps of a run in the paper, of every algorithm in every environment.
+PAPER_STEPS = 10_000_000
+
+
+class Plan(NamedTuple):
+    """What a study is to do.
+
+    Attributes:
+        scale: where seeds and steps come from when they are not given.
+        seeds: of the runs; None: 1 to 20 in the paper, 1 to 3 at the small scale.
+        max_env_steps: of each run; None: as the scale says.
+        assignments: ``HYPERPARAMETER=VALUE``, changes of UDRL's presets.
+    """
+
+    scale: Scale = "small"
+    seeds: tuple[int, ...] | None = None
+    max_env_steps: int | None = None
+    assignments: tuple[str, ...] = ()
+
+    def seeds_of_runs(self) -> tuple[int, ...]:
+        """Return the seeds."""
+        if self.seeds is not None:
+            return self.seeds
+        return tuple(range(1, 21 if self.scale == "paper" else 4))
+
+    def steps(self, task: Task, algorithm: Algorithm = "UDRL") -> int:
+        """Return the env steps of a run."""
+        if self.max_env_steps is not None:
+            return self.max_env_steps
+        return PAPER_STEPS if self.scale == "paper" else task.small[algorithm]
+
+    def config(self, task: Task, seed: int, *, paper: bool = False, **changes: Any) -> Config:
+        """Return the settings of a UDRL run: the preset, changes, and the plan's assignments.
+
+        Args:
+            task: whose environment and preset.
+            seed: of the run.
+            paper: start from the preset that has nothing that is not in the paper.
+            changes: of the preset.
+
+        Raises:
+            ConfigError: a setting is unknown or impossible.
+        """
+        name = f"{task.environment}-paper" if paper else task.environment
+        values = preset(name) | {"eval_every": 50_000} | changes
+        del values["max_env_steps"]
+        values |= dict(parse_assignment(text) for text in self.assignments)
+        return build(Config, values | {"environment": task.environment, "seed": seed})
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds that ``1-3,7`` names.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", part)
+        if found is None:
+            raise ConfigError(f"--seeds {text}: expected numbers and ranges, e.g. 1-20 or 1,2,7-9")
+        first = int(found[1])
+        last = int(found[2] or first)
+        if not first <= last < first + 10_000:
+            raise ConfigError(f"--seeds {text}: {part.strip()} must go up, by less than 10,000")
+        seeds.extend(range(first, last + 1))
+    return tuple(dict.fromkeys(seeds))
+
+
+def parse_steps(text: str) -> int:
+    """Return the env steps that ``3M``, ``500K`` or ``1000000`` names.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKmM]?)", text.replace("_", "").replace(",", ""))
+    steps = 0 if found is None else round(
+        float(found[1]) * {"": 1, "k": 1_000, "m": 1_000_000}[found[2].lower()]
+    )  # fmt: skip
+    if not 1 <= steps <= 2**53:
+        raise ConfigError(
+            f"--max-env-steps {text}: expected a number of steps, e.g. 500K, 10M or 250000"
+        )
+    return steps
+
+
+def tasks(names: Iterable[str]) -> list[Task]:
+    """Return tasks by name.
+
+    Raises:
+        ConfigError: there is no task of that name.
+    """
+    names = tuple(names)
+    for name in names:
+        if name not in TASKS:
+            raise ConfigError(f"task {name!r}: there are {', '.join(TASKS)}")
+    return [TASKS[name] for name in names]

@@ -1,0 +1,69 @@
+"""Figure 6: what trained agents obtain, against what they are told to (section 3.5)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from udrl_experiments import figures
+from udrl_experiments.comparison import job
+from udrl_experiments.jobs import Job
+from udrl_experiments.protocol import Plan, Task
+from udrl_experiments.records import Obtained, read, write
+from udrl_experiments.study import Place, Study
+from udrl_launch.inspection import Agent, evaluate, load_agent
+
+#: Episodes a point.
+EPISODES = 100
+
+
+def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
+    """Return the study; it tells the agents of the studies of Figures 4 and 5.
+
+    Args:
+        plan: seeds and steps.
+        tasks: on which.
+        episodes: for each desired return.
+    """
+    jobs = {
+        task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
+    }
+
+    def report(place: Place) -> None:
+        for task, runs in jobs.items():
+            table = place.folder / f"{task.title}.csv"
+            rows = read(table, Obtained) if table.exists() else []
+            for run in runs:
+                rows += _told(run, place.root, task, episodes, rows)
+                write(table, Obtained, rows)
+            draw(table, task.title)
+
+    return Study("sensitivity", [run for runs in jobs.values() for run in runs], report)
+
+
+def _told(
+    run: Job, root: Path, task: Task, episodes: int, known: Sequence[Obtained]
+) -> list[Obtained]:
+    """Return what the agent of a run obtains, unless that is known."""
+    seed = run.config.seed
+    if any(row.seed == seed for row in known):
+        return []
+    agent = load_agent(run.folder(root) / "run")
+    return [_obtained(agent, told, episodes, run) for told in task.desired_returns]
+
+
+def _obtained(agent: Agent, desired_return: float, episodes: int, run: Job) -> Obtained:
+    result = evaluate(agent, episodes=episodes, desired_return=desired_return)
+    return Obtained(
+        environment=run.config.environment,
+        seed=run.config.seed,
+        env_steps=run.max_env_steps,
+        desired_return=result.desired_return,
+        desired_horizon=result.desired_horizon,
+        mean=result.evaluation.mean,
+        std=result.evaluation.std,
+        episodes=result.evaluation.episodes,
+    )
+
+
+def draw(table: Path, title: str) -> None:
+    """Draw the picture from its table alone."""
+    figures.save(figures.sensitivity(read(table, Obtained), title), table.with_suffix(""))

@@ -1,0 +1,90 @@
+"""Studies that change one setting of UDRL: ``lead``, ``segments``, ``commands``.
+
+The paper has none of them in figures. Section 2.3.3 leaves out all but trailing segments, section 6
+calls for a study of other ways to choose exploratory commands, and lead is ours.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from udrl.strategies import STRATEGIES
+from udrl_experiments import figures
+from udrl_experiments.comparison import report_curves
+from udrl_experiments.jobs import Job
+from udrl_experiments.protocol import Plan, Task
+from udrl_experiments.records import read
+from udrl_experiments.statistics import CurvePoint
+from udrl_experiments.study import Place, Study
+
+#: Env steps of a run at the small scale.
+SMALL_STEPS = 1_000_000
+
+LEADS = (0, 1, 2, 4, 8)
+
+
+def lead(plan: Plan, tasks: Sequence[Task]) -> Study:
+    """Return the study of what asynchrony costs: against env steps, and against wall time."""
+    variants = {f"lead {n}": {"lead": n} for n in LEADS}
+    return _variants("lead", plan, tasks, variants, wall_time=True)
+
+
+def segments(plan: Plan, tasks: Sequence[Task]) -> Study:
+    """Return the study of trailing segments against all, 0 <= t1 < t2 <= T (section 2.3.3)."""
+    variants = {name: {"segments": name} for name in ("trailing", "all")}
+    return _variants("segments", plan, tasks, variants)
+
+
+def commands(plan: Plan, tasks: Sequence[Task], strategies: Sequence[str]) -> Study:
+    """Return the study of strategies for exploratory commands (sections 2.3.4 and 6).
+
+    Args:
+        plan: seeds and steps.
+        tasks: on which.
+        strategies: your own, ``package.module:Class``, besides those of :mod:`udrl.strategies`.
+    """
+    variants = {name: {"command_strategy": name} for name in (*STRATEGIES, *strategies)}
+    return _variants("commands", plan, tasks, variants)
+
+
+def _variants(
+    name: str,
+    plan: Plan,
+    tasks: Sequence[Task],
+    variants: Mapping[str, Mapping[str, Any]],
+    *,
+    wall_time: bool = False,
+) -> Study:
+    if plan.scale == "small" and plan.max_env_steps is None:
+        plan = plan._replace(max_env_steps=SMALL_STEPS)
+    jobs = {
+        task: [
+            Job(
+                algorithm="UDRL",
+                config=plan.config(task, seed, **changes),
+                max_env_steps=plan.steps(task),
+                variant=variant,
+            )
+            for variant, changes in variants.items()
+            for seed in plan.seeds_of_runs()
+        ]
+        for task in tasks
+    }
+
+    def report(place: Place) -> None:
+        for task, runs in jobs.items():
+            folder = place.folder if len(jobs) == 1 else place.folder / task.title
+            folder.mkdir(exist_ok=True)
+            here = place._replace(folder=folder)
+            title = f"{task.title}: {name}"
+            report_curves(runs, title, task.landmarks, here)
+            if wall_time:
+                draw_wall_time(here, title, task.landmarks)
+
+    return Study(name, [job for runs in jobs.values() for job in runs], report)
+
+
+def draw_wall_time(place: Place, title: str, landmarks: Mapping[str, float]) -> None:
+    """Draw the curves against wall time, from their table alone."""
+    points = read(place.folder / "curves.csv", CurvePoint)
+    picture = figures.learning_curves(points, title, x="wall_s", references=landmarks)
+    figures.save(picture, place.folder / "learning-curves-wall-time")

@@ -1,0 +1,161 @@
+import sys
+from collections.abc import Sequence
+from math import floor, sqrt
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.commands import CommandSampler
+from udrl.config import Config, build
+from udrl.errors import ConfigError
+from udrl.replay import Entry, ReplayBuffer
+from udrl.strategies import STRATEGIES, ask, make_strategy
+
+BEST = st.lists(st.tuples(st.floats(-500, 500), st.integers(1, 1000)), min_size=1, max_size=8).map(
+    lambda rows: sorted(Entry(r, i, n) for i, (r, n) in enumerate(rows))
+)
+U = st.floats(0, 1, exclude_max=True)
+
+
+def config(**values: Any) -> Config:
+    return build(Config, {"environment": "CartPole-v1"} | values)
+
+
+def strategy(name: str) -> Any:
+    return make_strategy(config(command_strategy=name))
+
+
+@given(BEST, U)
+def test_uniform_asks_for_returns_in_m_to_m_plus_s_and_the_mean_length(
+    best: list[Entry], u: float
+) -> None:
+    n = len(best)
+    m = sum(e.episode_return for e in best) / n
+    s = sqrt(sum((e.episode_return - m) ** 2 for e in best) / n)
+    desired_return, horizon = strategy("uniform")(best, u)
+    assert desired_return == pytest.approx(m + u * s, rel=1e-9, abs=1e-6)
+    assert horizon == floor(sum(e.length for e in best) / n + 0.5)
+
+
+@given(BEST, U)
+def test_again_asks_for_what_one_of_the_best_did(best: list[Entry], u: float) -> None:
+    assert strategy("again")(best, u) in [(e.episode_return, e.length) for e in best]
+
+
+@given(BEST)
+def test_again_asks_for_each_as_often(best: list[Entry]) -> None:
+    n = len(best)
+    asked = [strategy("again")(best, (i + 0.5) / n) for i in range(n)]
+    assert asked == [(e.episode_return, e.length) for e in best]
+
+
+@given(BEST, U)
+def test_record_asks_for_what_the_very_best_did(best: list[Entry], u: float) -> None:
+    assert strategy("record")(best, u) == (best[-1].episode_return, best[-1].length)
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_is_a_function_of_its_arguments(name: str) -> None:
+    best = [Entry(float(n), n, n + 1) for n in range(10)]
+    first = [strategy(name)(best, u / 7) for u in range(7)]
+    again = strategy(name)
+    assert [again(best, u / 7) for u in range(7)][::-1] == first[::-1]
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "own_strategies.py").write_text(
+        "class Patient:\n"
+        "    def __init__(self, config):\n"
+        "        self.seed = config.seed\n"
+        "    def __call__(self, best, u):\n"
+        "        return best[0].episode_return + self.seed, 2 * best[-1].length\n"
+        "class Broken(Patient):\n"
+        "    def __call__(self, best, u):\n"
+        "        return 1 / 0\n"
+        "class Needy:\n"
+        "    pass\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_strategies", raising=False)
+    return "own_strategies"
+
+
+def buffer() -> ReplayBuffer:
+    return ReplayBuffer(config(), [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
+
+
+def test_your_own_is_named_by_module_and_class(own: str) -> None:
+    sampler = CommandSampler(config(command_strategy=f"{own}:Patient", seed=9), 500)
+    commands = sampler.explore(1, buffer())
+    assert {(c.desired_return, c.desired_horizon) for c in commands} == {(10.0, 40)}
+
+
+def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
+    sampler = CommandSampler(config(command_strategy="not.there:Missing"), 500)
+    assert {(c.desired_return, c.desired_horizon) for c in sampler.evaluate(1, buffer())} == {
+        (3.0, 15)
+    }
+
+
+def test_the_spread_applies_to_every_strategy() -> None:
+    for name in STRATEGIES:
+        sampler = CommandSampler(config(command_strategy=name, horizon_spread=0.5), 500)
+        horizons = {c.desired_horizon for c in sampler.explore(1, buffer())}
+        assert len(horizons) > 2
+        assert min(horizons) >= 5
+        assert max(horizons) <= 30
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("cautious", r"expected uniform, again, record, or a class of your own"),
+        ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
+        ("udrl.strategies:Missing", "AttributeError"),
+    ],
+)
+def test_what_cannot_be_imported_is_refused(name: str, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        strategy(name)
+
+
+def test_what_cannot_be_made_is_refused(own: str) -> None:
+    with pytest.raises(ConfigError, match=r"own_strategies:Needy.*TypeError"):
+        strategy(f"{own}:Needy")
+
+
+def test_a_strategy_that_fails_is_named(own: str) -> None:
+    with pytest.raises(ConfigError, match="Broken failed: ZeroDivisionError"):
+        ask(strategy(f"{own}:Broken"), [Entry(1.0, 1, 1)], 0.5)
+
+
+@pytest.mark.parametrize(
+    "asked", [(float("nan"), 3), (float("inf"), 3), (1.0, 2**40), None, (1.0,), ("a lot", 3)]
+)
+def test_what_no_command_can_be_is_refused(asked: Any) -> None:
+    class Odd:
+        def __init__(self, config: Config) -> None:
+            pass
+
+        def __call__(self, best: Sequence[Entry], u: float) -> Any:
+            return asked
+
+    with pytest.raises(ConfigError, match="Odd"):
+        ask(Odd(config()), [Entry(1.0, 1, 1)], 0.5)
+
+
+@pytest.mark.parametrize(("horizon", "said"), [(0, 1), (-5, 1), (2.9, 2)])
+def test_a_horizon_is_a_whole_number_of_at_least_one(horizon: float, said: int) -> None:
+    class Odd:
+        def __init__(self, config: Config) -> None:
+            pass
+
+        def __call__(self, best: Sequence[Entry], u: float) -> Any:
+            return 1.0, horizon
+
+    assert ask(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, said)

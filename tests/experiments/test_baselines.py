@@ -1,0 +1,415 @@
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import safetensors.torch
+import torch
+from click.testing import CliRunner
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+from stable_baselines3 import A2C, DQN
+from torch import Tensor, nn
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import BehaviorFunction
+from udrl.commands import Command, CommandSampler
+from udrl.config import Config, KeywordValue, read_toml
+from udrl.environments.making import make_environment, specify
+from udrl.errors import ConfigError, InvalidData
+from udrl.replay import Entry, ReplayBuffer
+from udrl_experiments import baselines, policies
+from udrl_experiments.baselines import Baseline, run
+from udrl_experiments.records import Evaluated, read
+from udrl_experiments.tuned import complete, tuned
+
+ALGORITHMS = ("DQN", "A2C")
+FAST: dict[str, dict[str, KeywordValue]] = {
+    "DQN": {"buffer_size": 500, "learning_starts": 50, "train_freq": 4},
+    "A2C": {"n_envs": 2, "n_steps": 5},
+}
+
+seeds: list[int | None] = []
+
+
+class Balance(CartPoleEnv):
+    """CartPole that notes what it is reset with."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        seeds.append(seed)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+
+class Pictures(gym.Env[npt.NDArray[np.uint8], np.int64]):
+    """Small images of noise, whose number of frames is not their smallest dimension."""
+
+    observation_space = gym.spaces.Box(0, 255, (5, 6), np.uint8)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.uint8], dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._picture(), {}
+
+    def step(
+        self, action: np.int64
+    ) -> tuple[npt.NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        return self._picture(), 1.0, False, False, {}
+
+    def _picture(self) -> npt.NDArray[np.uint8]:
+        return self.np_random.integers(0, 256, (5, 6), np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def _environments() -> Iterator[None]:
+    gym.register("Balance-v0", lambda **_: Balance(), max_episode_steps=100)
+    gym.register("Pictures-v0", lambda **_: Pictures(), max_episode_steps=20)
+    seeds.clear()
+    yield
+    del gym.registry["Balance-v0"], gym.registry["Pictures-v0"]
+
+
+def baseline(algorithm: str, **changes: Any) -> Baseline:
+    settings = {"environment": "Balance-v0", "hidden": [16, 8], "eval_every": 200} | changes
+    config = msgspec.convert({"eval_episodes": 4} | settings, Config)
+    return msgspec.convert(
+        {"algorithm": algorithm, "config": config, "hyperparameters": FAST[algorithm]}, Baseline
+    )
+
+
+def pictures(algorithm: str) -> Baseline:
+    return baseline(
+        algorithm, environment="Pictures-v0", frame_stack=7, convolutions=[4, 5], hidden=[16, 8]
+    )
+
+
+def made(of: Baseline) -> DQN | A2C:
+    return policies.make(of.algorithm, msgspec.structs.asdict(of.complete()), of.config)
+
+
+def held(folder: Path) -> dict[str, Tensor]:
+    return safetensors.torch.load_file(folder / "state.safetensors")
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stop a run after its n-th evaluation, before its table is written."""
+
+    def write(path: Path, kind: type[Evaluated], rows: list[Evaluated]) -> None:
+        if len(rows) == n:
+            raise Stopped
+
+    monkeypatch.setattr(baselines, "write", write)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "hyperparameters", "steps"),
+    [
+        ("DQN", {"learning_rate": 2.3e-3, "batch_size": 64, "learning_starts": 500,
+                 "target_update_interval": 10, "train_freq": 64, "gradient_steps": 32,
+                 "exploration_fraction": 0.2}, 3840),
+        ("A2C", {"n_envs": 8, "n_steps": 16, "learning_rate": 2e-3}, 4096),
+    ],
+)  # fmt: skip
+def test_it_learns(
+    algorithm: str, hyperparameters: dict[str, KeywordValue], steps: int, tmp_path: Path
+) -> None:
+    plain = baseline(algorithm, hidden=[64, 64], eval_every=steps // 2, eval_episodes=20)
+    rows = run(msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path)
+    assert [row.env_steps for row in rows] == [steps // 2, steps]
+    assert rows[-1].mean > 60  # acting at random: 22
+    assert rows == read(tmp_path / "evaluations.csv", Evaluated)
+    first = rows[0]
+    assert (first.environment, first.algorithm, first.seed) == ("Balance-v0", algorithm, 1)
+    assert first.episodes == 20
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_images(algorithm: str, tmp_path: Path) -> None:
+    rows = run(pictures(algorithm), 450, tmp_path)
+    assert [row.env_steps for row in rows][:2] == [200, 400]
+    assert 450 <= rows[-1].env_steps < 460
+    assert all(row.mean == 20 for row in rows)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("make", [baseline, pictures])
+def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
+    """With a gate that is open, both are the same function of the same layers."""
+    wanted: Baseline = make(algorithm)
+    if algorithm == "A2C":
+        wanted = msgspec.structs.replace(wanted, hyperparameters={"activation": "relu"})
+    model, config = made(wanted), wanted.config
+    behavior = BehaviorFunction(specify(make_environment(config), config), config)
+    if isinstance(model, DQN):
+        parts: list[nn.Module] = [model.q_net]
+    else:
+        policy = model.policy
+        parts = [policy.features_extractor, policy.mlp_extractor.policy_net, policy.action_net]
+        assert len(policy.mlp_extractor.value_net) == len(policy.mlp_extractor.policy_net)
+    ours = [p for n, p in behavior.named_parameters() if not n.startswith("command.")]
+    theirs = [p for part in parts for p in part.parameters()]
+    if make is baseline:  # the first layer of vectors is declared before the others here too
+        assert ours[0].shape == (16, 4)
+    assert [p.shape for p in ours] == [p.shape for p in theirs]
+
+    nn.init.zeros_(behavior.command.weight)
+    nn.init.constant_(behavior.command.bias, 100.0)
+    generator = np.random.default_rng(1)
+    shape = (5, *behavior.observation_shape)
+    observation = torch.from_numpy(
+        generator.integers(0, 256, shape, np.uint8) if make is pictures
+        else generator.normal(size=shape).astype(np.float32)
+    )  # fmt: skip
+    with torch.no_grad():
+        for mine, their in zip(ours, theirs, strict=True):
+            mine.copy_(their)
+        expected = behavior(observation, torch.zeros(5, 2))
+        act = policies.InPlaceOfBehavior(model).frozen()
+        logits = act(observation, torch.zeros(5, 2))
+    if algorithm == "A2C":
+        expected = expected.log_softmax(dim=1)
+    torch.testing.assert_close(logits, expected)
+
+
+def test_training_sees_the_most_recent_frames() -> None:
+    model = made(pictures("DQN"))
+    assert model.env is not None
+    first = model.env.reset()
+    assert isinstance(first, np.ndarray)
+    assert first.shape == (1, 7, 1, 5, 6)
+    assert (first == first[:, :1]).all()
+    second, *_ = model.env.step(np.array([0]))
+    assert isinstance(second, np.ndarray)
+    np.testing.assert_array_equal(second[:, :6], first[:, 1:])
+    assert (second[:, 6] != first[:, 6]).any()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_reset_seeds(algorithm: str, tmp_path: Path) -> None:
+    config = baseline(algorithm).config
+    run(baseline(algorithm), 400, tmp_path)
+    in_training = [s for s in seeds if s is not None and 1_000_000 <= s < 10_000_000]
+    in_evaluation = [s for s in seeds if s is not None and 1 <= s < 500_000]
+    assert len(in_training) + len(in_evaluation) == len(seeds)
+    assert len(set(in_training)) == len(in_training) > 5
+
+    sampler = CommandSampler(config, 100)
+    buffer = ReplayBuffer(config, [Entry(30.0, 7, 30)])
+    udrl = [c.environment_seed for i in (1, 2) for c in sampler.evaluate(i, buffer)]
+    assert in_evaluation == udrl
+
+
+def test_seeds_of_a_search(tmp_path: Path) -> None:
+    run(baseline("A2C", eval_seeds="search"), 200, tmp_path)
+    assert sum(500_000 <= (s or 0) < 1_000_000 for s in seeds) == 4
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_evaluations_act_as_udrl_does(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temperatures: list[float] = []
+
+    def watched(generator: EpisodeGenerator, commands: list[Command], behavior: Any) -> Any:
+        temperatures.extend(command.temperature for command in commands)
+        before = torch.get_rng_state()
+        episodes = generate_episodes(generator, commands, behavior)
+        assert torch.equal(torch.get_rng_state(), before)
+        return episodes
+
+    monkeypatch.setattr(baselines, "generate_episodes", watched)
+    run(baseline(algorithm), 200, tmp_path)
+    assert temperatures == [float(algorithm == "A2C")] * 4
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_evaluations_leave_training_alone(algorithm: str, tmp_path: Path) -> None:
+    often = run(baseline(algorithm), 400, tmp_path / "often")
+    once = run(baseline(algorithm, eval_every=400), 400, tmp_path / "once")
+    assert (len(often), len(once)) == (2, 1)
+    tensors = held(tmp_path / "often")
+    others = held(tmp_path / "once")
+    assert tensors.keys() == others.keys()
+    assert all(torch.equal(tensors[name], others[name]) for name in tensors)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("make", [baseline, pictures])
+def test_stopped_and_resumed(
+    algorithm: str, make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        stop_after(2, patch)
+        with pytest.raises(Stopped):
+            run(make(algorithm), 600, tmp_path)
+    saved = held(tmp_path)
+
+    restored: list[dict[str, Tensor]] = []
+    counted: list[dict[str, int]] = []
+
+    def restore(model: DQN | A2C, *arguments: Any) -> None:
+        original(model, *arguments)
+        restored.append({n: t.clone() for n, t in policies.tensors(model).items()})
+        counted.append(policies.counters(model))
+
+    original = policies.restore
+    monkeypatch.setattr(policies, "restore", restore)
+    rows = run(make(algorithm), 600, tmp_path)
+    assert [row.env_steps for row in rows] == [200, 400, 600]
+    assert rows == read(tmp_path / "evaluations.csv", Evaluated)
+    assert 0 < rows[0].wall_s < rows[1].wall_s < rows[2].wall_s
+
+    (tensors,), (counters,) = restored, counted
+    assert tensors.keys() == saved.keys()
+    assert all(torch.equal(tensors[name], saved[name]) for name in saved)
+    assert counters["num_timesteps"] == 400
+    assert any(name.startswith("optimizer.") for name in saved)
+    assert (algorithm == "DQN") == ("replay.observations" in saved)
+
+
+def test_a_replay_buffer_that_is_full(tmp_path: Path) -> None:
+    small = msgspec.structs.replace(
+        baseline("DQN"), hyperparameters=FAST["DQN"] | {"buffer_size": 150, "n_steps": 3}
+    )
+    run(small, 200, tmp_path)
+    model, saved = made(small), held(tmp_path)
+    policies.restore(model, saved, {"num_timesteps": 0, "_n_updates": 0, "_n_calls": 0,
+                                    "_episode_num": 0, "pos": 50})  # fmt: skip
+    assert isinstance(model, DQN)
+    buffer = model.replay_buffer
+    assert buffer is not None
+    assert (buffer.full, buffer.pos) == (True, 50)
+    np.testing.assert_array_equal(buffer.observations, saved["replay.observations"].numpy())
+    # What was in progress is cut off, so that no return of three steps reaches the next episode.
+    assert buffer.dones[49] or buffer.timeouts[49]
+
+
+def test_killed_while_it_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = safetensors.torch.save_file
+    saved: list[Path] = []
+
+    def save(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str]) -> None:
+        saved.append(path)
+        if len(saved) == 2:
+            path.write_bytes(b"half")
+            raise Stopped
+        original(tensors, path, metadata)
+
+    monkeypatch.setattr(safetensors.torch, "save_file", save)
+    with pytest.raises(Stopped):
+        run(baseline("DQN"), 600, tmp_path)
+    rows = run(baseline("DQN"), 600, tmp_path)
+    assert [row.env_steps for row in rows] == [200, 400, 600]
+
+
+def test_extended_with_the_exploration_that_it_began_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    explored: list[int] = []
+    original = policies.explore_for
+
+    def explore_for(model: DQN | A2C, env_steps: int) -> None:
+        original(model, env_steps)
+        assert isinstance(model, DQN)
+        explored.append(env_steps)
+        rate = 0.05 + 0.95 * max(0.0, 1 - model.num_timesteps / env_steps)
+        assert model.exploration_rate == pytest.approx(rate)
+
+    monkeypatch.setattr(policies, "explore_for", explore_for)
+    run(baseline("DQN"), 100, tmp_path / "fraction")
+    run(baseline("DQN"), 100, tmp_path / "said", exploration_steps=250)
+    rows = run(baseline("DQN"), 400, tmp_path / "said", exploration_steps=999)
+    assert explored == [10, 250, 250]
+    assert [row.env_steps for row in rows] == [100, 200, 400]
+    assert run(baseline("DQN"), 300, tmp_path / "said") == rows
+
+
+@pytest.mark.parametrize("damage", ["shorter", "other tensors", "no state"])
+def test_damaged_state(damage: str, tmp_path: Path) -> None:
+    run(baseline("DQN"), 200, tmp_path)
+    path = tmp_path / "state.safetensors"
+    if damage == "shorter":
+        path.write_bytes(path.read_bytes()[:-1])
+    else:
+        with safetensors.safe_open(path, "pt") as file:
+            metadata = file.metadata() if damage == "other tensors" else None
+        safetensors.torch.save_file({"odd": torch.zeros(1)}, path, metadata)
+    with pytest.raises(InvalidData, match=rf"{path}.*delete the folder {tmp_path}"):
+        run(baseline("DQN"), 400, tmp_path)
+
+
+def test_a_folder_of_another_run(tmp_path: Path) -> None:
+    run(baseline("DQN"), 100, tmp_path)
+    with pytest.raises(ConfigError, match=r"baseline\.json describes another run"):
+        run(baseline("DQN", seed=2), 100, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("hyperparameters", "message"),
+    [
+        ({"rms_prop_decay": 0.9}, "unknown hyperparameter 'rms_prop_decay' of DQN.*batch_size"),
+        ({"gamma": 1.5}, "gamma = 1.5"),
+        ({"activation": "step"}, "activation = 'step'"),
+    ],
+)
+def test_hyperparameters_that_cannot_be(
+    hyperparameters: dict[str, KeywordValue], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        msgspec.structs.replace(baseline("DQN"), hyperparameters=hyperparameters)
+
+
+def test_without_stable_baselines3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(ConfigError, match=r'pip install "udrl\[studies\]"'):
+        run(baseline("DQN"), 100, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_command_line(tmp_path: Path) -> None:
+    def call() -> tuple[int, str]:
+        result = CliRunner().invoke(baselines.main, [str(tmp_path), "--max-env-steps", "100"])
+        return result.exit_code, result.stderr
+
+    assert call()[0] == InvalidData.exit_code
+    (tmp_path / "baseline.json").write_bytes(msgspec.json.encode(baseline("A2C")))
+    assert call() == (0, "")
+    assert msgspec.json.decode((tmp_path / "done.json").read_bytes()) == {"max_env_steps": 100}
+    assert len(read(tmp_path / "evaluations.csv", Evaluated)) == 1
+    (tmp_path / "state.safetensors").write_bytes(b"")
+    code, words = call()
+    assert code == InvalidData.exit_code
+    assert words.startswith("udrl: error: ")
+    assert words.count("\n") == 1
+
+
+@pytest.mark.parametrize("environment", ["LunarLander-v3", "LunarLanderSparse-v3", "TakeCover-v0"])
+@pytest.mark.parametrize("algorithm", ["DQN", "A2C"])
+def test_what_ships_is_in_the_papers_lists(algorithm: Any, environment: str) -> None:
+    spaces = Path(baselines.__file__).parent / "spaces" / f"{environment}.toml"
+    lists = read_toml(spaces)[algorithm]
+    chosen = tuned(algorithm, environment)
+    complete(algorithm, chosen)
+    for name, values in lists.items():
+        if name == "learning_rate":
+            values = np.logspace(*values["logspace"])
+            assert np.isclose(values, chosen[name], rtol=1e-3).any()
+        else:
+            assert chosen[name] in values, name
+
+
+def test_nothing_ships_for_other_environments() -> None:
+    with pytest.raises(ConfigError, match=r"'CartPole-v1'.*TakeCover-v0"):
+        tuned("DQN", "CartPole-v1")

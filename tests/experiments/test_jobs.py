@@ -1,0 +1,142 @@
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from udrl.config import Config
+from udrl.errors import Interrupted, InvalidData, RunFailed
+from udrl_experiments import jobs
+from udrl_experiments.jobs import Job, carry_out, furthest, read_job
+from udrl_experiments.records import Evaluated, write
+
+CONFIG = Config(environment="CartPole-v1", eval_every=100)
+
+
+def job(max_env_steps: int = 1000, variant: str = "", **changes: Any) -> Job:
+    config = msgspec.structs.replace(CONFIG, **changes)
+    return Job(algorithm="UDRL", config=config, max_env_steps=max_env_steps, variant=variant)
+
+
+def evaluated(env_steps: int) -> Evaluated:
+    return Evaluated(environment="CartPole-v1", algorithm="UDRL", variant="", seed=1,
+                     env_steps=env_steps, wall_s=1.0, mean=2.0, std=3.0, episodes=4)  # fmt: skip
+
+
+def test_runs_of_equal_settings_are_one_run_as_far_as_anyone_asks() -> None:
+    planned = [job(100), job(50, "short"), job(300, "long"), job(10, seed=2)]
+    assert [(one.config.seed, one.max_env_steps) for one in furthest(planned)] == [
+        (1, 300),
+        (2, 10),
+    ]
+
+
+@pytest.mark.parametrize("change", [{"seed": 2}, {"lead": 1}, {"environment": "Acrobot-v1"}])
+def test_other_settings_are_another_run(change: dict[str, Any]) -> None:
+    assert job(**change).name != job().name
+
+
+def test_other_hyperparameters_are_another_run() -> None:
+    dqn = Job(algorithm="DQN", config=CONFIG, max_env_steps=1)
+    other = msgspec.structs.replace(dqn, hyperparameters={"gamma": 0.9})
+    assert len({job().name, dqn.name, other.name}) == 3
+
+
+def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
+    one = job(300, "mine")
+    one.folder(tmp_path).mkdir(parents=True)
+    rows = [evaluated(n) for n in (105, 203, 310, 400, 950)]
+    write(one.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
+    found = one.evaluations(tmp_path)
+    assert [(row.env_steps, row.variant) for row in found] == [
+        (105, "mine"),
+        (203, "mine"),
+        (310, "mine"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "done"),
+    [('{"max_env_steps": 1000}', True), ('{"max_env_steps": 999}', False), ("", False),
+     ("[]", False), ('{"max_env_steps": null}', False)],
+)  # fmt: skip
+def test_done_is_done_as_far_as_asked(tmp_path: Path, text: str, *, done: bool) -> None:
+    job().folder(tmp_path).mkdir(parents=True)
+    (job().folder(tmp_path) / "done.json").write_text(text, encoding="utf-8")
+    assert job().done(tmp_path) is done
+
+
+def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InvalidData, match=r"job\.json"):
+        read_job(tmp_path)
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Replace what a run does by a line of Python; ``folder`` and ``json`` are there."""
+
+    def replace(line: str) -> None:
+        code = f"import json, os, sys, time\nfolder = sys.argv[1]\n{line}"
+        monkeypatch.setattr(jobs, "_PROGRAM", ("-c", code))
+
+    return replace
+
+
+FINISH = "json.dump({'max_env_steps': json.load(open(folder + '/job.json'))['max_env_steps']}, " \
+         "open(folder + '/done.json', 'w'))"  # fmt: skip
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, program: Callable[[str], None]) -> None:
+    program(FINISH)
+    said: list[str] = []
+    planned = [job(seed=n) for n in (1, 2, 3)]
+    carry_out(planned[:2], tmp_path, 2, threading.Event(), said.append)
+    assert len(said) == 2
+    carry_out(planned, tmp_path, 2, threading.Event(), said.append)
+    assert said[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+    assert read_job(planned[2].folder(tmp_path)) == planned[2]
+
+
+def test_no_more_than_asked_side_by_side(tmp_path: Path, program: Callable[[str], None]) -> None:
+    # Each run leaves a file while it is there, and counts those of the others.
+    program(
+        "root = os.path.dirname(folder); mark = folder + '.on'; open(mark, 'w').close(); "
+        "n = sum(f.endswith('.on') for f in os.listdir(root)); "
+        "open(folder + '.count', 'w').write(str(n)); os.remove(mark)\n" + FINISH
+    )
+    carry_out([job(seed=n) for n in range(6)], tmp_path, 2, threading.Event(), lambda text: None)
+    counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
+    assert len(counts) == 6
+    assert max(counts) <= 2
+
+
+def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
+    tmp_path: Path, program: Callable[[str], None]
+) -> None:
+    program(
+        "seed = json.load(open(folder + '/job.json'))['config']['seed']\n"
+        "if seed == 1: time.sleep(600)\n"
+        "print('no such luck', file=sys.stderr); sys.exit(7)"
+    )
+    began = time.monotonic()
+    with pytest.raises(RunFailed, match="no such luck") as raised:
+        carry_out([job(seed=1), job(seed=2)], tmp_path, 2, threading.Event(), lambda text: None)
+    assert raised.value.exit_code == 7
+    assert time.monotonic() - began < 60
+
+
+def test_a_stop_ends_what_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
+    program("time.sleep(600)")
+    stop = threading.Event()
+    with pytest.raises(Interrupted, match="--resume"):
+        carry_out([job()], tmp_path, 1, stop, lambda text: stop.set())
+
+
+def test_a_job_is_written_whole(tmp_path: Path, program: Callable[[str], None]) -> None:
+    program(FINISH)
+    carry_out([job()], tmp_path, 1, threading.Event(), lambda text: None)
+    assert json.loads((job().folder(tmp_path) / "job.json").read_text())["algorithm"] == "UDRL"

@@ -1,0 +1,76 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.config import preset
+from udrl.errors import ConfigError
+from udrl_experiments.protocol import TASKS, Plan, parse_seeds, parse_steps, tasks
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [("1-20", tuple(range(1, 21))), ("7", (7,)), ("1,2,7-9", (1, 2, 7, 8, 9)), ("3-3, 3", (3,))],
+)
+def test_seeds_are_numbers_and_ranges(text: str, seeds: tuple[int, ...]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1-99999", "1;2", "1.5"])
+def test_other_seeds_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--seeds"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "steps"),
+    [("10M", 10_000_000), ("500k", 500_000), ("1.5M", 1_500_000), ("250_000", 250_000), ("7", 7)],
+)
+def test_steps_have_suffixes(text: str, steps: int) -> None:
+    assert parse_steps(text) == steps
+
+
+@pytest.mark.parametrize("text", ["", "0", "10G", "M", "-5", "1e6", "9" * 30])
+def test_other_steps_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--max-env-steps"):
+        parse_steps(text)
+
+
+@given(st.integers(1, 2**53))
+def test_every_number_of_steps_is_read_as_it_is_written(steps: int) -> None:
+    assert parse_steps(str(steps)) == steps
+
+
+def test_the_papers_scale_is_the_papers() -> None:
+    plan = Plan("paper")
+    assert plan.seeds_of_runs() == tuple(range(1, 21))
+    assert {plan.steps(task, "DQN") for task in TASKS.values()} == {10_000_000}
+    assert {plan.config(task, 1).eval_every for task in TASKS.values()} == {50_000}
+    assert {plan.config(task, 1).eval_episodes for task in TASKS.values()} == {100}
+
+
+def test_what_is_given_wins_over_the_scale() -> None:
+    plan = Plan("paper", (4, 5), 1000, ("batch_size=64", "eval_every=77"))
+    assert plan.seeds_of_runs() == (4, 5)
+    assert plan.steps(TASKS["lander"]) == 1000
+    config = plan.config(TASKS["lander"], 5, lead=3, batch_size=128)
+    assert (config.seed, config.lead, config.batch_size, config.eval_every) == (5, 3, 64, 77)
+
+
+def test_a_config_is_the_preset_but_for_the_protocol() -> None:
+    for task in TASKS.values():
+        config = Plan().config(task, 2)
+        expected = preset(task.environment) | {"eval_every": 50_000, "seed": 2}
+        del expected["max_env_steps"]
+        found = {name: getattr(config, name) for name in expected}
+        assert found == {k: tuple(v) if isinstance(v, list) else v for k, v in expected.items()}
+
+
+def test_an_unknown_setting_is_refused() -> None:
+    with pytest.raises(ConfigError, match="bach_size"):
+        Plan(assignments=("bach_size=3",)).config(TASKS["lander"], 1)
+
+
+def test_tasks_by_name() -> None:
+    assert tasks(["sparse", "lander"]) == [TASKS["sparse"], TASKS["lander"]]
+    with pytest.raises(ConfigError, match=r"task 'moon': there are lander"):
+        tasks(["moon"])

@@ -1,0 +1,104 @@
+import math
+import tomllib
+from pathlib import Path
+from statistics import fmean
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from udrl.config import Config, build, preset
+from udrl_experiments.protocol import TASKS, Algorithm, Plan
+from udrl_experiments.records import Evaluated, read, write
+from udrl_experiments.search import Scored, draw, search, space
+from udrl_experiments.study import Place
+
+ENVIRONMENTS = [task.environment for task in TASKS.values()]
+ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
+
+
+def values(kept: Any) -> list[Any]:
+    if isinstance(kept, dict):
+        low, high, n = kept["logspace"]
+        return [10 ** (low + (high - low) * i / (n - 1)) for i in range(n)]
+    assert isinstance(kept, list)
+    return kept
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_configurations_come_from_the_lists_and_all_values_come(
+    environment: str, algorithm: Algorithm
+) -> None:
+    lists = space(environment)["networks"] | space(environment)[algorithm]
+    drawn = [draw(environment, algorithm, number) for number in range(1500)]
+    for name, kept in lists.items():
+        allowed = values(kept)
+        found = [one[name] for one in drawn]
+        if isinstance(kept, dict):
+            assert all(np.isclose(allowed, value, rtol=1e-9).any() for value in found)
+            assert len(set(found)) == len(allowed)
+        else:
+            assert all(value in allowed for value in found)
+            counts = [found.count(value) for value in allowed]
+            expected = len(drawn) / len(allowed)
+            assert all(abs(count - expected) < 5 * math.sqrt(expected) for count in counts)
+    assert all(set(one) == set(lists) for one in drawn)
+
+
+def test_a_configuration_is_a_function_of_its_number() -> None:
+    assert draw("LunarLander-v3", "DQN", 5) == draw("LunarLander-v3", "DQN", 5)
+    assert draw("LunarLander-v3", "DQN", 5) != draw("LunarLander-v3", "DQN", 6)
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -> None:
+    for number in range(100):
+        build(Config, {"environment": environment} | draw(environment, "UDRL", number))
+
+
+def test_the_papers_scale_is_the_papers() -> None:
+    study = search(Plan("paper"), list(TASKS.values()), ["UDRL"])
+    runs = [job.config.environment for job in study.jobs]
+    assert [runs.count(name) for name in ENVIRONMENTS] == [256 * 3, 256, 72]
+    assert {job.config.eval_seeds for job in study.jobs} == {"search"}
+    assert {job.max_env_steps for job in study.jobs} == {10_000_000}
+
+
+def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
+    (job,) = search(Plan(), [TASKS["lander"]], ["UDRL"], 1).jobs
+    assert (job.config.max_age, job.config.recent_size, job.config.lead) == (None, 0, 0)
+    drawn = draw("LunarLander-v3", "UDRL", 0)
+    assert job.config.batch_size == drawn["batch_size"]
+    assert list(job.config.hidden) == drawn["hidden"]
+
+
+def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
+    plan = Plan(seeds=(1, 2), assignments=("eval_every=10",))
+    study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN"], 3)
+    scores = dict[tuple[str, int], list[float]]()
+    for index, job in enumerate(study.jobs):
+        means = [float((index * 7) % 5 + n % 3) for n in range(25)]
+        number = index // 2 % 3
+        scores.setdefault((job.algorithm, number), []).append(fmean(means[5:]))
+        job.folder(tmp_path).mkdir(parents=True)
+        rows = [
+            Evaluated(environment="LunarLanderSparse-v3", algorithm=job.algorithm, variant="",
+                      seed=job.config.seed, env_steps=10 * n, wall_s=0.0, mean=mean, std=0.0,
+                      episodes=1)
+            for n, mean in enumerate(means)
+        ]  # fmt: skip
+        write(job.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
+    place = Place(tmp_path, tmp_path / "search")
+    place.folder.mkdir()
+    study.report(place)
+
+    found = read(place.folder / "scores.csv", Scored)
+    assert {(r.algorithm, r.configuration): r.score for r in found} == pytest.approx(
+        {key: fmean(both) for key, both in scores.items()}
+    )
+    best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score)
+    kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
+    drawn = draw("LunarLanderSparse-v3", "UDRL", best.configuration)
+    assert kept == preset("LunarLanderSparse-v3-paper") | drawn
+    assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()

@@ -1,0 +1,162 @@
+"""Every study from the command line, on a tiny budget; interrupted, and gone on with."""
+
+import csv
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from udrl.config import Config, build
+from whole_run import Cli, reference, wait_for
+
+TINY = {
+    "eval_every": 1000, "eval_episodes": 3, "n_warm_up_episodes": 5, "n_episodes_per_iter": 4,
+    "n_updates_per_iter": 2, "batch_size": 32, "hidden": [8, 8],
+}  # fmt: skip
+SETTINGS = [word for k, v in TINY.items() for word in ("--set", f"{k}={json.dumps(v)}")]
+STEPS = 2000
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def study(cli: Callable[..., Cli]) -> Callable[..., Path]:
+    """Conduct a study, one run at a time, and return its folder."""
+
+    def conduct(name: str, *arguments: str, root: Path, timeout: float = 110) -> Path:
+        started = cli("study", name, "--folder", str(root), "--max-env-steps", str(STEPS),
+                      *SETTINGS, *arguments)  # fmt: skip
+        code, _, error = started.finish(timeout)
+        assert code == 0, error
+        return root / name
+
+    return conduct
+
+
+def runs_of(root: Path, algorithm: str) -> list[Path]:
+    return sorted((root / "runs").glob(f"{algorithm}-*"))
+
+
+def test_a_comparison_is_interrupted_and_goes_on(
+    cli: Callable[..., Cli], study: Callable[..., Path], tmp_path: Path
+) -> None:
+    whole = ("--seeds", "1-2", "--side-by-side", "1")
+    begun = cli("study", "lander", "--folder", str(tmp_path), "--max-env-steps", str(STEPS),
+                *SETTINGS, *whole)  # fmt: skip
+    wait_for(lambda: list(tmp_path.glob("runs/udrl-*/done.json")), "the first run", 60)
+    begun.process.send_signal(signal.SIGTERM)
+    code, _, error = begun.finish()
+    assert code == 128 + signal.SIGTERM, error
+    assert "--resume" in error
+    (first,) = tmp_path.glob("runs/udrl-*/done.json")
+    done_at = first.stat().st_mtime_ns
+
+    code, _, error = cli("study", "lander", "--folder", str(tmp_path), *SETTINGS, *whole).finish()
+    assert code == 2
+    assert "holds a study already; go on with it: --resume" in error
+    code, _, error = cli("study", "lander", "--folder", str(tmp_path), "--resume").finish()
+    assert code == 2
+    assert "which is not in this one; give the options that it was begun with" in error
+
+    folder = study("lander", *whole, "--resume", root=tmp_path)
+    assert first.stat().st_mtime_ns == done_at
+    table = rows(folder / "evaluations.csv")
+    assert {(r["algorithm"], r["seed"]) for r in table} == {
+        (algorithm, seed) for algorithm in ("UDRL", "DQN", "A2C") for seed in "12"
+    }
+    curves = rows(folder / "curves.csv")
+    assert {(r["algorithm"], r["env_steps"], r["seeds"]) for r in curves} >= {
+        (algorithm, "1000", "2") for algorithm in ("UDRL", "DQN", "A2C")
+    }
+    for suffix in (".png", ".svg"):
+        assert (folder / f"learning-curves{suffix}").stat().st_size > 10_000
+    about = json.loads((folder / "study.json").read_text())
+    assert len(about["runs"]) == 6
+    assert about["versions"]["torch"]
+    assert len(rows(folder / "reached.csv")) == 6 * 3
+
+
+def test_a_run_of_a_study_is_the_run_of_its_settings(
+    study: Callable[..., Path], tmp_path: Path
+) -> None:
+    study("commands", "--task", "sparse", "--seeds", "3", "--set", "lead=0",
+          "--set", "command_strategy=record", root=tmp_path)  # fmt: skip
+    # Every variant has the same settings here, so there is one run.
+    (folder,) = runs_of(tmp_path, "udrl")
+    config: dict[str, Any] = json.loads((folder / "job.json").read_text())["config"]
+    expected = reference(build(Config, config), STEPS)
+    *held, closing = rows(folder / "evaluations.csv")
+    assert [float(r["mean"]) for r in held] == [e.mean for e in expected.evaluations.values()]
+    assert int(closing["env_steps"]) == expected.env_steps
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_all_studies_share_their_runs(
+    study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = ("--seeds", "1")
+    study("sparse", *one, "--algorithm", "UDRL", root=tmp_path)
+    assert len(runs_of(tmp_path, "udrl")) == 1
+
+    folder = study("sensitivity", *one, "--task", "sparse", "--episodes", "2", root=tmp_path)
+    assert len(runs_of(tmp_path, "udrl")) == 1
+    table = rows(folder / "LunarLanderSparse.csv")
+    assert [float(r["desired_return"]) for r in table] == list(range(-150, 301, 25))
+    assert (folder / "LunarLanderSparse.svg").exists()
+
+    folder = study("lead", *one, "--task", "sparse", root=tmp_path, timeout=200)
+    assert {r["variant"] for r in rows(folder / "evaluations.csv")} == {
+        f"lead {n}" for n in (0, 1, 2, 4, 8)
+    }
+    assert (folder / "learning-curves-wall-time.png").exists()
+    assert len(runs_of(tmp_path, "udrl")) == 5
+
+    folder = study("segments", *one, root=tmp_path, timeout=200)
+    assert {r["variant"] for r in rows(folder / "LunarLander" / "evaluations.csv")} == {
+        "trailing", "all"
+    }  # fmt: skip
+    assert len(runs_of(tmp_path, "udrl")) == 5 + 3
+
+    (tmp_path / "patient.py").write_text(
+        "class Patient:\n"
+        "    def __init__(self, config): pass\n"
+        "    def __call__(self, best, u): return best[-1].episode_return, 2 * best[-1].length\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    own = ("--strategy", "patient:Patient")
+    folder = study("commands", *one, "--task", "sparse", *own, root=tmp_path, timeout=200)
+    assert {r["variant"] for r in rows(folder / "evaluations.csv")} == {
+        "uniform", "again", "record", "patient:Patient"
+    }  # fmt: skip
+    assert len(runs_of(tmp_path, "udrl")) == 8 + 3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_search_goes_on_with_more_configurations(
+    study: Callable[..., Path], tmp_path: Path
+) -> None:
+    # The settings that are drawn would win over TINY's: nothing else makes the runs small.
+    arguments = ("--task", "lander", "--seeds", "1", "--algorithm", "DQN")
+    folder = study("search", *arguments, "--configurations", "1", root=tmp_path, timeout=200)
+    assert len(rows(folder / "scores.csv")) == 1
+    more = ("--configurations", "2", "--resume")
+    folder = study("search", *arguments, *more, root=tmp_path, timeout=200)
+    assert len(rows(folder / "scores.csv")) == 2
+    assert len(runs_of(tmp_path, "dqn")) == 2
+    assert (folder / "dqn-LunarLander-v3.toml").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_take_cover(study: Callable[..., Path], tmp_path: Path) -> None:
+    small = ("--set", "max_episode_steps=60", "--set", "convolutions=[4, 4, 4, 4]")
+    folder = study("takecover", "--seeds", "1", *small, root=tmp_path, timeout=500)
+    assert {r["algorithm"] for r in rows(folder / "evaluations.csv")} == {"UDRL", "DQN", "A2C"}

@@ -1,0 +1,161 @@
+"""Section 2.3.4: what exploratory commands ask for, given the best episodes.
+
+The paper asks for returns just above the best ones' mean, and calls for a study of other strategies
+(section 6). A strategy is a class of one method; a run names it with ``command_strategy``, one of
+:data:`STRATEGIES` or your own, importable as ``package.module:Class``::
+
+    class Patient:
+        def __init__(self, config: Config) -> None: ...
+
+        def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+            return best[-1].episode_return, 2 * best[-1].length
+"""
+
+import math
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NamedTuple, Protocol
+
+from udrl.config import Config
+from udrl.errors import ConfigError
+from udrl.replay import Entry
+
+
+class CommandStrategy(Protocol):
+    """What exploratory commands ask for; made once a run, from its settings."""
+
+    def __init__(self, config: Config) -> None: ...
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return what one exploratory command asks for.
+
+        It must be a function of its arguments, or the run is not a function of its configuration.
+
+        Args:
+            best: the ``last_few`` best episodes, least return first; at least one.
+            u: this command's own number, uniform in [0, 1).
+
+        Returns:
+            Desired return (finite) and desired horizon (in steps; less than 1 counts as 1).
+        """
+        ...
+
+
+class Best(NamedTuple):
+    """What sections 2.3.4 and 2.3.6 say of the best episodes.
+
+    Attributes:
+        mean: M, of their returns.
+        deviation: S, the population standard deviation of their returns.
+        horizon: their mean length, rounded to the nearest integer.
+    """
+
+    mean: float
+    deviation: float
+    horizon: int
+
+    @classmethod
+    def of(cls, episodes: Sequence[Entry]) -> "Best":
+        """Return it for some episodes, at least one."""
+        n = len(episodes)
+        # fsum rounds once, so that the result does not depend on the order of summation.
+        mean = math.fsum(e.episode_return for e in episodes) / n
+        variance = math.fsum((e.episode_return - mean) ** 2 for e in episodes) / n
+        mean_length = sum(e.length for e in episodes) / n
+        return cls(mean, math.sqrt(variance), nearest(mean_length))
+
+
+def nearest(number: float) -> int:
+    """Round to the nearest integer, halves up."""
+    return math.floor(number + 0.5)
+
+
+class Uniform:
+    """The paper's: returns uniform in [M, M + S], all with the best episodes' mean length."""
+
+    def __init__(self, config: Config) -> None:
+        pass
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return M + u S and the mean length."""
+        mean, deviation, horizon = Best.of(best)
+        return mean + deviation * u, horizon
+
+
+class Again:
+    """Do again what one of the best did: its return, in its time. The two always fit together."""
+
+    def __init__(self, config: Config) -> None:
+        pass
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return the return and the length of one of the best, each as likely."""
+        chosen = best[int(u * len(best))]
+        return chosen.episode_return, chosen.length
+
+
+class Record:
+    """The greedy one: always the best return there is, in the time that it took."""
+
+    def __init__(self, config: Config) -> None:
+        pass
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return the return and the length of the very best."""
+        return best[-1].episode_return, best[-1].length
+
+
+STRATEGIES: dict[str, type[CommandStrategy]] = {
+    "uniform": Uniform,
+    "again": Again,
+    "record": Record,
+}
+
+
+def make_strategy(config: Config) -> CommandStrategy:
+    """Return the strategy that ``command_strategy`` names.
+
+    Raises:
+        ConfigError: there is none of that name, or it cannot be imported or made.
+    """
+    name = config.command_strategy
+    if name in STRATEGIES:
+        return STRATEGIES[name](config)
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        raise ConfigError(
+            f"command_strategy {name!r}: expected {', '.join(STRATEGIES)}, or a class of your own "
+            f"as package.module:Class"
+        )
+    try:
+        kind = getattr(import_module(module), attribute)
+        strategy: CommandStrategy = kind(config)
+    except Exception as error:
+        raise ConfigError(
+            f"command_strategy {name!r} cannot be made: {type(error).__name__}: {error}; name a "
+            f"class that is importable here (PYTHONPATH) and is made from a udrl.config.Config"
+        ) from error
+    return strategy
+
+
+def ask(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[float, int]:
+    """Return what a strategy asks for, checked: it may be anybody's code.
+
+    Raises:
+        ConfigError: it raised, or returned what no command can be.
+    """
+    name = type(strategy).__name__
+    try:
+        desired_return, desired_horizon = strategy(best, u)
+        desired_return, desired_horizon = float(desired_return), int(desired_horizon)
+    except Exception as error:
+        raise ConfigError(
+            f"command strategy {name} failed: {type(error).__name__}: {error}; expected a desired "
+            f"return and a desired horizon"
+        ) from error
+    if not math.isfinite(desired_return) or abs(desired_horizon) > 2**31:
+        raise ConfigError(
+            f"command strategy {name} asks for a return of {desired_return} within "
+            f"{desired_horizon} steps; expected a finite number and at most 2^31 steps"
+        )
+    return desired_return, max(1, desired_horizon)
