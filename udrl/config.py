@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
         batch_size: examples in one update.
         command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
-            ``record``, or a class of your own as ``package.module:Class``
+            ``ranked``, ``record``, or a class of your own as ``package.module:Class``
             (:mod:`udrl.strategies`).
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,

@@ -94,6 +94,25 @@ class Again:
         return chosen.episode_return, chosen.length
 
 
+class Ranked:
+    """As :class:`Again`, but the better an episode, the likelier it is chosen.
+
+    Orders that differ, each of which somebody has obeyed, keep agents from doing everything in one
+    way; and rare successes are repeated before they are many.
+    """
+
+    def __init__(self, config: Config) -> None:
+        pass
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return the return and the length of one of the best.
+
+        It is one of the k best of n with probability sqrt(k / n).
+        """
+        chosen = best[-1 - int(u * u * len(best))]
+        return chosen.episode_return, chosen.length
+
+
 class Record:
     """The greedy one: always the best return there is, in the time that it took."""
 
@@ -108,6 +127,7 @@ class Record:
 STRATEGIES: dict[str, type[CommandStrategy]] = {
     "uniform": Uniform,
     "again": Again,
+    "ranked": Ranked,
     "record": Record,
 }
 

@@ -1,19 +1,16 @@
 """DQN and A2C from Stable-Baselines3 under UDRL's protocol (section 3.2).
 
 Networks, reset seeds and evaluations are UDRL's: an evaluation is Algorithm 2, with commands that
-nobody hears. ``python -m udrl_experiments.baselines FOLDER --max-env-steps N`` does the run that
-FOLDER/baseline.json describes, or goes on with it.
+nobody hears.
 """
 
 import contextlib
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, cast
 
-import click
 import msgspec
 import safetensors
 import safetensors.torch
@@ -24,7 +21,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue
-from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.errors import ConfigError, InvalidData
 from udrl.evaluation import summarise
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
@@ -164,9 +161,8 @@ def _require_stable_baselines3() -> None:
 
 def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> list[Command]:
     """Return the commands of an evaluation: the seeds of UDRL's in the iteration ``number``."""
-    config = baseline.config
-    if baseline.algorithm == "DQN":
-        config = msgspec.structs.replace(config, eval_temperature=0.0)
+    temperature = 0.0 if baseline.algorithm == "DQN" else 1.0
+    config = msgspec.structs.replace(baseline.config, eval_temperature=temperature)
     sampler = CommandSampler(config, generator.spec.max_episode_steps)
     return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
 
@@ -225,20 +221,3 @@ def _reading(path: Path) -> Iterator[None]:
             f"{path}: {type(error).__name__}: {error}; "
             f"delete the folder {path.parent} to have the run made again"
         ) from error
-
-
-@click.command()
-@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--max-env-steps", type=click.IntRange(1), required=True, metavar="N")
-def main(folder: Path, max_env_steps: int) -> None:
-    """Do the run that FOLDER/baseline.json describes, or go on with it."""
-    try:
-        run(read_baseline(folder), max_env_steps, folder)
-    except UdrlError as error:
-        click.echo(f"udrl: error: {error}", err=True)
-        sys.exit(error.exit_code)
-    _put(folder / "done.json", msgspec.json.encode({"max_env_steps": max_env_steps}))
-
-
-if __name__ == "__main__":
-    main()

@@ -46,6 +46,18 @@ def test_again_asks_for_what_one_of_the_best_did(best: list[Entry], u: float) ->
 
 
 @given(BEST)
+def test_ranked_asks_for_one_of_the_k_best_with_probability_sqrt_k_of_n(best: list[Entry]) -> None:
+    n, tries = len(best), 1_000
+    asked = [strategy("ranked")(best, (i + 0.5) / tries) for i in range(tries)]
+    for k in range(1, n + 1):
+        kept = [(e.episode_return, e.length) for e in best[n - k :]]
+        share = sum(one in kept for one in asked) / tries
+        others = [(e.episode_return, e.length) for e in best[: n - k]]
+        if not set(kept) & set(others):
+            assert abs(share - sqrt(k / n)) < 2 / tries
+
+
+@given(BEST)
 def test_again_asks_for_each_as_often(best: list[Entry]) -> None:
     n = len(best)
     asked = [strategy("again")(best, (i + 0.5) / n) for i in range(n)]
@@ -114,7 +126,7 @@ def test_the_spread_applies_to_every_strategy() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("cautious", r"expected uniform, again, record, or a class of your own"),
+        ("cautious", r"expected uniform, again, ranked, record, or a class of your own"),
         ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
         ("udrl.strategies:Missing", "AttributeError"),
     ],

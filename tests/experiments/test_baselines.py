@@ -10,7 +10,6 @@ import numpy.typing as npt
 import pytest
 import safetensors.torch
 import torch
-from click.testing import CliRunner
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from stable_baselines3 import A2C, DQN
 from torch import Tensor, nn
@@ -376,23 +375,6 @@ def test_without_stable_baselines3(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match=r'pip install "udrl\[studies\]"'):
         run(baseline("DQN"), 100, tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_command_line(tmp_path: Path) -> None:
-    def call() -> tuple[int, str]:
-        result = CliRunner().invoke(baselines.main, [str(tmp_path), "--max-env-steps", "100"])
-        return result.exit_code, result.stderr
-
-    assert call()[0] == InvalidData.exit_code
-    (tmp_path / "baseline.json").write_bytes(msgspec.json.encode(baseline("A2C")))
-    assert call() == (0, "")
-    assert msgspec.json.decode((tmp_path / "done.json").read_bytes()) == {"max_env_steps": 100}
-    assert len(read(tmp_path / "evaluations.csv", Evaluated)) == 1
-    (tmp_path / "state.safetensors").write_bytes(b"")
-    code, words = call()
-    assert code == InvalidData.exit_code
-    assert words.startswith("udrl: error: ")
-    assert words.count("\n") == 1
 
 
 @pytest.mark.parametrize("environment", ["LunarLander-v3", "LunarLanderSparse-v3", "TakeCover-v0"])
