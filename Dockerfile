@@ -24,6 +24,7 @@ COPY README.md LICENSE ./
 COPY udrl udrl
 COPY proto proto
 COPY services services
+COPY experiments experiments
 # Nothing is built against torch here, and nobody installs anything later.
 RUN /opt/udrl/bin/pip install --no-deps . \
     && rm -rf /opt/udrl/lib/python3*/site-packages/torch/include \
