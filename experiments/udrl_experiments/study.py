@@ -89,9 +89,9 @@ def _open(study: Study, place: Place, *, resume: bool) -> None:
                 f"{place.folder} holds a study already; go on with it: --resume; or name another "
                 f"--folder"
             )
-        planned = {(job.name, job.variant): job.max_env_steps for job in study.jobs}
         for job in _begun(file):
-            if planned.get((job.name, job.variant), 0) < job.max_env_steps:
+            same = (j for j in study.jobs if (j.name, j.variant) == (job.name, job.variant))
+            if max((j.max_env_steps for j in same), default=0) < job.max_env_steps:
                 raise ConfigError(
                     f"{place.folder} holds a study with the run {job.described}, which is not in "
                     f"this one; give the options that it was begun with, or ones that ask for "
@@ -131,16 +131,17 @@ def provenance() -> dict[str, Any]:
 
 
 def _commit() -> str:
-    """Return the commit of the code, if it lies in a Git checkout."""
+    """Return the commit of the code, if Git keeps it here."""
+    here = Path(__file__)
 
     def git(*arguments: str) -> str:
-        here = Path(__file__).parent
-        command = ["git", "-C", str(here), *arguments]
+        command = ["git", "-C", str(here.parent), *arguments]
         return subprocess.run(  # noqa: S603 - git, with our own arguments
             command, capture_output=True, text=True, check=True, timeout=10
         ).stdout.strip()
 
     try:
+        git("ls-files", "--error-unmatch", here.name)  # not a checkout that we are installed in
         changed = git("status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "HEAD") + (" and changes" if changed else "")
     except (OSError, subprocess.SubprocessError):

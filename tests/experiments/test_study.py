@@ -1,0 +1,99 @@
+import json
+import re
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from udrl.config import Config
+from udrl.errors import ConfigError, InvalidData, RunFailed
+from udrl_experiments.jobs import Job
+from udrl_experiments.study import Place, Study, conduct, provenance
+
+
+def job(seed: int, max_env_steps: int = 100) -> Job:
+    return Job(algorithm="UDRL", config=Config(environment="CartPole-v1", seed=seed),
+               max_env_steps=max_env_steps)  # fmt: skip
+
+
+class World:
+    """A study whose runs are only noted."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.done: list[Job] = []
+        self.reported: list[Place] = []
+
+    def conduct(self, *jobs: Job, resume: bool = False) -> None:
+        def carry_out(planned: Sequence[Job], *others: Any) -> None:
+            self.done = list(planned)
+
+        study = Study("try", jobs, self.reported.append, carry_out)
+        conduct(study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
+                say=lambda text: None)  # fmt: skip
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    return World(tmp_path)
+
+
+def test_runs_first_and_then_the_report(world: World) -> None:
+    world.conduct(job(1), job(2))
+    assert world.done == [job(1), job(2)]
+    assert world.reported == [Place(world.root, world.root / "try")]
+
+
+def test_what_is_done_is_written_down(world: World) -> None:
+    world.conduct(job(1), job(2))
+    about = json.loads((world.root / "try" / "study.json").read_text())
+    assert msgspec.convert(about["runs"], list[Job]) == [job(1), job(2)]
+    assert about["study"] == "try"
+
+
+def test_provenance_names_versions_and_the_kind_of_machine() -> None:
+    found = provenance()
+    assert {"udrl", "python", "torch", "numpy", "gymnasium"} <= set(found["versions"])
+    assert found["machine"]["cores"] >= 1
+    assert re.fullmatch(r"([0-9a-f]{40}( and changes)?)?", found["commit"])
+
+
+def test_a_study_is_not_done_over_another(world: World) -> None:
+    world.conduct(job(1))
+    with pytest.raises(ConfigError, match=r"holds a study already; go on with it: --resume"):
+        world.conduct(job(1))
+
+
+@pytest.mark.parametrize("jobs", [(job(1), job(2)), (job(1, 500),), (job(1), job(1, 7))])
+def test_it_goes_on_with_as_much_or_more(world: World, jobs: tuple[Job, ...]) -> None:
+    world.conduct(job(1))
+    world.conduct(*jobs, resume=True)
+    assert world.done == list(jobs)
+
+
+@pytest.mark.parametrize("jobs", [(job(2),), (job(1, 99),), ()])
+def test_it_does_not_go_on_with_less(world: World, jobs: tuple[Job, ...]) -> None:
+    world.conduct(job(1))
+    with pytest.raises(ConfigError, match=r"seed 1: 100 env steps, which is not in this one"):
+        world.conduct(*jobs, resume=True)
+
+
+def test_a_damaged_book_is_told(world: World) -> None:
+    world.conduct(job(1))
+    (world.root / "try" / "study.json").write_text('{"runs": [{}]}')
+    with pytest.raises(InvalidData, match=r"study\.json.*delete it"):
+        world.conduct(job(1), resume=True)
+
+
+def test_without_the_runs_there_is_no_report(world: World) -> None:
+    def fail(*arguments: Any) -> None:
+        raise RunFailed("no")
+
+    study = Study("try", [job(1)], world.reported.append, fail)
+    with pytest.raises(RunFailed):
+        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                say=lambda text: None)  # fmt: skip
+    assert not world.reported
