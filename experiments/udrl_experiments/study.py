@@ -89,9 +89,12 @@ def _open(study: Study, place: Place, *, resume: bool) -> None:
                 f"{place.folder} holds a study already; go on with it: --resume; or name another "
                 f"--folder"
             )
+        planned: dict[tuple[str, str], int] = {}
+        for job in study.jobs:
+            key = job.name, job.variant
+            planned[key] = max(planned.get(key, 0), job.max_env_steps)
         for job in _begun(file):
-            same = (j for j in study.jobs if (j.name, j.variant) == (job.name, job.variant))
-            if max((j.max_env_steps for j in same), default=0) < job.max_env_steps:
+            if planned.get((job.name, job.variant), 0) < job.max_env_steps:
                 raise ConfigError(
                     f"{place.folder} holds a study with the run {job.described}, which is not in "
                     f"this one; give the options that it was begun with, or ones that ask for "
