@@ -109,7 +109,9 @@ def search(
                 mine = [row for row in rows if (row.environment, row.algorithm) == kind]
                 _write_preset(place.folder, max(mine, key=lambda row: row.score))
 
-    return Study("search", [run for runs in jobs.values() for run in runs], report, carry_out)
+    return Study(
+        "search", [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",)
+    )
 
 
 def _seeds(plan: Plan, task: Task) -> tuple[int, ...]:

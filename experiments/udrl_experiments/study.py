@@ -1,6 +1,7 @@
 """What a study is, and how it is conducted: runs, tables, provenance, pictures."""
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import subprocess
@@ -39,6 +40,7 @@ class Study(NamedTuple):
         jobs: the runs that it needs.
         report: makes tables and pictures of them, once they are done.
         carry_out: does the runs.
+        needs: modules that must be there besides those that its runs need.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Study(NamedTuple):
     carry_out: Callable[
         [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
     ] = carry_out
+    needs: Sequence[str] = ()
 
 
 def conduct(
@@ -69,15 +72,28 @@ def conduct(
         say: is told how it goes.
 
     Raises:
-        ConfigError: the folder holds a study already and ``resume`` is not set, or another one.
+        ConfigError: a package is missing, or the folder holds a study already: another one, or
+            ``resume`` is not set.
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
+    _require(study)
     place = Place(root, root / study.name)
     _open(study, place, resume=resume)
     study.carry_out(study.jobs, root, side_by_side, stop, say)
     study.report(place)
     say(f"tables and pictures are in {place.folder}")
+
+
+def _require(study: Study) -> None:
+    """Refuse before the first run what would be missed after the last one."""
+    others = {job.algorithm for job in study.jobs} - {"UDRL"}
+    for module in ("matplotlib", *(["stable_baselines3"] if others else []), *study.needs):
+        if importlib.util.find_spec(module) is None:
+            raise ConfigError(
+                f"the study {study.name} needs the module {module}, which is not installed; "
+                f'install it with: pip install "udrl[studies]"'
+            )
 
 
 def _open(study: Study, place: Place, *, resume: bool) -> None:

@@ -1,5 +1,6 @@
 import json
 import re
+import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from udrl.config import Config
 from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
+from udrl_experiments.protocol import Algorithm
 from udrl_experiments.study import Place, Study, conduct, provenance
 
 
@@ -59,6 +61,19 @@ def test_provenance_names_versions_and_the_kind_of_machine() -> None:
     assert {"udrl", "python", "torch", "numpy", "gymnasium"} <= set(found["versions"])
     assert found["machine"]["cores"] >= 1
     assert re.fullmatch(r"([0-9a-f]{40}( and changes)?)?", found["commit"])
+
+
+@pytest.mark.parametrize(
+    ("module", "algorithm"), [("matplotlib", "UDRL"), ("stable_baselines3", "A2C")]
+)
+def test_what_is_missing_is_told_before_the_first_run(
+    world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[studies\]"'):
+        world.conduct(msgspec.structs.replace(job(1), algorithm=algorithm))
+    assert not world.done
+    assert not (world.root / "try").exists()
 
 
 def test_a_study_is_not_done_over_another(world: World) -> None:
