@@ -93,10 +93,11 @@ def _conduct(
     cores = len(os.sched_getaffinity(0))
 
     def service(stop: threading.Event) -> None:
-        conduct(
+        said = conduct(
             planned, folder, side_by_side=side_by_side or max(1, cores // 2), resume=resume,
             stop=stop, say=lambda text: click.echo(text, err=True),
         )  # fmt: skip
+        click.echo(said)
 
     return run_service(service)
 

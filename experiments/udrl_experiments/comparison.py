@@ -29,8 +29,8 @@ def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
         for seed in plan.seeds_of_runs()
     ]
 
-    def report(place: Place) -> None:
-        report_curves(jobs, task.title, task.landmarks, place)
+    def report(place: Place) -> str:
+        return report_curves(jobs, task.title, task.landmarks, place)
 
     return Study(name, jobs, report)
 
@@ -47,15 +47,24 @@ def job(task: Task, plan: Plan, algorithm: Algorithm, seed: int) -> Job:
 
 def report_curves(
     jobs: Sequence[Job], title: str, landmarks: dict[str, float], place: Place
-) -> list[CurvePoint]:
-    """Write all evaluations, their curves, and when returns were reached; draw the curves."""
+) -> str:
+    """Write all evaluations, their curves, and when returns were reached; draw the curves.
+
+    Returns:
+        A line for each curve: where it ends.
+    """
     rows: list[Evaluated] = [row for job in jobs for row in job.evaluations(place.root)]
     points = curves(rows, jobs[0].config.eval_every)
     write(place.folder / "evaluations.csv", Evaluated, rows)
     write(place.folder / "curves.csv", CurvePoint, points)
     write(place.folder / "reached.csv", Reached, reached(rows, _THRESHOLDS))
     draw_curves(place, title, landmarks)
-    return points
+    last = {(point.algorithm, point.variant): point for point in points}
+    return "\n".join(
+        f"{title}: {' '.join(words).strip()}: mean return {end.mean:.1f} after {end.env_steps:,} "
+        f"env steps, seeds: {end.seeds}, 95 % interval {end.low:.1f} to {end.high:.1f}"
+        for words, end in last.items()
+    )
 
 
 def draw_curves(place: Place, title: str, landmarks: dict[str, float]) -> None:

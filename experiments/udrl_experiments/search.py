@@ -90,7 +90,7 @@ def search(
         for number in range(_configurations(plan, task, configurations))
     }
 
-    def report(place: Place) -> None:
+    def report(place: Place) -> str:
         rows = [
             Scored(
                 environment=task.environment,
@@ -103,11 +103,11 @@ def search(
             for (task, algorithm, number), runs in jobs.items()
         ]
         write(place.folder / "scores.csv", Scored, rows)
-        for task in tasks:
-            for algorithm in algorithms:
-                kind = (task.environment, algorithm)
-                mine = [row for row in rows if (row.environment, row.algorithm) == kind]
-                _write_preset(place.folder, max(mine, key=lambda row: row.score))
+        return "\n".join(
+            _write_preset(place.folder, _best(rows, task, algorithm))
+            for task in tasks
+            for algorithm in algorithms
+        )
 
     return Study(
         "search", [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",)
@@ -149,8 +149,14 @@ def _score(run: Job, root: Path) -> float:
     return score([row.mean for row in run.evaluations(root)], LAST)
 
 
-def _write_preset(folder: Path, best: Scored) -> None:
-    """Write the best settings as a file that ``udrl train --config`` reads."""
+def _best(rows: Sequence[Scored], task: Task, algorithm: Algorithm) -> Scored:
+    kind = (task.environment, algorithm)
+    mine = [row for row in rows if (row.environment, row.algorithm) == kind]
+    return max(mine, key=lambda row: row.score)
+
+
+def _write_preset(folder: Path, best: Scored) -> str:
+    """Write the best settings as a file, UDRL's for ``udrl train --config``; return its text."""
     drawn = json.loads(best.settings)
     if best.algorithm == "UDRL":
         values = preset(f"{best.environment}-paper") | drawn
@@ -162,3 +168,4 @@ def _write_preset(folder: Path, best: Scored) -> None:
     text += "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
     path = folder / f"{best.algorithm.lower()}-{best.environment}.toml"
     path.write_text(text, encoding="utf-8")
+    return f"# {path}\n{text}"

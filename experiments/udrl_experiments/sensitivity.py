@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import correlation
 
 from udrl_experiments import figures
 from udrl_experiments.comparison import job
@@ -27,7 +28,8 @@ def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> 
         task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
     }
 
-    def report(place: Place) -> None:
+    def report(place: Place) -> str:
+        said = []
         for task, runs in jobs.items():
             table = place.folder / f"{task.title}.csv"
             rows = read(table, Obtained) if table.exists() else []
@@ -35,8 +37,24 @@ def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> 
                 rows += _told(run, place.root, task, episodes, rows)
                 write(table, Obtained, rows)
             draw(table, task.title)
+            said += _in_words(task, rows)
+        return "\n".join(said)
 
     return Study("sensitivity", [run for runs in jobs.values() for run in runs], report)
+
+
+def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
+    """Return a line for each agent: how desired and obtained returns go together."""
+    said = []
+    for seed in dict.fromkeys(row.seed for row in rows):
+        mine = [row for row in rows if row.seed == seed]
+        told, got = [row.desired_return for row in mine], [row.mean for row in mine]
+        related = correlation(told, got) if len(set(got)) > 1 else 0.0
+        said.append(
+            f"{task.title}, seed {seed}: told {min(told):.0f} to {max(told):.0f}, obtained "
+            f"{min(got):.1f} to {max(got):.1f}, correlation {related:.2f}"
+        )
+    return said
 
 
 def _told(

@@ -38,14 +38,15 @@ class Study(NamedTuple):
     Attributes:
         name: of its folder, and of the command.
         jobs: the runs that it needs.
-        report: makes tables and pictures of them, once they are done.
+        report: makes tables and pictures of them, once they are done; returns what came of them in
+            words.
         carry_out: does the runs.
         needs: modules that must be there besides those that its runs need.
     """
 
     name: str
     jobs: Sequence[Job]
-    report: Callable[[Place], None]
+    report: Callable[[Place], str]
     carry_out: Callable[
         [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
     ] = carry_out
@@ -60,8 +61,8 @@ def conduct(
     resume: bool,
     stop: threading.Event,
     say: Callable[[str], None],
-) -> None:
-    """Conduct a study, or go on with it where it stopped.
+) -> str:
+    """Conduct a study, or go on with it where it stopped, and return what came of it in words.
 
     Args:
         study: what to do.
@@ -81,8 +82,9 @@ def conduct(
     place = Place(root, root / study.name)
     _open(study, place, resume=resume)
     study.carry_out(study.jobs, root, side_by_side, stop, say)
-    study.report(place)
+    said = study.report(place)
     say(f"tables and pictures are in {place.folder}")
+    return said
 
 
 def _require(study: Study) -> None:

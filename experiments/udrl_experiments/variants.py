@@ -70,15 +70,17 @@ def _variants(
         for task in tasks
     }
 
-    def report(place: Place) -> None:
+    def report(place: Place) -> str:
+        said = []
         for task, runs in jobs.items():
             folder = place.folder if len(jobs) == 1 else place.folder / task.title
             folder.mkdir(exist_ok=True)
             here = place._replace(folder=folder)
             title = f"{task.title}: {name}"
-            report_curves(runs, title, task.landmarks, here)
+            said.append(report_curves(runs, title, task.landmarks, here))
             if wall_time:
                 draw_wall_time(here, title, task.landmarks)
+        return "\n".join(said)
 
     return Study(name, [job for runs in jobs.values() for job in runs], report)
 

@@ -91,7 +91,7 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
         write(job.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
     place = Place(tmp_path, tmp_path / "search")
     place.folder.mkdir()
-    study.report(place)
+    said = study.report(place)
 
     found = read(place.folder / "scores.csv", Scored)
     assert {(r.algorithm, r.configuration): r.score for r in found} == pytest.approx(
@@ -100,5 +100,6 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
     best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score)
     kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
     drawn = draw("LunarLanderSparse-v3", "UDRL", best.configuration)
+    assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in said
     assert kept == preset("LunarLanderSparse-v3-paper") | drawn
     assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()

@@ -29,12 +29,16 @@ class World:
         self.done: list[Job] = []
         self.reported: list[Place] = []
 
+    def report(self, place: Place) -> str:
+        self.reported.append(place)
+        return "all is well"
+
     def conduct(self, *jobs: Job, resume: bool = False) -> None:
         def carry_out(planned: Sequence[Job], *others: Any) -> None:
             self.done = list(planned)
 
-        study = Study("try", jobs, self.reported.append, carry_out)
-        conduct(study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
+        study = Study("try", jobs, self.report, carry_out)
+        self.said = conduct(study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
                 say=lambda text: None)  # fmt: skip
 
 
@@ -47,6 +51,7 @@ def test_runs_first_and_then_the_report(world: World) -> None:
     world.conduct(job(1), job(2))
     assert world.done == [job(1), job(2)]
     assert world.reported == [Place(world.root, world.root / "try")]
+    assert world.said == "all is well"
 
 
 def test_what_is_done_is_written_down(world: World) -> None:
@@ -107,7 +112,7 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
     def fail(*arguments: Any) -> None:
         raise RunFailed("no")
 
-    study = Study("try", [job(1)], world.reported.append, fail)
+    study = Study("try", [job(1)], world.report, fail)
     with pytest.raises(RunFailed):
         conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
                 say=lambda text: None)  # fmt: skip
