@@ -20,6 +20,9 @@ from udrl.config import Config
 from udrl.errors import ConfigError
 from udrl.replay import Entry
 
+#: Returns and horizons that a command may have, with room for a horizon's spread.
+_MOST = 10**9
+
 
 class CommandStrategy(Protocol):
     """What exploratory commands ask for; made once a run, from its settings."""
@@ -36,7 +39,8 @@ class CommandStrategy(Protocol):
             u: this command's own number, uniform in [0, 1).
 
         Returns:
-            Desired return (finite) and desired horizon (in steps; less than 1 counts as 1).
+            Desired return and desired horizon (in steps; less than 1 counts as 1), both at most a
+            thousand million.
         """
         ...
 
@@ -166,16 +170,16 @@ def ask(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[flo
     """
     name = type(strategy).__name__
     try:
-        desired_return, desired_horizon = strategy(best, u)
+        desired_return, desired_horizon = strategy(tuple(best), u)
         desired_return, desired_horizon = float(desired_return), int(desired_horizon)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(
             f"command strategy {name} failed: {type(error).__name__}: {error}; expected a desired "
             f"return and a desired horizon"
         ) from error
-    if not math.isfinite(desired_return) or abs(desired_horizon) > 2**31:
+    if not abs(desired_return) <= _MOST or abs(desired_horizon) > _MOST:
         raise ConfigError(
             f"command strategy {name} asks for a return of {desired_return} within "
-            f"{desired_horizon} steps; expected a finite number and at most 2^31 steps"
+            f"{desired_horizon} steps; expected numbers up to {_MOST:,}"
         )
     return desired_return, max(1, desired_horizon)

@@ -6,6 +6,7 @@ nobody hears.
 
 import contextlib
 import os
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue
-from udrl.errors import ConfigError, InvalidData
+from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
@@ -73,7 +74,12 @@ class _State(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run(
-    baseline: Baseline, max_env_steps: int, folder: Path, exploration_steps: int | None = None
+    baseline: Baseline,
+    max_env_steps: int,
+    folder: Path,
+    *,
+    exploration_steps: int | None = None,
+    stop: threading.Event | None = None,
 ) -> list[Evaluated]:
     """Train, or go on with the training in a folder, and evaluate every ``eval_every`` env steps.
 
@@ -87,6 +93,7 @@ def run(
         folder: of this run alone. ``evaluations.csv`` grows with every evaluation.
         exploration_steps: env steps in which DQN's part of random actions falls; None: its
             ``exploration_fraction`` of ``max_env_steps``. A resumed run keeps what it began with.
+        stop: ends the training early; it goes on from its last evaluation.
 
     Returns:
         All evaluations.
@@ -96,7 +103,9 @@ def run(
         UnsupportedEnvironment: the environment cannot be made or is not supported.
         EnvironmentFault: the environment failed repeatedly in an evaluation.
         InvalidData: what the folder holds is damaged.
+        Interrupted: ``stop`` was set.
     """
+    stop = stop or threading.Event()
     _require_stable_baselines3()
     from udrl_experiments import policies
 
@@ -131,7 +140,13 @@ def run(
         opened.callback(generator.close)
         while (env_steps := model.num_timesteps) < max_env_steps:
             due = (env_steps // config.eval_every + 1) * config.eval_every
-            model.learn(min(due, max_env_steps) - env_steps, reset_num_timesteps=False)
+            model.learn(
+                min(due, max_env_steps) - env_steps,
+                callback=lambda local, shared: not stop.is_set(),
+                reset_num_timesteps=False,
+            )
+            if stop.is_set():
+                raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
             # The generator asks no more of a behavior function than this.
             behavior = cast(BehaviorFunction, policies.InPlaceOfBehavior(model))
             commands = _commands(baseline, generator, len(rows) + 1)
@@ -161,8 +176,9 @@ def _require_stable_baselines3() -> None:
 
 def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> list[Command]:
     """Return the commands of an evaluation: the seeds of UDRL's in the iteration ``number``."""
-    temperature = 0.0 if baseline.algorithm == "DQN" else 1.0
-    config = msgspec.structs.replace(baseline.config, eval_temperature=temperature)
+    config = baseline.config
+    if baseline.algorithm == "DQN":
+        config = msgspec.structs.replace(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec.max_episode_steps)
     return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
 

@@ -1,17 +1,17 @@
 """Figures 4 and 5: UDRL, DQN and A2C under one protocol (sections 3.2 to 3.4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
 
+from udrl.config import Config, KeywordValue
 from udrl_experiments import figures
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, Algorithm, Plan, Task
-from udrl_experiments.records import Evaluated, write
+from udrl_experiments.records import Evaluated, read, write
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Place, Study
 from udrl_experiments.tuned import tuned
-
-#: Mean returns whose first evaluation is looked for, in env steps and in seconds.
-_THRESHOLDS = (100.0, 150.0, 200.0)
 
 
 def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
@@ -25,29 +25,43 @@ def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
     task = TASKS[name]
     jobs = [
         job(task, plan, algorithm, seed)
-        for algorithm in algorithms
+        for algorithm in dict.fromkeys(algorithms)
         for seed in plan.seeds_of_runs()
     ]
 
     def report(place: Place) -> str:
-        return report_curves(jobs, task.title, task.landmarks, place)
+        return report_curves(jobs, task, task.title, place)
 
     return Study(name, jobs, report)
 
 
 def job(task: Task, plan: Plan, algorithm: Algorithm, seed: int) -> Job:
     """Return an algorithm's run on a task."""
+    steps = plan.steps(task, algorithm)
+    if algorithm == "UDRL":
+        return Job(algorithm=algorithm, config=plan.config(task, seed), max_env_steps=steps)
+    chosen = tuned(algorithm, task.environment)
+    return baseline(algorithm, plan.baseline(task, seed), chosen, steps)
+
+
+def baseline(
+    algorithm: Literal["DQN", "A2C"],
+    config: Config,
+    hyperparameters: dict[str, KeywordValue],
+    max_env_steps: int,
+) -> Job:
+    """Return a run of DQN or A2C; how DQN explores depends on how far it is to go."""
+    exploration = float(hyperparameters.get("exploration_fraction", 0.0))
     return Job(
         algorithm=algorithm,
-        config=plan.config(task, seed),
-        hyperparameters={} if algorithm == "UDRL" else tuned(algorithm, task.environment),
-        max_env_steps=plan.steps(task, algorithm),
+        config=config,
+        hyperparameters=hyperparameters,
+        exploration_steps=round(exploration * max_env_steps),
+        max_env_steps=max_env_steps,
     )
 
 
-def report_curves(
-    jobs: Sequence[Job], title: str, landmarks: dict[str, float], place: Place
-) -> str:
+def report_curves(jobs: Sequence[Job], task: Task, title: str, place: Place) -> str:
     """Write all evaluations, their curves, and when returns were reached; draw the curves.
 
     Returns:
@@ -57,8 +71,8 @@ def report_curves(
     points = curves(rows, jobs[0].config.eval_every)
     write(place.folder / "evaluations.csv", Evaluated, rows)
     write(place.folder / "curves.csv", CurvePoint, points)
-    write(place.folder / "reached.csv", Reached, reached(rows, _THRESHOLDS))
-    draw_curves(place, title, landmarks)
+    write(place.folder / "reached.csv", Reached, reached(rows, task.thresholds))
+    draw_curves(place.folder, title, task.landmarks)
     last = {(point.algorithm, point.variant): point for point in points}
     return "\n".join(
         f"{title}: {' '.join(words).strip()}: mean return {end.mean:.1f} after {end.env_steps:,} "
@@ -67,10 +81,8 @@ def report_curves(
     )
 
 
-def draw_curves(place: Place, title: str, landmarks: dict[str, float]) -> None:
+def draw_curves(folder: Path, title: str, landmarks: Mapping[str, float]) -> None:
     """Draw the curves from their table alone."""
-    from udrl_experiments.records import read
-
-    points = read(place.folder / "curves.csv", CurvePoint)
+    points = read(folder / "curves.csv", CurvePoint)
     picture = figures.learning_curves(points, title, references=landmarks)
-    figures.save(picture, place.folder / "learning-curves")
+    figures.save(picture, folder / "learning-curves")

@@ -1,20 +1,24 @@
 """One run of a study in a process of its own: ``python -m udrl_experiments.job FOLDER``."""
 
+import contextlib
 import csv
-import json
+import fcntl
 import logging
 import os
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import msgspec
 
 from udrl.config import Budget
-from udrl.errors import RunFailed, UdrlError
+from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
 from udrl_experiments.jobs import Job, read_job
-from udrl_experiments.records import Evaluated, write
+from udrl_experiments.provenance import provenance
+from udrl_experiments.records import Evaluated, put, read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
@@ -40,14 +44,43 @@ def main(folder: Path, parent: int | None) -> None:
     os._exit(code)  # as the command `udrl` ends, for the same reason
 
 
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep other processes from the run; the kernel lets go of it when this one ends."""
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunInUse(
+                f"another study works on the run in {folder}; wait for it, or name another --folder"
+            ) from error
+        yield
+
+
 def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
-    """Do the run and leave its evaluations and a note that it is done."""
+    """Do the run and leave its evaluations and a note that it is done.
+
+    Raises:
+        RunInUse: somebody does it already.
+        UdrlError: it failed.
+        Interrupted: ``stop`` was set.
+    """
+    with _alone(folder):
+        _carry_out(job, folder, stop)
+
+
+def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
     if job.algorithm == "UDRL":
         settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
         status = train(settings, folder / "run", stop, go_on=True)
         if status.problem:
             raise RunFailed(status.problem)
-        write(folder / "evaluations.csv", Evaluated, _evaluations(job, folder / "run", status))
+        table = folder / "evaluations.csv"
+        # What closed a run that goes on now was an evaluation too, and stays.
+        rows = {row.env_steps: row for row in _evaluations(job, folder / "run", status)}
+        if (folder / "done.json").exists():
+            rows |= {row.env_steps: row for row in read(table, Evaluated)}
+        write(table, Evaluated, (rows[steps] for steps in sorted(rows)))
     else:
         baselines.run(
             baselines.Baseline(
@@ -55,10 +88,11 @@ def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
             ),
             job.max_env_steps,
             folder,
+            stop=stop,
+            exploration_steps=job.exploration_steps or None,
         )
-    done = folder / "done.json.part"
-    done.write_text(json.dumps({"max_env_steps": job.max_env_steps}) + "\n", encoding="utf-8")
-    done.replace(folder / "done.json")
+    done = {"max_env_steps": job.max_env_steps, **provenance()}
+    put(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")
 
 
 def _evaluations(job: Job, run_dir: Path, status: Status) -> list[Evaluated]:

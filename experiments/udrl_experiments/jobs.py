@@ -19,7 +19,7 @@ import msgspec
 from udrl.config import Config
 from udrl.errors import Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
-from udrl_experiments.records import Evaluated, read
+from udrl_experiments.records import Evaluated, put, read
 
 #: What is said when a study is stopped.
 INTERRUPTED = "stopped; go on with the same command and --resume"
@@ -37,6 +37,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         algorithm: who learns.
         config: UDRL's settings; of another algorithm's, environment, networks and evaluations.
         hyperparameters: of DQN and A2C.
+        exploration_steps: over which DQN's part of random actions falls is a part of so many.
         max_env_steps: how far.
         variant: what sets it apart within the study; not a part of what the run is.
     """
@@ -44,13 +45,17 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     algorithm: Algorithm
     config: Config
     hyperparameters: dict[str, bool | int | float | str] = {}
+    exploration_steps: int = 0
     max_env_steps: int
     variant: str = ""
 
     @property
     def name(self) -> str:
         """A name that only runs of equal settings have."""
-        identity = msgspec.json.encode([self.algorithm, self.config, self.hyperparameters])
+        identity = msgspec.json.encode(
+            [self.algorithm, self.config, self.hyperparameters, self.exploration_steps],
+            order="sorted",
+        )
         digest = hashlib.sha256(identity).hexdigest()[:12]
         environment = re.sub(r"[^a-z0-9]+", "-", self.config.environment.lower()).strip("-")
         return f"{self.algorithm.lower()}-{environment}-seed{self.config.seed}-{digest}"
@@ -72,8 +77,9 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """Say whether the run has got as far as is asked."""
         try:
             done = json.loads((self.folder(root) / "done.json").read_text(encoding="utf-8"))
-            return int(done["max_env_steps"]) >= self.max_env_steps
-        except (OSError, ValueError, KeyError, TypeError):
+            far_enough = int(done["max_env_steps"]) >= self.max_env_steps
+            return far_enough and bool(read(self.folder(root) / "evaluations.csv", Evaluated))
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, InvalidData):
             return False
 
     def evaluations(self, root: Path) -> list[Evaluated]:
@@ -123,6 +129,7 @@ def carry_out(
         Interrupted: ``stop`` was set.
     """
     waiting = [job for job in furthest(jobs) if not job.done(root)][::-1]
+    jobs_by_name = {job.name: job for job in waiting}
     n, running = len(waiting), dict[str, subprocess.Popen[bytes]]()
     try:
         while waiting or running:
@@ -131,6 +138,7 @@ def carry_out(
                 say(f"[{n - len(waiting)}/{n}] {job.described}")
                 running[job.name] = _start(job, root)
             if stop.wait(_POLL_S):
+                say(INTERRUPTED)  # before the runs get their time to end
                 raise Interrupted(INTERRUPTED)
             for name, process in list(running.items()):
                 code = process.poll()
@@ -139,6 +147,12 @@ def carry_out(
                 del running[name]
                 if code != 0:
                     raise _failure(root / "runs" / name, code)
+                if not jobs_by_name[name].done(root):
+                    raise RunFailed(
+                        f"the run in {root / 'runs' / name} has no evaluation within "
+                        f"{jobs_by_name[name].max_env_steps:,} env steps; ask for more "
+                        f"(--max-env-steps), or evaluate earlier (--set eval_every=STEPS)"
+                    )
     finally:
         _end(running.values())
 
@@ -156,9 +170,7 @@ def furthest(jobs: Iterable[Job]) -> Sequence[Job]:
 def _start(job: Job, root: Path) -> subprocess.Popen[bytes]:
     folder = job.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
-    aside = folder / "job.json.part"
-    aside.write_bytes(msgspec.json.format(msgspec.json.encode(job)))
-    os.replace(aside, folder / "job.json")
+    put(folder / "job.json", msgspec.json.format(msgspec.json.encode(job)))
     with (folder / "log.txt").open("ab") as output:
         return subprocess.Popen(  # noqa: S603 - our own program
             [sys.executable, *_PROGRAM, str(folder), "--parent", str(os.getpid())],

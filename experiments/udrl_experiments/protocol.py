@@ -25,6 +25,8 @@ class Task:
         small: env steps of a run at the small scale: UDRL's, and the other algorithms'.
         desired_returns: what trained agents are told in the study of section 3.5.
         landmarks: returns that the paper names, by what they mean.
+        thresholds: returns whose first evaluation is looked for, in env steps and in seconds.
+        module: what its environment needs.
     """
 
     environment: str
@@ -32,6 +34,8 @@ class Task:
     small: dict[Algorithm, int]
     desired_returns: tuple[float, ...]
     landmarks: dict[str, float]
+    thresholds: tuple[float, ...]
+    module: str
 
 
 _LANDING = {"lands": 100.0, "close to optimal": 200.0}
@@ -39,19 +43,28 @@ _SMALL: dict[Algorithm, int] = {"UDRL": 3_000_000, "DQN": 1_000_000, "A2C": 1_00
 
 TASKS = {
     "lander": Task(
-        "LunarLander-v3", "LunarLander", _SMALL, tuple(range(-150, 301, 25)), _LANDING
+        "LunarLander-v3", "LunarLander", _SMALL, tuple(range(-150, 301, 25)), _LANDING,
+        (100.0, 150.0, 200.0), "Box2D",
     ),
     "sparse": Task(
-        "LunarLanderSparse-v3", "LunarLanderSparse", _SMALL, tuple(range(-150, 301, 25)), _LANDING
+        "LunarLanderSparse-v3", "LunarLanderSparse", _SMALL, tuple(range(-150, 301, 25)), _LANDING,
+        (100.0, 150.0, 200.0), "Box2D",
     ),
     "takecover": Task(
         "TakeCover-v0", "TakeCover", {"UDRL": 300_000, "DQN": 100_000, "A2C": 100_000},
-        tuple(range(100, 2101, 200)), {"solved": 750.0},
+        tuple(range(100, 2101, 200)), {"solved": 750.0}, (300.0, 500.0, 750.0), "vizdoom",
     ),
 }  # fmt: skip
 
 #: Env steps of a run in the paper, of every algorithm in every environment.
 PAPER_STEPS = 10_000_000
+
+
+#: Settings of a UDRL run that DQN and A2C have too; no other is a part of what their runs are.
+_SHARED = (
+    "environment", "environment_kwargs", "max_episode_steps", "seed", "frame_stack", "convolutions",
+    "hidden", "eval_every", "eval_episodes", "eval_temperature", "eval_seeds", "device",
+)  # fmt: skip
 
 
 class Plan(NamedTuple):
@@ -93,11 +106,28 @@ class Plan(NamedTuple):
         Raises:
             ConfigError: a setting is unknown or impossible.
         """
-        name = f"{task.environment}-paper" if paper else task.environment
-        values = preset(name) | {"eval_every": 50_000} | changes
+        own = changes | {"environment": task.environment, "seed": seed}
+        given = dict(parse_assignment(text) for text in self.assignments)
+        for name in given:
+            if name in own:
+                raise ConfigError(f"--set {name}=...: this study sets {name} itself; leave it out")
+        values = preset(f"{task.environment}-paper" if paper else task.environment)
         del values["max_env_steps"]
-        values |= dict(parse_assignment(text) for text in self.assignments)
-        return build(Config, values | {"environment": task.environment, "seed": seed})
+        return build(Config, values | {"eval_every": 50_000} | given | own)
+
+    def baseline(self, task: Task, seed: int, **changes: Any) -> Config:
+        """Return the settings of a run of DQN or A2C: what they have in common with UDRL's.
+
+        Args:
+            task: whose environment and networks.
+            seed: of the run.
+            changes: of the preset.
+
+        Raises:
+            ConfigError: a setting is unknown or impossible.
+        """
+        config = self.config(task, seed, **changes)
+        return Config(**{name: getattr(config, name) for name in _SHARED})
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from udrl.errors import ConfigError, Interrupted, RunFailed
+from udrl.errors import ConfigError, Interrupted, RunFailed, Unreachable
 from udrl_experiments import jobs
 from udrl_experiments.jobs import INTERRUPTED, Job
 
@@ -29,12 +29,17 @@ def carry_out(
     With ``RAY_ADDRESS`` set, the runs go to that cluster; ``root`` must be a folder that all its
     machines share. What was done is known by what lies there, so nothing of Ray's is kept.
 
+    A run that fails does not end the search: hyperparameters that a run cannot be made with are
+    what a search finds out.
+
     Raises:
         ConfigError: Ray is not installed.
-        RunFailed: a run failed.
+        Unreachable: nobody answers at ``RAY_ADDRESS``.
+        RunFailed: every run failed.
         Interrupted: ``stop`` was set.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_CHDIR_TO_TRIAL_DIR", "0")
     try:
         import ray
         from ray import tune
@@ -47,8 +52,12 @@ def carry_out(
         return
 
     class Watch(tune.Callback):
+        def __reduce__(self) -> tuple[type[tune.Callback], tuple[()]]:
+            return tune.Callback, ()  # Tune saves it with what could be restored; nobody does
+
         def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
             if stop.is_set():
+                say(INTERRUPTED)
                 raise Interrupted(INTERRUPTED)
 
         def on_trial_start(
@@ -62,8 +71,13 @@ def carry_out(
         return {"evaluations": len(job.evaluations(root))}
 
     say(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
-    if "RAY_ADDRESS" in os.environ:
-        ray.init(logging_level=logging.WARNING)
+    if address := os.environ.get("RAY_ADDRESS"):
+        try:
+            ray.init(logging_level=logging.WARNING)
+        except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+            raise Unreachable(
+                f"RAY_ADDRESS = {address}: {error}; start Ray there (ray start --head), or unset it"
+            ) from error
     else:
         cores = _CORES * side_by_side
         ray.init(num_cpus=cores, include_dashboard=False, logging_level=logging.WARNING,
@@ -78,10 +92,11 @@ def carry_out(
             tune_config=tune.TuneConfig(max_concurrent_trials=side_by_side),
             run_config=tune.RunConfig(
                 name="ray", storage_path=str(root.resolve()), verbose=0, callbacks=[Watch()],
-                failure_config=tune.FailureConfig(fail_fast=True),
             ),
         ).fit()  # fmt: skip
-        if results.errors:
-            raise RunFailed(str(results.errors[0]))
+        for failure in results.errors:
+            say(f"a run failed: {failure}")
+        if len(results.errors) == len(waiting):
+            raise RunFailed(f"all {len(waiting)} runs failed, the first with: {results.errors[0]}")
     finally:
         ray.shutdown()

@@ -1,6 +1,8 @@
 """Tidy tables: a CSV file with a line for each observation, typed and checked when it is read."""
 
 import csv
+import io
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -63,14 +65,20 @@ class Obtained(msgspec.Struct, frozen=True, kw_only=True):
     episodes: int
 
 
+def put(path: Path, content: bytes) -> None:
+    """Write a file; it is there whole or not at all."""
+    aside = path.with_name(path.name + ".part")
+    aside.write_bytes(content)
+    os.replace(aside, path)
+
+
 def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
     """Write rows, with the field names as the first line; the file is there whole or not at all."""
-    aside = path.with_name(path.name + ".part")
-    with aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(kind.__struct_fields__)
-        writer.writerows(msgspec.structs.astuple(row) for row in rows)
-    os.replace(aside, path)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(kind.__struct_fields__)
+    writer.writerows(msgspec.structs.astuple(row) for row in rows)
+    put(path, text.getvalue().encode())
 
 
 def read(path: Path, kind: type[Row]) -> list[Row]:
@@ -81,10 +89,13 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            table = csv.DictReader(file)
+            rows = list(table)
+        if tuple(table.fieldnames or ()) != kind.__struct_fields__:
+            raise ValueError(f"its columns are {table.fieldnames}")  # noqa: TRY301
         # The text "" is none where no text is expected.
         words = {f.name for f in msgspec.structs.fields(kind) if f.type is str}
-        return [
+        read = [
             msgspec.convert(
                 {name: value if value or name in words else None for name, value in row.items()},
                 kind,
@@ -92,8 +103,16 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
             )
             for row in rows
         ]
-    except (OSError, UnicodeDecodeError, csv.Error, msgspec.ValidationError) as error:
+        if not all(
+            math.isfinite(value)
+            for row in read
+            for value in msgspec.structs.astuple(row)
+            if isinstance(value, float)
+        ):
+            raise ValueError("a number is not finite")  # noqa: TRY301
+    except (OSError, ValueError, csv.Error, msgspec.ValidationError) as error:
         raise InvalidData(
             f"{path}: {error}; expected a CSV file with {', '.join(kind.__struct_fields__)}; "
             f"delete it to have it made again"
         ) from error
+    return read

@@ -14,10 +14,11 @@ import numpy as np
 
 from udrl.config import preset
 from udrl.streams import Stream
+from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import LAST, Algorithm, Plan, Task
 from udrl_experiments.ray_tune import carry_out
-from udrl_experiments.records import write
+from udrl_experiments.records import put, write
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Place, Study
 
@@ -34,7 +35,8 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
         algorithm: who learned.
         configuration: its number; which settings it has is a function of it.
         seeds: runs that the score is the mean of.
-        score: mean of the last 20 evaluations (Appendix B), mean over the seeds.
+        score: mean of the last 20 evaluations (Appendix B), mean over the seeds; none if a run of
+            it failed.
         settings: what was drawn, as JSON.
     """
 
@@ -42,7 +44,7 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
     algorithm: str
     configuration: int
     seeds: int
-    score: float
+    score: float | None
     settings: str
 
 
@@ -86,7 +88,7 @@ def search(
             _job(plan, task, algorithm, number, seed) for seed in _seeds(plan, task)
         ]
         for task in tasks
-        for algorithm in algorithms
+        for algorithm in dict.fromkeys(algorithms)
         for number in range(_configurations(plan, task, configurations))
     }
 
@@ -97,16 +99,16 @@ def search(
                 algorithm=algorithm,
                 configuration=number,
                 seeds=len(runs),
-                score=fmean(_score(run, place.root) for run in runs),
+                score=_score(runs, place.root),
                 settings=json.dumps(draw(task.environment, algorithm, number)),
             )
             for (task, algorithm, number), runs in jobs.items()
         ]
         write(place.folder / "scores.csv", Scored, rows)
         return "\n".join(
-            _write_preset(place.folder, _best(rows, task, algorithm))
+            _write_preset(place.folder, rows, task, algorithm)
             for task in tasks
-            for algorithm in algorithms
+            for algorithm in dict.fromkeys(algorithms)
         )
 
     return Study(
@@ -132,40 +134,40 @@ def _job(plan: Plan, task: Task, algorithm: Algorithm, number: int, seed: int) -
     if plan.scale == "small" and plan.max_env_steps is None:
         plan = plan._replace(max_env_steps=SMALL_STEPS)
     drawn = draw(task.environment, algorithm, number)
-    networks = {k: v for k, v in drawn.items() if k in ("hidden", "convolutions")}
-    return Job(
-        algorithm=algorithm,
-        config=plan.config(
-            task, seed, paper=True, eval_seeds="search",
-            **(drawn if algorithm == "UDRL" else networks),
-        ),
-        hyperparameters={} if algorithm == "UDRL"
-        else {k: v for k, v in drawn.items() if k not in networks},
-        max_env_steps=plan.steps(task, algorithm),
-    )  # fmt: skip
+    steps = plan.steps(task, algorithm)
+    if algorithm == "UDRL":
+        config = plan.config(task, seed, paper=True, eval_seeds="search", **drawn)
+        return Job(algorithm=algorithm, config=config, max_env_steps=steps)
+    networks = {k: drawn.pop(k) for k in ("hidden", "convolutions") if k in drawn}
+    config = plan.baseline(task, seed, eval_seeds="search", **networks)
+    return baseline(algorithm, config, drawn, steps)
 
 
-def _score(run: Job, root: Path) -> float:
-    return score([row.mean for row in run.evaluations(root)], LAST)
+def _score(runs: Sequence[Job], root: Path) -> float | None:
+    """Return the mean score of a configuration's runs; none if one of them failed."""
+    if not all(run.done(root) for run in runs):
+        return None
+    return fmean(score([row.mean for row in run.evaluations(root)], LAST) for run in runs)
 
 
-def _best(rows: Sequence[Scored], task: Task, algorithm: Algorithm) -> Scored:
-    kind = (task.environment, algorithm)
-    mine = [row for row in rows if (row.environment, row.algorithm) == kind]
-    return max(mine, key=lambda row: row.score)
-
-
-def _write_preset(folder: Path, best: Scored) -> str:
+def _write_preset(folder: Path, rows: Sequence[Scored], task: Task, algorithm: Algorithm) -> str:
     """Write the best settings as a file, UDRL's for ``udrl train --config``; return its text."""
+    kind = (task.environment, algorithm)
+    scored = [
+        (row.score, row)
+        for row in rows
+        if (row.environment, row.algorithm) == kind and row.score is not None
+    ]
+    if not scored:
+        return f"# {algorithm}, {task.environment}: no configuration got to its end"
+    value, best = max(scored, key=lambda pair: pair[0])
     drawn = json.loads(best.settings)
-    if best.algorithm == "UDRL":
+    if algorithm == "UDRL":
         values = preset(f"{best.environment}-paper") | drawn
     else:
         values = {"environment": best.environment, **drawn}
-    text = (
-        f"# Configuration {best.configuration}; score {best.score:.1f} over {best.seeds} seed(s).\n"
-    )
+    text = f"# Configuration {best.configuration}; score {value:.1f}, seeds: {best.seeds}.\n"
     text += "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
-    path = folder / f"{best.algorithm.lower()}-{best.environment}.toml"
-    path.write_text(text, encoding="utf-8")
+    path = folder / f"{algorithm.lower()}-{best.environment}.toml"
+    put(path, text.encode())
     return f"# {path}\n{text}"

@@ -10,7 +10,7 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained, read, write
 from udrl_experiments.study import Place, Study
-from udrl_launch.inspection import Agent, evaluate, load_agent
+from udrl_launch.inspection import Agent, evaluate, load_agent, read_status
 
 #: Episodes a point.
 EPISODES = 100
@@ -32,10 +32,8 @@ def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> 
         said = []
         for task, runs in jobs.items():
             table = place.folder / f"{task.title}.csv"
-            rows = read(table, Obtained) if table.exists() else []
-            for run in runs:
-                rows += _told(run, place.root, task, episodes, rows)
-                write(table, Obtained, rows)
+            rows = [row for run in runs for row in _told(run, place.root, task, episodes)]
+            write(table, Obtained, rows)
             draw(table, task.title)
             said += _in_words(task, rows)
         return "\n".join(said)
@@ -57,23 +55,19 @@ def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
     return said
 
 
-def _told(
-    run: Job, root: Path, task: Task, episodes: int, known: Sequence[Obtained]
-) -> list[Obtained]:
-    """Return what the agent of a run obtains, unless that is known."""
-    seed = run.config.seed
-    if any(row.seed == seed for row in known):
-        return []
-    agent = load_agent(run.folder(root) / "run")
-    return [_obtained(agent, told, episodes, run) for told in task.desired_returns]
+def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
+    """Return what the agent of a run obtains; another study may have taken it further."""
+    run_dir = run.folder(root) / "run"
+    agent, env_steps = load_agent(run_dir), read_status(run_dir).env_steps
+    return [_obtained(agent, env_steps, told, episodes) for told in task.desired_returns]
 
 
-def _obtained(agent: Agent, desired_return: float, episodes: int, run: Job) -> Obtained:
+def _obtained(agent: Agent, env_steps: int, desired_return: float, episodes: int) -> Obtained:
     result = evaluate(agent, episodes=episodes, desired_return=desired_return)
     return Obtained(
-        environment=run.config.environment,
-        seed=run.config.seed,
-        env_steps=run.max_env_steps,
+        environment=agent.config.environment,
+        seed=agent.config.seed,
+        env_steps=env_steps,
         desired_return=result.desired_return,
         desired_horizon=result.desired_horizon,
         mean=result.evaluation.mean,

@@ -1,31 +1,27 @@
 """What a study is, and how it is conducted: runs, tables, provenance, pictures."""
 
-import importlib.metadata
 import importlib.util
-import os
-import platform
-import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
-import udrl
 from udrl.errors import ConfigError, InvalidData
+from udrl.strategies import make_strategy
 from udrl_experiments.jobs import Job, carry_out
-
-#: Packages whose version may change a result.
-_PACKAGES = ("eclipse-zenoh", "gymnasium", "numpy", "ray", "stable-baselines3", "torch", "vizdoom")
+from udrl_experiments.protocol import TASKS
+from udrl_experiments.provenance import provenance
+from udrl_experiments.records import put
 
 
 class Place(NamedTuple):
     """Where a study works.
 
     Attributes:
-        root: of all studies, which share their runs.
-        folder: this study's: tables, pictures, ``study.json``.
+        root: where its runs live, in ``runs``; most studies share them.
+        folder: its own: tables, pictures, ``study.json``.
     """
 
     root: Path
@@ -42,6 +38,7 @@ class Study(NamedTuple):
             words.
         carry_out: does the runs.
         needs: modules that must be there besides those that its runs need.
+        shares_runs: whether runs that other studies have made will do.
     """
 
     name: str
@@ -51,6 +48,7 @@ class Study(NamedTuple):
         [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
     ] = carry_out
     needs: Sequence[str] = ()
+    shares_runs: bool = True
 
 
 def conduct(
@@ -73,29 +71,45 @@ def conduct(
         say: is told how it goes.
 
     Raises:
-        ConfigError: a package is missing, or the folder holds a study already: another one, or
-            ``resume`` is not set.
+        ConfigError: a package is missing, a strategy cannot be made, the folder cannot be written,
+            or it holds a study already: another one, or ``resume`` is not set.
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
     _require(study)
-    place = Place(root, root / study.name)
-    _open(study, place, resume=resume)
-    study.carry_out(study.jobs, root, side_by_side, stop, say)
-    said = study.report(place)
-    say(f"tables and pictures are in {place.folder}")
+    root = root.resolve()
+    folder = root / study.name
+    place = Place(root if study.shares_runs else folder, folder)
+    try:
+        _open(study, place, resume=resume)
+        study.carry_out(study.jobs, place.root, side_by_side, stop, say)
+        said = study.report(place)
+    except OSError as error:
+        raise ConfigError(
+            f"--folder {root}: {error}; name a folder that you may write, on a disk with room"
+        ) from error
+    say(f"tables and pictures are in {folder}")
     return said
 
 
 def _require(study: Study) -> None:
     """Refuse before the first run what would be missed after the last one."""
-    others = {job.algorithm for job in study.jobs} - {"UDRL"}
-    for module in ("matplotlib", *(["stable_baselines3"] if others else []), *study.needs):
+    modules = dict.fromkeys(("matplotlib", *study.needs))
+    for job in study.jobs:
+        if job.algorithm != "UDRL":
+            modules["stable_baselines3"] = None
+        for task in TASKS.values():
+            if task.environment == job.config.environment:
+                modules[task.module] = None
+    for module in modules:
         if importlib.util.find_spec(module) is None:
             raise ConfigError(
                 f"the study {study.name} needs the module {module}, which is not installed; "
-                f'install it with: pip install "udrl[studies]"'
+                f'install it with: pip install "udrl[box2d,doom,studies]"'
             )
+    strategies = {job.config.command_strategy: job.config for job in study.jobs}
+    for config in strategies.values():
+        make_strategy(config)
 
 
 def _open(study: Study, place: Place, *, resume: bool) -> None:
@@ -120,9 +134,7 @@ def _open(study: Study, place: Place, *, resume: bool) -> None:
                 )
     place.folder.mkdir(parents=True, exist_ok=True)
     about = {"study": study.name, **provenance(), "runs": study.jobs}
-    aside = file.with_suffix(".part")
-    aside.write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
-    os.replace(aside, file)
+    put(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
 
 
 def _begun(file: Path) -> list[Job]:
@@ -131,48 +143,5 @@ def _begun(file: Path) -> list[Job]:
 
     try:
         return msgspec.json.decode(file.read_bytes(), type=About).runs
-    except (OSError, msgspec.DecodeError) as error:
+    except msgspec.DecodeError as error:
         raise InvalidData(f"{file}: {error}; delete it to begin the study anew") from error
-
-
-def provenance() -> dict[str, Any]:
-    """Return what software and what kind of machine results come from."""
-    versions = {"udrl": udrl.__version__, "python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return {
-        "commit": _commit(),
-        "versions": versions,
-        "machine": {"processor": _processor(), "cores": len(os.sched_getaffinity(0)),
-                    "system": f"{platform.system()} {platform.machine()}"},
-    }  # fmt: skip
-
-
-def _commit() -> str:
-    """Return the commit of the code, if Git keeps it here."""
-    here = Path(__file__)
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(here.parent), *arguments]
-        return subprocess.run(  # noqa: S603 - git, with our own arguments
-            command, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", here.name)  # not a checkout that we are installed in
-        changed = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + (" and changes" if changed else "")
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor())

@@ -5,6 +5,7 @@ calls for a study of other ways to choose exploratory commands, and lead is ours
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from udrl.strategies import STRATEGIES
@@ -77,16 +78,18 @@ def _variants(
             folder.mkdir(exist_ok=True)
             here = place._replace(folder=folder)
             title = f"{task.title}: {name}"
-            said.append(report_curves(runs, title, task.landmarks, here))
+            said.append(report_curves(runs, task, title, here))
             if wall_time:
-                draw_wall_time(here, title, task.landmarks)
+                draw_wall_time(folder, title, task.landmarks)
         return "\n".join(said)
 
-    return Study(name, [job for runs in jobs.values() for job in runs], report)
+    # A time that was measured beside other runs, or by other code, is not comparable.
+    every = [job for runs in jobs.values() for job in runs]
+    return Study(name, every, report, shares_runs=not wall_time)
 
 
-def draw_wall_time(place: Place, title: str, landmarks: Mapping[str, float]) -> None:
+def draw_wall_time(folder: Path, title: str, landmarks: Mapping[str, float]) -> None:
     """Draw the curves against wall time, from their table alone."""
-    points = read(place.folder / "curves.csv", CurvePoint)
+    points = read(folder / "curves.csv", CurvePoint)
     picture = figures.learning_curves(points, title, x="wall_s", references=landmarks)
-    figures.save(picture, place.folder / "learning-curves-wall-time")
+    figures.save(picture, folder / "learning-curves-wall-time")

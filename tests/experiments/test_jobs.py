@@ -1,6 +1,6 @@
-import json
+import fcntl
+import os
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,9 @@ import msgspec
 import pytest
 
 from udrl.config import Config
-from udrl.errors import Interrupted, InvalidData, RunFailed
+from udrl.errors import Interrupted, InvalidData, RunFailed, RunInUse
 from udrl_experiments import jobs
+from udrl_experiments.job import carry_out as do
 from udrl_experiments.jobs import Job, carry_out, furthest, read_job
 from udrl_experiments.records import Evaluated, write
 
@@ -20,6 +21,12 @@ CONFIG = Config(environment="CartPole-v1", eval_every=100)
 def job(max_env_steps: int = 1000, variant: str = "", **changes: Any) -> Job:
     config = msgspec.structs.replace(CONFIG, **changes)
     return Job(algorithm="UDRL", config=config, max_env_steps=max_env_steps, variant=variant)
+
+
+TABLE = (
+    "environment,algorithm,variant,seed,env_steps,wall_s,mean,std,episodes\n"
+    "CartPole-v1,UDRL,,1,105,1.0,2.0,3.0,4\n"
+)
 
 
 def evaluated(env_steps: int) -> Evaluated:
@@ -62,11 +69,14 @@ def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "done"),
     [('{"max_env_steps": 1000}', True), ('{"max_env_steps": 999}', False), ("", False),
-     ("[]", False), ('{"max_env_steps": null}', False)],
+     ("[]", False), ('{"max_env_steps": null}', False), ('{"max_env_steps": 1e999}', False)],
 )  # fmt: skip
 def test_done_is_done_as_far_as_asked(tmp_path: Path, text: str, *, done: bool) -> None:
-    job().folder(tmp_path).mkdir(parents=True)
-    (job().folder(tmp_path) / "done.json").write_text(text, encoding="utf-8")
+    folder = job().folder(tmp_path)
+    folder.mkdir(parents=True)
+    (folder / "done.json").write_text(text, encoding="utf-8")
+    assert not job().done(tmp_path), "it has no evaluations"
+    write(folder / "evaluations.csv", Evaluated, [evaluated(105)])
     assert job().done(tmp_path) is done
 
 
@@ -80,14 +90,23 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Replace what a run does by a line of Python; ``folder`` and ``json`` are there."""
 
     def replace(line: str) -> None:
-        code = f"import json, os, sys, time\nfolder = sys.argv[1]\n{line}"
+        code = f"import json, os, shutil, sys, time\nfolder = sys.argv[1]\n{line}"
         monkeypatch.setattr(jobs, "_PROGRAM", ("-c", code))
 
     return replace
 
 
-FINISH = "json.dump({'max_env_steps': json.load(open(folder + '/job.json'))['max_env_steps']}, " \
-         "open(folder + '/done.json', 'w'))"  # fmt: skip
+FINISH = f"""
+open(folder + '/evaluations.csv', 'w').write({TABLE!r})
+asked = json.load(open(folder + '/job.json'))['max_env_steps']
+json.dump({{'max_env_steps': asked}}, open(folder + '/done.json', 'w'))
+"""
+#: Leaves the process's id, and lasts.
+LAST = "open(folder + '/pid', 'w').write(str(os.getpid())); time.sleep(600)"
+
+
+def quietly(text: str) -> None:
+    """Say nothing."""
 
 
 def test_what_is_done_is_not_done_again(tmp_path: Path, program: Callable[[str], None]) -> None:
@@ -105,38 +124,73 @@ def test_no_more_than_asked_side_by_side(tmp_path: Path, program: Callable[[str]
     # Each run leaves a file while it is there, and counts those of the others.
     program(
         "root = os.path.dirname(folder); mark = folder + '.on'; open(mark, 'w').close(); "
-        "n = sum(f.endswith('.on') for f in os.listdir(root)); "
+        "time.sleep(0.5); n = sum(f.endswith('.on') for f in os.listdir(root)); "
         "open(folder + '.count', 'w').write(str(n)); os.remove(mark)\n" + FINISH
     )
-    carry_out([job(seed=n) for n in range(6)], tmp_path, 2, threading.Event(), lambda text: None)
+    carry_out([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), quietly)
     counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
-    assert len(counts) == 6
-    assert max(counts) <= 2
+    assert len(counts) == 4
+    assert max(counts) == 2
+
+
+class WhenItRuns(threading.Event):
+    """Set as soon as a run has left its process's id."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.file = folder / "pid"
+
+    @property
+    def pid(self) -> int:
+        text = self.file.read_text() if self.file.exists() else ""
+        return int(text or 0)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return bool(self.pid) or super().wait(timeout)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_stop_ends_what_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
+    program(LAST)
+    stop, said = WhenItRuns(job().folder(tmp_path)), list[str]()
+    with pytest.raises(Interrupted, match="--resume"):
+        carry_out([job()], tmp_path, 1, stop, said.append)
+    assert "--resume" in said[-1]
+    assert not is_running(stop.pid)
 
 
 def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
     tmp_path: Path, program: Callable[[str], None]
 ) -> None:
+    lasting = job(seed=1)
+    pid = str(lasting.folder(tmp_path) / "pid")
     program(
-        "seed = json.load(open(folder + '/job.json'))['config']['seed']\n"
-        "if seed == 1: time.sleep(600)\n"
+        f"if folder == {str(lasting.folder(tmp_path))!r}: {LAST}\n"
+        f"while not (os.path.exists({pid!r}) and open({pid!r}).read()): time.sleep(0.01)\n"
         "print('no such luck', file=sys.stderr); sys.exit(7)"
     )
-    began = time.monotonic()
     with pytest.raises(RunFailed, match="no such luck") as raised:
-        carry_out([job(seed=1), job(seed=2)], tmp_path, 2, threading.Event(), lambda text: None)
+        carry_out([lasting, job(seed=2)], tmp_path, 2, threading.Event(), quietly)
     assert raised.value.exit_code == 7
-    assert time.monotonic() - began < 60
+    assert not is_running(WhenItRuns(lasting.folder(tmp_path)).pid)
 
 
-def test_a_stop_ends_what_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
-    program("time.sleep(600)")
-    stop = threading.Event()
-    with pytest.raises(Interrupted, match="--resume"):
-        carry_out([job()], tmp_path, 1, stop, lambda text: stop.set())
+def test_a_run_without_evaluations_is_told(tmp_path: Path, program: Callable[[str], None]) -> None:
+    program("")
+    with pytest.raises(RunFailed, match=r"no evaluation within 1,000 env steps; ask for more"):
+        carry_out([job()], tmp_path, 1, threading.Event(), quietly)
 
 
-def test_a_job_is_written_whole(tmp_path: Path, program: Callable[[str], None]) -> None:
-    program(FINISH)
-    carry_out([job()], tmp_path, 1, threading.Event(), lambda text: None)
-    assert json.loads((job().folder(tmp_path) / "job.json").read_text())["algorithm"] == "UDRL"
+def test_nobody_else_works_on_a_run(tmp_path: Path) -> None:
+    dqn = Job(algorithm="DQN", config=CONFIG, max_env_steps=10)
+    with (tmp_path / "lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(RunInUse, match="another study works on the run"):
+            do(dqn, tmp_path, threading.Event())

@@ -52,7 +52,7 @@ def test_what_is_given_wins_over_the_scale() -> None:
     plan = Plan("paper", (4, 5), 1000, ("batch_size=64", "eval_every=77"))
     assert plan.seeds_of_runs() == (4, 5)
     assert plan.steps(TASKS["lander"]) == 1000
-    config = plan.config(TASKS["lander"], 5, lead=3, batch_size=128)
+    config = plan.config(TASKS["lander"], 5, lead=3)
     assert (config.seed, config.lead, config.batch_size, config.eval_every) == (5, 3, 64, 77)
 
 
@@ -74,3 +74,17 @@ def test_tasks_by_name() -> None:
     assert tasks(["sparse", "lander"]) == [TASKS["sparse"], TASKS["lander"]]
     with pytest.raises(ConfigError, match=r"task 'moon': there are lander"):
         tasks(["moon"])
+
+
+@pytest.mark.parametrize("name", ["lead", "seed", "environment"])
+def test_what_a_study_sets_itself_cannot_be_set(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
+        Plan(assignments=(f"{name}=1",)).config(TASKS["lander"], 1, lead=2)
+
+
+def test_a_baseline_is_the_same_whatever_udrl_does() -> None:
+    usual = Plan().baseline(TASKS["lander"], 3)
+    other = Plan(assignments=("last_few=7", "lead=3", "command_strategy=record", "batch_size=9"))
+    assert other.baseline(TASKS["lander"], 3) == usual
+    shared = Plan(assignments=("hidden=[8]",)).baseline(TASKS["lander"], 3)
+    assert (shared.hidden, shared.seed, shared.environment) == ((8,), 3, "LunarLander-v3")

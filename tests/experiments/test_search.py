@@ -1,3 +1,4 @@
+import json
 import math
 import tomllib
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from udrl.config import Config, build, preset
+from udrl.errors import ConfigError
 from udrl_experiments.protocol import TASKS, Algorithm, Plan
 from udrl_experiments.records import Evaluated, read, write
 from udrl_experiments.search import Scored, draw, search, space
@@ -75,11 +77,13 @@ def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
 
 def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
     plan = Plan(seeds=(1, 2), assignments=("eval_every=10",))
-    study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN"], 3)
+    study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN", "DQN"], 4)
     scores = dict[tuple[str, int], list[float]]()
     for index, job in enumerate(study.jobs):
         means = [float((index * 7) % 5 + n % 3) for n in range(25)]
-        number = index // 2 % 3
+        number = index // 2 % 4
+        if number == 3:
+            continue  # it failed
         scores.setdefault((job.algorithm, number), []).append(fmean(means[5:]))
         job.folder(tmp_path).mkdir(parents=True)
         rows = [
@@ -89,17 +93,33 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
             for n, mean in enumerate(means)
         ]  # fmt: skip
         write(job.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
+        done = json.dumps({"max_env_steps": job.max_env_steps})
+        (job.folder(tmp_path) / "done.json").write_text(done)
     place = Place(tmp_path, tmp_path / "search")
     place.folder.mkdir()
     said = study.report(place)
 
     found = read(place.folder / "scores.csv", Scored)
-    assert {(r.algorithm, r.configuration): r.score for r in found} == pytest.approx(
-        {key: fmean(both) for key, both in scores.items()}
-    )
-    best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score)
+    assert len(found) == 8
+    scored = {(r.algorithm, r.configuration): r.score for r in found if r.score is not None}
+    assert scored == pytest.approx({key: fmean(both) for key, both in scores.items()})
+    best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score or -math.inf)
     kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
     drawn = draw("LunarLanderSparse-v3", "UDRL", best.configuration)
     assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in said
     assert kept == preset("LunarLanderSparse-v3-paper") | drawn
     assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()
+
+
+@pytest.mark.parametrize("name", ["batch_size", "eval_seeds", "hidden", "seed", "environment"])
+def test_what_a_search_draws_cannot_be_set(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
+        search(Plan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
+
+
+def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
+    study = search(Plan(), [TASKS["lander"]], ["A2C"], 2)
+    (tmp_path / "search").mkdir()
+    said = study.report(Place(tmp_path, tmp_path / "search"))
+    assert "no configuration got to its end" in said
+    assert not list((tmp_path / "search").glob("*.toml"))

@@ -13,7 +13,8 @@ from udrl.config import Config
 from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
-from udrl_experiments.study import Place, Study, conduct, provenance
+from udrl_experiments.provenance import provenance
+from udrl_experiments.study import Place, Study, conduct
 
 
 def job(seed: int, max_env_steps: int = 100) -> Job:
@@ -69,14 +70,17 @@ def test_provenance_names_versions_and_the_kind_of_machine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "algorithm"), [("matplotlib", "UDRL"), ("stable_baselines3", "A2C")]
+    ("module", "algorithm"),
+    [("matplotlib", "UDRL"), ("stable_baselines3", "A2C"), ("Box2D", "UDRL")],
 )
 def test_what_is_missing_is_told_before_the_first_run(
     world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[studies\]"'):
-        world.conduct(msgspec.structs.replace(job(1), algorithm=algorithm))
+    config = Config(environment="LunarLander-v3")
+    needy = msgspec.structs.replace(job(1), algorithm=algorithm, config=config)
+    with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[box2d,doom,studies\]"'):
+        world.conduct(needy)
     assert not world.done
     assert not (world.root / "try").exists()
 
@@ -117,3 +121,16 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
         conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
                 say=lambda text: None)  # fmt: skip
     assert not world.reported
+
+
+def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World) -> None:
+    config = Config(environment="CartPole-v1", command_strategy="not.there:Missing")
+    with pytest.raises(ConfigError, match=r"not\.there:Missing"):
+        world.conduct(job(1), msgspec.structs.replace(job(1), config=config))
+    assert not world.done
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"--folder .*file.*name a folder that you may write"):
+        World(tmp_path / "file").conduct(job(1))

@@ -17,6 +17,8 @@ TINY = {
     "n_updates_per_iter": 2, "batch_size": 32, "hidden": [8, 8],
 }  # fmt: skip
 SETTINGS = [word for k, v in TINY.items() for word in ("--set", f"{k}={json.dumps(v)}")]
+#: Of a search, which draws the others.
+SEARCH = ["--set", "eval_every=1000", "--set", "eval_episodes=3"]
 STEPS = 2000
 
 
@@ -30,8 +32,9 @@ def study(cli: Callable[..., Cli]) -> Callable[..., Path]:
     """Conduct a study, one run at a time, and return its folder."""
 
     def conduct(name: str, *arguments: str, root: Path, timeout: float = 110) -> Path:
+        settings = SEARCH if name == "search" else SETTINGS
         started = cli("study", name, "--folder", str(root), "--max-env-steps", str(STEPS),
-                      *SETTINGS, *arguments)  # fmt: skip
+                      *settings, *arguments)  # fmt: skip
         code, _, error = started.finish(timeout)
         assert code == 0, error
         return root / name
@@ -85,9 +88,7 @@ def test_a_comparison_is_interrupted_and_goes_on(
 def test_a_run_of_a_study_is_the_run_of_its_settings(
     study: Callable[..., Path], tmp_path: Path
 ) -> None:
-    study("commands", "--task", "sparse", "--seeds", "3", "--set", "lead=0",
-          "--set", "command_strategy=record", root=tmp_path)  # fmt: skip
-    # Every variant has the same settings here, so there is one run.
+    study("sparse", "--algorithm", "UDRL", "--seeds", "3", "--set", "lead=0", root=tmp_path)
     (folder,) = runs_of(tmp_path, "udrl")
     config: dict[str, Any] = json.loads((folder / "job.json").read_text())["config"]
     expected = reference(build(Config, config), STEPS)
@@ -116,13 +117,14 @@ def test_all_studies_share_their_runs(
         f"lead {n}" for n in (0, 1, 2, 4, 8)
     }
     assert (folder / "learning-curves-wall-time.png").exists()
-    assert len(runs_of(tmp_path, "udrl")) == 5
+    assert len(runs_of(tmp_path, "udrl")) == 1
+    assert len(runs_of(folder, "udrl")) == 5
 
     folder = study("segments", *one, root=tmp_path, timeout=200)
     assert {r["variant"] for r in rows(folder / "LunarLander" / "evaluations.csv")} == {
         "trailing", "all"
     }  # fmt: skip
-    assert len(runs_of(tmp_path, "udrl")) == 5 + 3
+    assert len(runs_of(tmp_path, "udrl")) == 1 + 3
 
     (tmp_path / "patient.py").write_text(
         "class Patient:\n"
@@ -135,23 +137,26 @@ def test_all_studies_share_their_runs(
     assert {r["variant"] for r in rows(folder / "evaluations.csv")} == {
         "uniform", "again", "ranked", "record", "patient:Patient"
     }  # fmt: skip
-    assert len(runs_of(tmp_path, "udrl")) == 8 + 4
+    assert len(runs_of(tmp_path, "udrl")) == 4 + 4
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(300)
 def test_a_search_goes_on_with_more_configurations(
-    study: Callable[..., Path], tmp_path: Path
+    study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The settings that are drawn would win over TINY's: nothing else makes the runs small.
-    arguments = ("--task", "lander", "--seeds", "1", "--algorithm", "DQN")
-    folder = study("search", *arguments, "--configurations", "1", root=tmp_path, timeout=200)
+    here = Path("studies")  # relative to where the command runs, as the default is
+    monkeypatch.chdir(tmp_path)
+    arguments = ("--task", "lander", "--seeds", "1", "--algorithm", "A2C")
+    folder = study("search", *arguments, "--configurations", "1", root=here, timeout=140)
     assert len(rows(folder / "scores.csv")) == 1
+    (first,) = (run / "done.json" for run in runs_of(here, "a2c"))
+    done_at = first.stat().st_mtime_ns
     more = ("--configurations", "2", "--resume")
-    folder = study("search", *arguments, *more, root=tmp_path, timeout=200)
-    assert len(rows(folder / "scores.csv")) == 2
-    assert len(runs_of(tmp_path, "dqn")) == 2
-    assert (folder / "dqn-LunarLander-v3.toml").exists()
+    folder = study("search", *arguments, *more, root=here, timeout=140)
+    assert all(float(r["score"]) < 0 for r in rows(folder / "scores.csv"))
+    assert len(runs_of(here, "a2c")) == 2
+    assert first.stat().st_mtime_ns == done_at
+    assert (folder / "a2c-LunarLander-v3.toml").exists()
 
 
 @pytest.mark.slow

@@ -1,0 +1,59 @@
+"""What results come from: software, commit, and the kind of machine."""
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import udrl
+
+#: Packages whose version may change a result.
+_PACKAGES = (
+    "Box2D", "box2d-py", "eclipse-zenoh", "gymnasium", "numpy", "ray", "stable-baselines3", "torch",
+    "vizdoom",
+)  # fmt: skip
+
+
+def provenance() -> dict[str, Any]:
+    """Return what software and what kind of machine results come from."""
+    versions = {"udrl": udrl.__version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "commit": _commit(),
+        "versions": versions,
+        "machine": {"processor": _processor(), "cores": len(os.sched_getaffinity(0)),
+                    "system": f"{platform.system()} {platform.machine()}"},
+    }  # fmt: skip
+
+
+def _commit() -> str:
+    """Return the commit of the code, if Git keeps it here."""
+    here = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here.parent), *arguments]
+        return subprocess.run(  # noqa: S603 - git, with our own arguments
+            command, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", here.name)  # not a checkout that we are installed in
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + (" and changes" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor())
