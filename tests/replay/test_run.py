@@ -452,14 +452,16 @@ def test_cancelled_command_is_refused_until_the_run_goes_on(
 def test_resumed_run_completes_what_had_arrived_before_its_end(
     make_run: MakeRun, reopened: MakeRun
 ) -> None:
-    run = make_run(lead=1, max_env_steps=11)
+    run = make_run(lead=1)
     work(run)
+    budget = run.progress.env_steps + 1  # iteration 1 reaches it
+    run = reopened(run, Budget(max_env_steps=budget))
     run.add_version(train_next(run), 0.0)
     *others, last = [c for c in outstanding(run) if c.iteration == 1]
     for command in [*others, *(c for c in outstanding(run) if c.iteration == 2), last]:
         deliver(run, command)
     assert (run.progress.state, run.progress.iteration) == ("closing", 1)
-    run = reopened(run, Budget(max_env_steps=40))
+    run = reopened(run, Budget(max_env_steps=budget + 40))
     assert (run.progress.state, run.progress.iteration) == ("running", 2)
 
 
