@@ -99,7 +99,7 @@ def run(
         All evaluations.
 
     Raises:
-        ConfigError: the folder holds another run, or Stable-Baselines3 is not installed.
+        ConfigError: Stable-Baselines3 is not installed.
         UnsupportedEnvironment: the environment cannot be made or is not supported.
         EnvironmentFault: the environment failed repeatedly in an evaluation.
         InvalidData: what the folder holds is damaged.
@@ -110,7 +110,7 @@ def run(
     from udrl_experiments import policies
 
     torch.set_num_threads(1)
-    _claim(folder, baseline)
+    folder.mkdir(parents=True, exist_ok=True)
     config, hyperparameters = settle(baseline.config), baseline.complete()
     path = folder / "state.safetensors"
     held: dict[str, Tensor] = {}
@@ -181,35 +181,6 @@ def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> l
         config = msgspec.structs.replace(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec.max_episode_steps)
     return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
-
-
-def read_baseline(folder: Path) -> Baseline:
-    """Return the baseline of a folder.
-
-    Raises:
-        InvalidData: there is none.
-    """
-    path = folder / "baseline.json"
-    with _reading(path):
-        return msgspec.json.decode(path.read_bytes(), type=Baseline)
-
-
-def _claim(folder: Path, baseline: Baseline) -> None:
-    path = folder / "baseline.json"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        _put(path, msgspec.json.format(msgspec.json.encode(baseline)))
-    elif read_baseline(folder) != baseline:
-        raise ConfigError(
-            f"{path} describes another run than the one that is asked for; choose another folder"
-        )
-
-
-def _put(path: Path, content: bytes) -> None:
-    """Write a file; it is there whole or not at all."""
-    aside = path.with_name(path.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, path)
 
 
 def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:

@@ -13,6 +13,8 @@ from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Place, Study
 from udrl_experiments.tuned import tuned
 
+_PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
+
 
 def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
@@ -81,8 +83,13 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, place: Place) -> 
     )
 
 
-def draw_curves(folder: Path, title: str, landmarks: Mapping[str, float]) -> None:
+def draw_curves(
+    folder: Path,
+    title: str,
+    landmarks: Mapping[str, float],
+    x: Literal["env_steps", "wall_s"] = "env_steps",
+) -> None:
     """Draw the curves from their table alone."""
     points = read(folder / "curves.csv", CurvePoint)
-    picture = figures.learning_curves(points, title, references=landmarks)
-    figures.save(picture, folder / "learning-curves")
+    picture = figures.learning_curves(points, title, x=x, references=landmarks)
+    figures.save(picture, folder / _PICTURES[x])

@@ -5,16 +5,12 @@ calls for a study of other ways to choose exploratory commands, and lead is ours
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from udrl.strategies import STRATEGIES
-from udrl_experiments import figures
-from udrl_experiments.comparison import report_curves
+from udrl_experiments.comparison import draw_curves, report_curves
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
-from udrl_experiments.records import read
-from udrl_experiments.statistics import CurvePoint
 from udrl_experiments.study import Place, Study
 
 #: Env steps of a run at the small scale.
@@ -80,16 +76,9 @@ def _variants(
             title = f"{task.title}: {name}"
             said.append(report_curves(runs, task, title, here))
             if wall_time:
-                draw_wall_time(folder, title, task.landmarks)
+                draw_curves(folder, title, task.landmarks, "wall_s")
         return "\n".join(said)
 
     # A time that was measured beside other runs, or by other code, is not comparable.
     every = [job for runs in jobs.values() for job in runs]
     return Study(name, every, report, shares_runs=not wall_time)
-
-
-def draw_wall_time(folder: Path, title: str, landmarks: Mapping[str, float]) -> None:
-    """Draw the curves against wall time, from their table alone."""
-    points = read(folder / "curves.csv", CurvePoint)
-    picture = figures.learning_curves(points, title, x="wall_s", references=landmarks)
-    figures.save(picture, folder / "learning-curves-wall-time")

@@ -349,12 +349,6 @@ def test_damaged_state(damage: str, tmp_path: Path) -> None:
         run(baseline("DQN"), 400, tmp_path)
 
 
-def test_a_folder_of_another_run(tmp_path: Path) -> None:
-    run(baseline("DQN"), 100, tmp_path)
-    with pytest.raises(ConfigError, match=r"baseline\.json describes another run"):
-        run(baseline("DQN", seed=2), 100, tmp_path)
-
-
 @pytest.mark.parametrize(
     ("hyperparameters", "message"),
     [
