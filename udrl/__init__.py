@@ -10,6 +10,7 @@ Algorithm 1                       :mod:`udrl.algorithm1`
 2.3.4 exploratory commands        :mod:`udrl.commands`
 2.3.5 experience, Algorithm 2     :mod:`udrl.acting`
 2.3.6 evaluation                  :mod:`udrl.commands`, :mod:`udrl.evaluation`
+Algorithm 2, step by step         :mod:`udrl.policy`, :mod:`udrl.rollout`
 3.1, 3.4 environments             :mod:`udrl.environments`
 Table 2 hyperparameters           :mod:`udrl.config`
 ================================  ======================================

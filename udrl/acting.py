@@ -47,6 +47,54 @@ _FIRST_BYTES = 64 << 20
 _Rows = npt.NDArray[np.int64]
 
 
+class CommandReader:
+    """What the network reads of a command: bounded and scaled (sections 2.3.2 and 3.1).
+
+    Args:
+        config: ``desired_horizon``, ``return_scale``, ``horizon_scale``.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._horizon_is_return = config.desired_horizon == "return"
+        self._least = np.array([1.0 if self._horizon_is_return else -np.inf, 1.0])
+        self._scales = np.array([config.return_scale, config.horizon_scale])
+
+    def __call__(
+        self, desired: npt.NDArray[np.float64], out: npt.NDArray[np.float32]
+    ) -> npt.NDArray[np.float32]:
+        """Write what is read of ``desired`` to ``out``, and return it.
+
+        Args:
+            desired: (desired return, desired horizon), float64 [n, 2]. Where horizons follow from
+                returns they are set here.
+            out: float32 [n, 2].
+        """
+        if self._horizon_is_return:
+            np.floor(desired[:, 0], out=desired[:, 1])
+        np.multiply(np.maximum(desired, self._least), self._scales, out=out, casting="same_kind")
+        return out
+
+
+def sample(
+    logits: npt.NDArray[np.float64],
+    temperature: npt.NDArray[np.float64],
+    uniforms: npt.NDArray[np.float64],
+) -> npt.NDArray[np.int64]:
+    """Return one action for each row, by inverse CDF.
+
+    Args:
+        logits: of P(a | s, c), float64 [n, n_actions].
+        temperature: logits are divided by it, float64 [n, 1], more than 0.
+        uniforms: float64 [n] in [0, 1).
+    """
+    below = logits - np.maximum.reduce(logits, axis=1, keepdims=True)
+    weights = np.exp(below / temperature)
+    cumulative = np.add.accumulate(weights, axis=1)
+    threshold = uniforms * cumulative[:, -1]
+    actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)
+    return np.minimum(actions, logits.shape[1] - 1, out=actions)
+
+
 class Failure(NamedTuple):
     """An episode that could not be finished, through the environment's fault."""
 
@@ -107,9 +155,7 @@ class EpisodeGenerator:
         self._logits = np.zeros((n_environments, self.spec.n_actions))
         self._temperature = np.ones((n_environments, 1))
         self._cap = np.full(n_environments, np.inf)
-        self._horizon_is_return = config.desired_horizon == "return"
-        self._least = np.array([1.0 if self._horizon_is_return else -np.inf, 1.0])
-        self._scales = np.array([config.return_scale, config.horizon_scale])
+        self._read = CommandReader(config)
 
         # A ring of rounds: round k of all environments is kept at k % capacity, until the longest
         # running episode needs more.
@@ -215,11 +261,7 @@ class EpisodeGenerator:
         desired, command, logits = self._desired, self._command, self._logits
         if self.spec.max_return is not None:
             np.minimum(desired[:, 0], self._cap, out=desired[:, 0])
-        if self._horizon_is_return:
-            np.floor(desired[:, 0], out=desired[:, 1])
-        np.multiply(
-            np.maximum(desired, self._least), self._scales, out=command, casting="same_kind"
-        )
+        self._read(desired, out=command)
         if self._calls is None:
             self._calls = self._plan_calls()
         observation = self._observation if self._frame_stack == 1 else self._stacks()
@@ -229,12 +271,7 @@ class EpisodeGenerator:
                 observation.take(padded, axis=0, out=observation_in, mode="clip")
                 command.take(padded, axis=0, out=command_in, mode="clip")
                 logits[rows] = act(self._observation_in, self._command_in).numpy()[: len(rows)]
-        below = logits - np.maximum.reduce(logits, axis=1, keepdims=True)
-        weights = np.exp(below / self._temperature)
-        cumulative = np.add.accumulate(weights, axis=1)
-        threshold = uniforms * cumulative[:, -1]
-        actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)
-        np.minimum(actions, self.spec.n_actions - 1, out=actions)
+        actions = sample(logits, self._temperature, uniforms)
         if self._greedy:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
         return actions

@@ -1,0 +1,133 @@
+import math
+from typing import Any
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+import pytest
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import initialise
+from udrl.commands import Command
+from udrl.config import Config, build
+from udrl.environments import Environment, make_environment, specify
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.policy import Policy
+from udrl.rollout import Rollout
+from udrl.streams import Purpose, stream_key
+
+
+def command(**values: Any) -> Command:
+    usual: dict[str, Any] = {
+        "id": 7,
+        "kind": "evaluate",
+        "desired_return": 80.0,
+        "desired_horizon": 60,
+        "environment_seed": 11,
+        "stream_key": stream_key(1, Purpose.EPISODE, 1, 7),
+        "weights_version": 1,
+        "max_steps": 300,
+    }
+    return Command(**(usual | values))
+
+
+def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Environment]:
+    config = build(Config, {"environment": environment, "hidden": [16, 16]} | values)
+    env = make_environment(config)
+    spec = specify(env, config)
+    return Policy(initialise(config, spec), config, spec), env
+
+
+@pytest.mark.parametrize(
+    ("told", "settings"),
+    [
+        ({}, {}),
+        ({"temperature": 0.0}, {}),
+        ({"temperature": 0.4}, {"max_return": 20.0}),
+        ({"max_steps": 12}, {"frame_stack": 4}),
+        ({"desired_return": 40.7}, {"desired_horizon": "return"}),
+        ({"kind": "explore", "desired_return": 500.0}, {"max_return": 20.0}),
+    ],
+)
+def test_left_alone_it_makes_the_episode_of_its_command(
+    told: dict[str, Any], settings: dict[str, Any]
+) -> None:
+    policy, env = agent(**settings)
+    order = command(**told)
+    (expected,) = generate_episodes(EpisodeGenerator(policy.config, 3), [order], policy.behavior)
+    rollout = Rollout(policy, env, order)
+    actions, rewards = [], []
+    while not rollout.over:
+        rewards.append(rollout.step())
+        actions.append(rollout.action)
+    assert actions == expected.actions.tolist()
+    assert rewards == expected.rewards.tolist()
+    assert rollout.episode_return == expected.episode_return
+    assert (rollout.terminated, rollout.truncated) == (expected.terminated, expected.truncated)
+    assert rollout.steps == expected.length
+
+
+def test_the_command_counts_down() -> None:
+    policy, env = agent()
+    rollout = Rollout(policy, env, command())
+    for _ in range(3):
+        rollout.step()
+    assert (rollout.desired_return, rollout.desired_horizon) == (77.0, 57)
+
+
+def test_a_command_given_on_the_way_is_what_the_next_action_follows() -> None:
+    policy, env = agent()
+    rollout = Rollout(policy, env, command())
+    rollout.step()
+    observation = rollout._recent[-1]
+    rollout.tell(500.0, 9)
+    rollout.temperature = 0.5
+    assert rollout.probabilities.tolist() == (
+        policy.probabilities(observation, 500.0, 9, temperature=0.5).tolist()
+    )
+    rollout.step()
+    assert (rollout.desired_return, rollout.desired_horizon) == (499.0, 8)
+
+
+def test_what_is_told_is_bounded_as_in_evaluations() -> None:
+    policy, env = agent(max_return=100.0)
+    rollout = Rollout(policy, env, command(desired_return=300.0))
+    assert rollout.desired_return == 100.0
+    policy, env = agent(desired_horizon="return")
+    rollout = Rollout(policy, env, command(desired_return=33.9))
+    assert rollout.desired_horizon == math.floor(33.9)
+
+
+def test_a_picture_is_what_the_environment_renders() -> None:
+    policy, _ = agent()
+    kwargs = {"render_mode": "rgb_array"}
+    env = make_environment(msgspec.structs.replace(policy.config, environment_kwargs=kwargs))
+    rollout = Rollout(policy, env, command())
+    before = rollout.picture()
+    for _ in range(5):
+        rollout.step()
+    assert before.dtype == np.uint8
+    assert before.shape == rollout.picture().shape
+    assert (before != rollout.picture()).any()
+    env.close()
+
+
+def test_an_environment_that_renders_nothing_is_told_so() -> None:
+    policy, env = agent()
+    with (
+        pytest.warns(UserWarning, match="render"),
+        pytest.raises(UnsupportedEnvironment, match=r"'CartPole-v1' shows no picture.*rgb_array"),
+    ):
+        Rollout(policy, env, command()).picture()
+
+
+class Broken(gym.Wrapper[Any, Any, Any, Any]):
+    def step(self, action: Any) -> Any:
+        raise RuntimeError("the wheels came off")
+
+
+def test_an_environment_that_breaks_is_named() -> None:
+    policy, env = agent()
+    rollout = Rollout(policy, Broken(env), command())
+    with pytest.raises(EnvironmentFault, match=r"step\(\), 0 steps.*seed 11.*wheels came off"):
+        rollout.step()

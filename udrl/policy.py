@@ -1,0 +1,152 @@
+"""A trained agent to act with: an observation and an order in, an action out."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from udrl.acting import CommandReader, sample
+from udrl.behavior import BehaviorFunction, stacked_shape
+from udrl.config import Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.errors import InvalidData
+
+
+class Policy:
+    """A behavior function with the settings that say how to ask it (section 2.3.2).
+
+    It has no memory: the same arguments give the same distribution, to the bit the one that
+    Algorithm 2 samples from (:mod:`udrl.acting`).
+
+    Args:
+        behavior: B(s, c; theta).
+        config: the settings that it was trained with.
+        spec: of its environment.
+        rng: draws the actions; None: seeded by the operating system.
+    """
+
+    def __init__(
+        self,
+        behavior: BehaviorFunction,
+        config: Config,
+        spec: EnvironmentSpec,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self.behavior = behavior
+        self.config = config
+        self.spec = spec
+        self.observation_shape = stacked_shape(spec, config)
+        self._rng = rng or np.random.default_rng()
+        self._act = behavior.frozen()
+        self._read = CommandReader(config)
+        # As many rows as in a run, all alike: fewer may round differently.
+        rows = config.inference_rows
+        self._observation_in = torch.from_numpy(
+            np.zeros((rows, *self.observation_shape), spec.observation_dtype)
+        )
+        self._command_in = torch.zeros(rows, 2)
+
+    def logits(
+        self, observation: npt.ArrayLike, desired_return: float, desired_horizon: float
+    ) -> npt.NDArray[np.float64]:
+        """Return the logits of P(a | s, c).
+
+        Args:
+            observation: what the environment shows. With a ``frame_stack`` of more than 1 the most
+                recent ones, the newest last, as ``gymnasium.wrappers.FrameStackObservation`` stacks
+                them.
+            desired_return: what is still to be obtained.
+            desired_horizon: in how many steps; less than 1 counts as 1. It is not read where the
+                horizon follows from the return (``desired_horizon = "return"``).
+
+        Returns:
+            float64 [n_actions].
+
+        Raises:
+            InvalidData: the observation has another shape than those it was trained on, or
+                something is not finite.
+        """
+        seen = np.asarray(observation)
+        stacks = (self.config.frame_stack, *self.spec.observation_shape)
+        if seen.shape not in (self.observation_shape, stacks):
+            raise InvalidData(
+                f"an observation of shape {seen.shape}: expected {self.observation_shape}; show "
+                f"the policy what it was trained on ({self.config.environment})"
+            )
+        desired = np.array([[desired_return, desired_horizon]], np.float64)
+        if not (np.isfinite(desired).all() and np.isfinite(seen).all()):
+            raise InvalidData(
+                f"desired return {desired_return}, desired horizon {desired_horizon}: these and "
+                f"the observation must be finite numbers"
+            )
+        self._observation_in.numpy()[:] = seen.reshape(self.observation_shape)
+        self._command_in.numpy()[:] = self._read(desired, np.empty((1, 2), np.float32))
+        with torch.inference_mode():
+            logits = self._act(self._observation_in, self._command_in)[0].numpy()
+        return logits.astype(np.float64)
+
+    def probabilities(
+        self,
+        observation: npt.ArrayLike,
+        desired_return: float,
+        desired_horizon: float,
+        temperature: float = 1.0,
+    ) -> npt.NDArray[np.float64]:
+        """Return P(a | s, c), float64 [n_actions]; arguments and errors as of :meth:`logits`.
+
+        Args:
+            observation: see :meth:`logits`.
+            desired_return: likewise.
+            desired_horizon: likewise.
+            temperature: logits are divided by it; 0: all on the mode.
+        """
+        logits = self.logits(observation, desired_return, desired_horizon)
+        return probabilities(logits, temperature)
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        desired_return: float,
+        desired_horizon: float,
+        *,
+        temperature: float = 1.0,
+        deterministic: bool = False,
+    ) -> int:
+        """Return an action of P(a | s, c); arguments and errors as of :meth:`logits`.
+
+        Who acts counts down: after a reward r ask for ``desired_return - r`` within
+        ``desired_horizon - 1`` steps (Algorithm 2).
+
+        Args:
+            observation: see :meth:`logits`.
+            desired_return: likewise.
+            desired_horizon: likewise.
+            temperature: logits are divided by it; 0: take the mode.
+            deterministic: the same as a temperature of 0.
+        """
+        logits = self.logits(observation, desired_return, desired_horizon)
+        return choose(logits, 0.0 if deterministic else temperature, self._rng.random())
+
+
+def probabilities(logits: npt.NDArray[np.float64], temperature: float) -> npt.NDArray[np.float64]:
+    """Return the distribution over actions, float64 [n_actions], for logits of the same shape."""
+    weights = np.exp((logits - logits.max()) / (temperature or 1.0))
+    if temperature == 0:
+        weights = np.eye(len(logits))[logits.argmax()]
+    shares: npt.NDArray[np.float64] = weights / weights.sum()
+    return shares
+
+
+def choose(logits: npt.NDArray[np.float64], temperature: float, uniform: float) -> int:
+    """Return the action that Algorithm 2 takes for logits, float64 [n_actions].
+
+    Args:
+        logits: of P(a | s, c).
+        temperature: logits are divided by it; 0: take the mode.
+        uniform: the number in [0, 1) that decides.
+    """
+    if temperature == 0:
+        return int(logits.argmax())
+    divisor: Any = np.array([[temperature]])
+    return int(sample(logits[None], divisor, np.array([uniform]))[0])

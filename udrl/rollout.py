@@ -1,0 +1,142 @@
+"""Algorithm 2 one step at a time, for whoever watches, and may say something else on the way.
+
+:mod:`udrl.acting` carries out thousands of commands, each to its end; this carries out one. Left
+alone it makes the same episode, to the bit.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from udrl.commands import Command
+from udrl.environments.making import Environment, limit_steps
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.policy import Policy, choose, probabilities
+from udrl.streams import Stream
+
+Result = TypeVar("Result")
+
+#: Random numbers that are drawn at once.
+_AT_A_TIME = 256
+
+
+class Rollout:
+    """One episode.
+
+    Args:
+        policy: the agent.
+        env: its environment, from :func:`udrl.environments.make_environment`.
+        command: the order, the seeds and the temperature.
+
+    Attributes:
+        desired_return: what is still to be obtained, after the countdown.
+        desired_horizon: the steps that are left for it.
+        temperature: of the next actions; may be set.
+        steps: taken so far.
+        episode_return: obtained so far, a sequential sum in float64.
+        terminated: the environment reached a terminal state.
+        truncated: a time limit ended the episode.
+        action: the last one; None before the first.
+
+    Raises:
+        EnvironmentFault: the environment raised an exception.
+    """
+
+    def __init__(self, policy: Policy, env: Environment, command: Command) -> None:
+        self.command = command
+        self.temperature = command.temperature
+        self.steps = 0
+        self.episode_return = 0.0
+        self.terminated = self.truncated = False
+        self.action: int | None = None
+        self._policy = policy
+        self._env = env
+        self._cap = policy.spec.max_return if command.kind == "evaluate" else None
+        self._stream = Stream(command.stream_key)
+        self._uniforms: deque[float] = deque()
+        limit_steps(env, command.max_steps)
+        observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
+        n = policy.config.frame_stack
+        self._recent = deque([self._plain(observation)] * n, maxlen=n)
+        self.tell(command.desired_return, command.desired_horizon)
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.terminated or self.truncated
+
+    @property
+    def probabilities(self) -> npt.NDArray[np.float64]:
+        """P(a | s_t, c_t), float64 [n_actions]: what the next action is sampled from."""
+        return probabilities(self._logits(), self.temperature)
+
+    def tell(self, desired_return: float, desired_horizon: int) -> None:
+        """Give another order from here on."""
+        self.desired_return = desired_return
+        self.desired_horizon = desired_horizon
+        self._bound()
+
+    def step(self) -> float:
+        """Take one action and return its reward; the episode must not be over.
+
+        Raises:
+            EnvironmentFault: the environment raised an exception.
+        """
+        assert not self.over
+        if not self._uniforms:
+            self._uniforms.extend(self._stream.uniforms(_AT_A_TIME).tolist())
+        self.action = action = choose(self._logits(), self.temperature, self._uniforms.popleft())
+        observation, reward, self.terminated, self.truncated, _ = self._carefully(
+            "step", lambda: self._env.step(action)
+        )
+        self._recent.append(self._plain(observation))
+        reward = float(np.float32(reward))
+        self.steps += 1
+        self.episode_return += reward
+        self.desired_return -= reward
+        self.desired_horizon -= 1
+        self._bound()
+        return reward
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """Return what a spectator sees now, uint8 [height, width, 3].
+
+        Raises:
+            UnsupportedEnvironment: the environment was not made with a ``render_mode`` of
+                ``rgb_array``, or has none.
+        """
+        picture = self._carefully("render", self._env.render)
+        if not isinstance(picture, np.ndarray) or picture.ndim != 3:
+            raise UnsupportedEnvironment(
+                f"environment {self._policy.config.environment!r} shows no picture; it has to be "
+                f"made with render_mode='rgb_array', and to support that"
+            )
+        return picture
+
+    def _bound(self) -> None:
+        if self._cap is not None:
+            self.desired_return = min(self.desired_return, self._cap)
+        if self._policy.config.desired_horizon == "return":
+            self.desired_horizon = math.floor(self.desired_return)
+
+    def _logits(self) -> npt.NDArray[np.float64]:
+        return self._policy.logits(
+            np.stack(self._recent), self.desired_return, self.desired_horizon
+        )
+
+    def _plain(self, observation: Any) -> npt.NDArray[Any]:
+        """Return an observation of one's own, in the dtype that the network was trained on."""
+        return np.array(observation, self._policy.spec.observation_dtype)
+
+    def _carefully(self, where: str, call: Callable[[], Result]) -> Result:
+        try:
+            return call()
+        except Exception as error:
+            raise EnvironmentFault(
+                f"the environment failed in {where}(), {self.steps} steps into the episode of seed "
+                f"{self.command.environment_seed}: {type(error).__name__}: {error}"
+            ) from error
