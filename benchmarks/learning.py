@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-from udrl_launch.inspection import evaluate, load_agent, read_status
+from udrl_launch.agents import evaluate, load_agent
+from udrl_launch.inspection import read_status
 from udrl_proto.messages import Status
 
 ENVIRONMENTS = ("LunarLander-v3", "LunarLanderSparse-v3", "CartPole-v1")

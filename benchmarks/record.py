@@ -22,7 +22,7 @@ from udrl.commands import CommandSampler
 from udrl.config import Config
 from udrl.environments import Environment, make_environment
 from udrl.numerics import use_one_thread
-from udrl_launch.inspection import load_agent
+from udrl_launch.agents import load_agent
 
 
 class Filmed(gym.Wrapper[Any, Any, Any, Any]):

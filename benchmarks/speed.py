@@ -44,7 +44,8 @@ from udrl.numerics import use_one_thread
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
-from udrl_launch.inspection import load_agent, status_of
+from udrl_launch.agents import load_agent
+from udrl_launch.inspection import status_of
 from udrl_launch.process import keep_freed_memory
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello

@@ -92,7 +92,8 @@ def sample(
     cumulative = np.add.accumulate(weights, axis=1)
     threshold = uniforms * cumulative[:, -1]
     actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)
-    return np.minimum(actions, logits.shape[1] - 1, out=actions)
+    np.minimum(actions, logits.shape[1] - 1, out=actions)
+    return actions
 
 
 class Failure(NamedTuple):

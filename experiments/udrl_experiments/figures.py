@@ -1,7 +1,6 @@
 """The pictures of the studies, drawn from tidy tables alone, in the layout of the paper's figures.
 
-Colours are those of Okabe and Ito, which the colour-blind can tell apart; every line has a dash
-pattern and marker of its own as well, so that a figure can be read in grey.
+They can be read in grey and by the colour-blind (:mod:`udrl_launch.styles`).
 """
 
 import itertools
@@ -14,16 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from udrl.errors import ConfigError
 from udrl_experiments.records import Obtained
 from udrl_experiments.statistics import CurvePoint
+from udrl_launch.styles import line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: The palette without its yellow, which is too light for a line on white.
-_COLOURS = ("#009E73", "#0072B2", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-# Their numbers have no common divisor: 36 lines pass before a pair comes again.
-_DASHES = ("-", "--", "-.", ":")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "h")
 #: Algorithms that look the same in every figure; UDRL is green as in the paper.
 _OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2}
 
@@ -161,13 +156,7 @@ def _styles(algorithms: Sequence[str]) -> Iterator[dict[str, Any]]:
     others = (rank for rank in itertools.count() if rank not in taken)
     for algorithm in algorithms:
         rank = own.pop(algorithm) if algorithm in own else next(others)
-        yield {
-            "color": _COLOURS[rank % len(_COLOURS)],
-            "linestyle": _DASHES[rank % len(_DASHES)],
-            "marker": _MARKERS[rank % len(_MARKERS)],
-            "markersize": 5,
-            "linewidth": 1.5,
-        }
+        yield line_style(rank)
 
 
 def _legend(figure: "Figure", axes: "Axes", title: str) -> None:

@@ -10,7 +10,8 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained, read, write
 from udrl_experiments.study import Place, Study
-from udrl_launch.inspection import Agent, evaluate, load_agent, read_status
+from udrl_launch.agents import Agent, evaluate, load_agent
+from udrl_launch.inspection import read_status
 
 #: Episodes a point.
 EPISODES = 100

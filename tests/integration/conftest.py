@@ -12,7 +12,7 @@ from udrl.config import Budget, Config
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status
-from whole_run import Cli, assert_conserved
+from whole_run import Cli, assert_conserved, small
 
 
 @pytest.fixture
@@ -53,6 +53,15 @@ def run(tmp_path: Path) -> Callable[..., Status]:
         return status
 
     return runner
+
+
+@pytest.fixture(scope="session")
+def ended_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of a short run on CartPole; nobody changes it."""
+    run_dir = tmp_path_factory.mktemp("ended") / "cart"
+    settings = Settings(small(), Budget(max_env_steps=3000), Fleet(actors=1, envs_per_actor=16))
+    assert train(settings, run_dir, threading.Event(), in_process=True).state == "ended"
+    return run_dir
 
 
 @pytest.fixture

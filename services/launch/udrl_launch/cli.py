@@ -17,10 +17,14 @@ _COMMANDS = {
     "learner": "udrl_launch.commands.services",
     "actor": "udrl_launch.commands.services",
     "evaluate": "udrl_launch.commands.looking",
+    "play": "udrl_launch.commands.playing",
     "reproduce": "udrl_launch.commands.looking",
     "status": "udrl_launch.commands.looking",
+    "runs": "udrl_launch.commands.runs",
+    "plot": "udrl_launch.commands.runs",
     "health": "udrl_launch.commands.health",
     "keys": "udrl_launch.commands.keys",
+    "completion": "udrl_launch.commands.completion",
     # It stands above this package, and imports it.
     "study": "udrl_experiments.command",
 }

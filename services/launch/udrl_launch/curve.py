@@ -1,43 +1,130 @@
-"""The picture of a learning curve, drawn from ``metrics.csv`` alone."""
+"""Pictures of learning curves, drawn from ``metrics.csv`` alone."""
 
 import csv
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from udrl.errors import ConfigError
+from udrl.errors import ConfigError, StoreError
+from udrl_launch.styles import line_style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Row = Mapping[str, str]
+
+_X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
+#: What matplotlib can write.
+_KINDS = (".png", ".svg", ".pdf")
 
 
 def draw(run_dir: Path, title: str) -> Path:
-    """Draw evaluation returns against env steps into the run's directory; return the picture.
+    """Draw a run's returns against env steps into its directory; return the picture.
 
     Raises:
         ConfigError: matplotlib is not installed.
+        StoreError: the run has no metrics.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            'the learning curve needs matplotlib; install it with: pip install "udrl[plot]"'
-        ) from error
-    with (run_dir / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    figure = Figure(figsize=(7, 4.3), layout="constrained")
-    axes = figure.add_subplot()
+    rows = _read(run_dir)
+    figure, axes = _empty()
     steps = [int(r["env_steps"]) for r in rows]
     for name, label, style in (
         ("return_mean", "mean of the replay buffer", "--"),
         ("explored_return", "exploratory episodes, mean of an iteration", ":"),
     ):
-        axes.plot(steps, [float(r[name]) for r in rows], style, color="0.6", label=label, lw=1)
+        returns = [float(r[name] or "nan") for r in rows]
+        axes.plot(steps, returns, style, color="0.6", label=label, lw=1)
+    _evaluations(axes, rows, "env_steps", "evaluation, mean and 95 % interval", rank=1)
+    axes.set(xlabel="env steps", ylabel="return", title=title)
+    axes.legend(fontsize="small")
+    picture = run_dir / "learning_curve.png"
+    _save(figure, picture)
+    return picture
+
+
+def compare(
+    run_dirs: Sequence[Path], picture: Path, x: Literal["env_steps", "wall_s"] = "env_steps"
+) -> None:
+    """Draw the evaluations of several runs into one picture.
+
+    Args:
+        run_dirs: at least one; the lines are labelled with as much of the names as tells them
+            apart.
+        picture: ``.png``, ``.svg`` or ``.pdf``.
+        x: what the returns are drawn against.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or another kind of file.
+        StoreError: a run has no metrics, or none has been evaluated.
+    """
+    if picture.suffix not in _KINDS:
+        raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
+    evaluated = {run_dir: [r for r in _read(run_dir) if r["eval_mean"]] for run_dir in run_dirs}
+    if not any(evaluated.values()):
+        names = ", ".join(map(str, run_dirs))
+        raise StoreError(f"nothing to draw: {names}: no evaluation yet; wait for the first")
+    figure, axes = _empty()
+    for rank, (label, rows) in enumerate(zip(_labels(run_dirs), evaluated.values(), strict=True)):
+        _evaluations(axes, rows, x, label, rank)
+    axes.set(xlabel=_X[x][0], ylabel="mean return of an evaluation, 95 % interval")
+    axes.legend(fontsize="small", handlelength=3.5)
+    _save(figure, picture)
+
+
+def _labels(run_dirs: Sequence[Path]) -> list[str]:
+    """Return names that tell runs apart: as few of the last parts of their paths as do."""
+    parts = [run_dir.resolve().parts for run_dir in run_dirs]
+    for n in range(1, max(map(len, parts))):
+        labels = ["/".join(p[-n:]) for p in parts]
+        if len(set(labels)) == len(set(parts)):
+            return labels
+    return [str(run_dir) for run_dir in run_dirs]
+
+
+def _read(run_dir: Path) -> list[Row]:
+    path = run_dir / "metrics.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise StoreError(f"{path}: {error.strerror}; name the directory of a run") from error
+
+
+def _empty() -> "tuple[Figure, Axes]":
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            'learning curves need matplotlib; install it with: pip install "udrl[plot]"'
+        ) from error
+    figure = Figure(figsize=(7, 4.3), layout="constrained")
+    axes = figure.add_subplot()
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def _evaluations(axes: "Axes", rows: Sequence[Row], x: str, label: str, rank: int) -> None:
+    """Draw the mean returns of a run's evaluations with their intervals."""
     evaluated = [r for r in rows if r["eval_mean"]]
-    at = [int(r["eval_at_env_steps"]) for r in evaluated]
+    unit = _X[x][1]
+    column = "eval_at_env_steps" if x == "env_steps" else x
+    at = [float(r[column]) / unit for r in evaluated]
     low, mean, high = (
         [float(r[n]) for r in evaluated] for n in ("eval_ci95_low", "eval_mean", "eval_ci95_high")
     )
-    axes.fill_between(at, low, high, color="C0", alpha=0.25, lw=0)
-    axes.plot(at, mean, "o-", color="C0", ms=3, label="evaluation, mean and 95 % interval")
-    axes.set(xlabel="env steps", ylabel="return", title=title)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
-    picture = run_dir / "learning_curve.png"
-    figure.savefig(picture, dpi=130)
-    return picture
+    style = line_style(rank)
+    axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
+    axes.plot(at, mean, label=label, markevery=max(1, len(at) // 10), **style)
+
+
+def _save(figure: "Figure", picture: Path) -> None:
+    """Write a picture; it is there as a whole or not at all."""
+    aside = picture.with_name(f"{picture.name}.part")
+    try:
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(aside, format=picture.suffix[1:], dpi=130)
+        os.replace(aside, picture)
+    except OSError as error:
+        raise ConfigError(f"{picture}: {error.strerror}; name a file you may write") from error

@@ -371,6 +371,11 @@ class Store:
             Evaluation(*found),
         )
 
+    def best_evaluation(self) -> float | None:
+        """Return the greatest mean return of an evaluation, closing ones included."""
+        ((best,),) = self._rows("SELECT max(mean) FROM evaluations")
+        return None if best is None else float(best)
+
     def metrics(self, after: int) -> list[tuple[Any, ...]]:
         """Return the rows of ``metrics.csv`` of iterations after ``after``."""
         return self._rows(

@@ -2,26 +2,17 @@
 
 import traceback
 from pathlib import Path
-from typing import Literal
 
 import click
 import msgspec
 
 from udrl.errors import ConfigError, EnvironmentFault
-from udrl_launch import inspection
+from udrl_launch import agents, inspection
 from udrl_launch.address import Address
-from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
+from udrl_launch.commands.options import KEYS, RUN, RUN_DIR, WEIGHTS, version
 from udrl_launch.display import panel
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
-
-
-def _version(text: str) -> int | Literal["latest", "best"]:
-    if text == "latest" or text == "best":
-        return text  # type: ignore[return-value]
-    if text.isdecimal():
-        return int(text)
-    raise ConfigError(f"--weights {text}: expected latest, best or a version number")
 
 
 @click.command()
@@ -34,8 +25,7 @@ def _version(text: str) -> int | Literal["latest", "best"]:
 @click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
 @click.option("--desired-return", type=float, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
-@click.option("--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
-              help="Which of the versions that the run keeps.")  # fmt: skip
+@WEIGHTS
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def evaluate(
     run_dir: Path,
@@ -51,8 +41,8 @@ def evaluate(
 
     Example: udrl evaluate runs/mine --greedy --desired-return 200 --desired-horizon 300
     """
-    agent = inspection.load_agent(run_dir, _version(weights))
-    result = inspection.evaluate(
+    agent = agents.load_agent(run_dir, version(weights))
+    result = agents.evaluate(
         agent, episodes=episodes, temperature=0.0 if greedy else temperature,
         desired_return=desired_return,
         desired_horizon=desired_horizon,
@@ -85,7 +75,7 @@ def reproduce(run_dir: Path, command_id: int) -> int:
     Example: udrl reproduce runs/mine 12000003
     """
     try:
-        episode = inspection.reproduce(run_dir, command_id)
+        episode = agents.reproduce(run_dir, command_id)
     except EnvironmentFault as fault:
         traceback.print_exception(fault.__cause__)
         raise

@@ -1,8 +1,11 @@
 """Options that several commands have."""
 
 from pathlib import Path
+from typing import Literal
 
 import click
+
+from udrl.errors import ConfigError
 
 RUN_DIR = click.Path(path_type=Path, file_okay=False)
 PARENT = click.option("--parent", type=int, hidden=True)
@@ -20,3 +23,20 @@ AUDIT = click.option(
 RUN = click.option(
     "--run", "run_id", metavar="RUN_ID", help="Which run, where a router carries several."
 )
+WEIGHTS = click.option(
+    "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
+    help="Which of the versions that the run keeps.",
+)  # fmt: skip
+
+
+def version(text: str) -> int | Literal["latest", "best"]:
+    """Return what ``--weights`` says.
+
+    Raises:
+        ConfigError: neither a word that it knows, nor a number.
+    """
+    if text == "latest" or text == "best":
+        return text  # type: ignore[return-value]
+    if text.isdecimal():
+        return int(text)
+    raise ConfigError(f"--weights {text}: expected latest, best or a version number")

@@ -1,0 +1,175 @@
+"""Agents of runs: loaded, evaluated, and told one command again."""
+
+import faulthandler
+from contextlib import closing
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import msgspec
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.behavior import BehaviorFunction
+from udrl.checkpoint import decode_weights
+from udrl.commands import Command, CommandSampler
+from udrl.config import Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import ConfigError, StoreError
+from udrl.evaluation import Evaluation, summarise
+from udrl.numerics import use_one_thread
+from udrl.policy import Policy
+from udrl.replay import ReplayBuffer
+from udrl_proto.messages import Hello
+from udrl_replay.run import Progress
+from udrl_replay.store import Store
+
+#: Seconds after which a command that is reproduced shows where it is, again and again.
+_SHOW_S = 60.0
+
+
+class Agent(NamedTuple):
+    """A trained behavior function and the run that it comes from."""
+
+    config: Config
+    environment: EnvironmentSpec
+    version: int
+    behavior: BehaviorFunction
+    buffer: ReplayBuffer
+    iteration: int
+    weights: bytes
+
+    @property
+    def policy(self) -> Policy:
+        """What to act with."""
+        return Policy(self.behavior, self.config, self.environment)
+
+
+def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest") -> Agent:
+    """Return an agent from a run's directory.
+
+    Raises:
+        StoreError: there is no run, or it does not keep that version.
+    """
+    with closing(Store(run_dir, read_only=True)) as store:
+        hello = store.fact("hello", Hello)
+        progress = store.fact("progress", Progress)
+        named = {"latest": progress.latest_version, "best": progress.best_version}
+        wanted = version if isinstance(version, int) else named[version]
+        found = store.version(wanted)
+        if found is None or not found.weights:
+            raise StoreError(
+                f"weights {version!r} are not kept in {run_dir}; kept are versions "
+                f"{store.versions_kept()}"
+            )
+        held = store.buffer(progress.iteration)
+        return Agent(
+            config=hello.config,
+            environment=hello.environment,
+            version=wanted,
+            behavior=decode_weights(found.weights, hello.config, hello.environment),
+            buffer=ReplayBuffer(hello.config, (p.entry for p in held)),
+            iteration=progress.iteration,
+            weights=found.weights,
+        )
+
+
+def reproduce(run_dir: Path, command_id: int) -> Episode:
+    """Carry out one outstanding command of a run.
+
+    Raises:
+        StoreError: there is no such command, or its weights are not kept.
+        EnvironmentFault: the environment failed, with what it raised as the cause.
+    """
+    with closing(Store(run_dir, read_only=True)) as store:
+        config = store.fact("hello", Hello).config
+        outstanding = {c.id: c for c in store.commands(cancelled=False)}
+    if command_id not in outstanding:
+        raise StoreError(f"command {command_id} is not outstanding in {run_dir}")
+    command = outstanding[command_id]
+    version = command.weights_version
+    behavior = load_agent(run_dir, version).behavior if version else None
+    use_one_thread()
+    faulthandler.dump_traceback_later(_SHOW_S, repeat=True)  # it may hang, in native code too
+    try:
+        return generate_episodes(EpisodeGenerator(config, 1), [command], behavior)[0]
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+class Result(NamedTuple):
+    """What an evaluation was told, and what came of it."""
+
+    desired_return: float
+    desired_horizon: int
+    temperature: float
+    evaluation: Evaluation
+    returns: list[float]
+
+
+def evaluation_commands(
+    agent: Agent,
+    *,
+    episodes: int,
+    temperature: float | None = None,
+    desired_return: float | None = None,
+    desired_horizon: int | None = None,
+) -> list[Command]:
+    """Return the commands of an evaluation; what is None is as in the run's closing one (2.3.6).
+
+    Raises:
+        ConfigError: a horizon is given, and the run's horizons follow from the returns.
+    """
+    if agent.config.desired_horizon == "return" and desired_horizon is not None:
+        raise ConfigError(
+            f"desired horizon {desired_horizon}: in this run it is the desired return, as an "
+            f"integer, at every step; give the return only"
+        )
+    if temperature is None:
+        temperature = agent.config.eval_temperature
+    config = msgspec.structs.replace(
+        agent.config, eval_episodes=episodes, eval_temperature=temperature
+    )
+    sampler = CommandSampler(config, agent.environment.max_episode_steps)
+    commands = sampler.close(agent.iteration, agent.buffer)
+    told = commands[0]
+    desired = sampler.desired(
+        told.desired_return if desired_return is None else desired_return,
+        told.desired_horizon if desired_horizon is None else desired_horizon,
+    )
+    return [
+        msgspec.structs.replace(c, desired_return=desired[0], desired_horizon=desired[1])
+        for c in commands
+    ]
+
+
+def evaluate(
+    agent: Agent,
+    *,
+    episodes: int,
+    temperature: float | None = None,
+    desired_return: float | None = None,
+    desired_horizon: int | None = None,
+    environments: int = 16,
+) -> Result:
+    """Evaluate an agent; without a command of its own, by that of section 2.3.6.
+
+    With the run's own settings this repeats its closing evaluation exactly.
+
+    Raises:
+        ConfigError: a horizon is given, and the run's horizons follow from the returns.
+    """
+    commands = evaluation_commands(
+        agent,
+        episodes=episodes,
+        temperature=temperature,
+        desired_return=desired_return,
+        desired_horizon=desired_horizon,
+    )
+    use_one_thread()
+    generator = EpisodeGenerator(agent.config, environments)
+    done = generate_episodes(generator, commands, agent.behavior)
+    generator.close()
+    told, returns = commands[0], [e.episode_return for e in done]
+    return Result(
+        told.desired_return, told.desired_horizon, told.temperature, summarise(returns), returns
+    )

@@ -1,0 +1,98 @@
+"""``udrl play``."""
+
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import click
+import msgspec
+
+from udrl.numerics import use_one_thread
+from udrl_launch.agents import evaluation_commands, load_agent
+from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
+from udrl_launch.playing import filmed, fps_of, with_seed
+from udrl_launch.playing import play as play_episodes
+from udrl_launch.window import KEYS_HELP, Window
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR)
+@click.option("--desired-return", type=float, metavar="R", help="Default: as in section 2.3.6.")
+@click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), metavar="H",
+              help="In how many steps. Default: likewise.")  # fmt: skip
+@click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
+              help="Episodes to play.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1),
+              help="Of the first episode, one more for each that follows. Default: those of the "
+              "run's closing evaluation.")  # fmt: skip
+@click.option("--temperature", type=click.FloatRange(0, 1000),
+              help="Of the action distribution; 0: take its mode. Default: as the run's "
+              "evaluations.")  # fmt: skip
+@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@WEIGHTS
+@click.option("--video", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Film them: FILE.mp4 or FILE.gif.")  # fmt: skip
+@click.option(
+    "--window", "opens_window", is_flag=True,
+    help=f"Watch, and change the command on the way. {KEYS_HELP.capitalize()}.",
+)  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print a line of JSON for each episode.")
+def play(
+    run_dir: Path,
+    desired_return: float | None,
+    desired_horizon: int | None,
+    episodes: int,
+    seed: int | None,
+    temperature: float | None,
+    greedy: bool,
+    weights: str,
+    video: Path | None,
+    opens_window: bool,
+    as_json: bool,
+) -> int:
+    """Give a trained agent an order, and watch.
+
+    Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
+    """
+    agent = load_agent(run_dir, version(weights))
+    commands = evaluation_commands(
+        agent,
+        episodes=episodes,
+        temperature=0.0 if greedy else temperature,
+        desired_return=desired_return,
+        desired_horizon=desired_horizon,
+    )
+    if seed is not None:
+        commands = with_seed(commands, seed)
+    use_one_thread()
+    told = commands[0]
+    if not as_json:
+        click.echo(
+            f"asked for a return of {told.desired_return:.1f} within {told.desired_horizon} steps "
+            f"(temperature {told.temperature:g}, weights version {agent.version})"
+        )
+    with ExitStack() as stack:
+        window = None
+        if opens_window:
+            with closing(filmed(agent.config)) as env:
+                window = stack.enter_context(closing(Window(fps_of(env))))
+        for rollout in play_episodes(agent, commands, video=video, screen=window):
+            if as_json:
+                report = {
+                    "environment_seed": rollout.command.environment_seed,
+                    "desired_return": told.desired_return,
+                    "desired_horizon": told.desired_horizon,
+                    "episode_return": rollout.episode_return,
+                    "length": rollout.steps,
+                    "terminated": rollout.terminated,
+                    "truncated": rollout.truncated,
+                }
+                click.echo(msgspec.json.encode(report).decode())
+            else:
+                ending = "" if rollout.terminated else ", cut by its time limit"
+                click.echo(
+                    f"seed {rollout.command.environment_seed}: obtained "
+                    f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
+                )
+    if video is not None and not as_json:
+        click.echo(f"film: {video}")
+    return 0

@@ -1,0 +1,70 @@
+"""``udrl runs`` and ``udrl plot``: all runs at once."""
+
+import time
+from pathlib import Path
+from typing import Literal
+
+import click
+import msgspec
+
+from udrl_launch import curve
+from udrl_launch.commands.options import RUN_DIR
+from udrl_launch.display import duration
+from udrl_launch.runs import Summary, find
+
+_HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "run"
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path), default=Path("runs"))
+@click.option("--json", "as_json", is_flag=True, help="Print a line of JSON for each run.")
+def runs(folder: Path, as_json: bool) -> int:
+    """List the runs in a folder (./runs), with their state and best return; the newest first.
+
+    Example: udrl runs
+    """
+    found = find(folder)
+    if as_json:
+        for summary in found:
+            click.echo(msgspec.json.encode(summary).decode())
+        return 0
+    if not found:
+        click.echo(f"no runs in {folder}; begin one: udrl train LunarLander-v3", err=True)
+        return 0
+    rows = [_HEAD, *map(_cells, found)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        click.echo("  ".join(cells).rstrip())
+    for summary in found:
+        if summary.problem:
+            click.echo(f"{summary.run_dir}: {summary.problem}", err=True)
+    return 0
+
+
+def _cells(summary: Summary) -> tuple[str, ...]:
+    """Return a line of the table; the directory, which may be long, stands last."""
+    ago = f"{duration(max(0.0, time.time() - summary.changed))} ago"
+    if summary.state == "unreadable":
+        return summary.state, "", "", "", "", ago, summary.run_dir
+    best = "none yet" if summary.best_return is None else f"{summary.best_return:.1f}"
+    steps = f"{summary.env_steps:,} of {summary.max_env_steps:,}"
+    seed = str(summary.seed)
+    return summary.state, summary.environment, seed, steps, best, ago, summary.run_dir
+
+
+@click.command()
+@click.argument("run_dirs", metavar="RUN_DIR...", type=RUN_DIR, nargs=-1, required=True)
+@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              default=Path("learning_curves.png"), show_default=True,
+              help="The picture: .png, .svg or .pdf.")  # fmt: skip
+@click.option("--x", type=click.Choice(["env_steps", "wall_s"]), default="env_steps",
+              show_default=True, help="What returns are drawn against.")  # fmt: skip
+def plot(run_dirs: tuple[Path, ...], output: Path, x: Literal["env_steps", "wall_s"]) -> int:
+    """Draw the learning curves of several runs into one picture.
+
+    Example: udrl plot runs/one runs/other --output both.svg
+    """
+    curve.compare(run_dirs, output, x)
+    click.echo(f"picture: {output}")
+    return 0

@@ -1,0 +1,109 @@
+"""``udrl play``: episodes to look at, in a window or a film, one step at a time."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from udrl.commands import Command
+from udrl.config import Config
+from udrl.environments.making import Environment, make_environment
+from udrl.rollout import Rollout
+from udrl.streams import Purpose, stream_key
+from udrl_launch.agents import Agent
+from udrl_launch.film import Film, Picture
+
+#: Pictures a second where the environment does not say how fast it is.
+_USUAL_FPS = 30.0
+
+
+class Screen(Protocol):
+    """Where pictures are shown while an episode goes on."""
+
+    def show(self, rollout: Rollout, picture: Picture, caption: str) -> bool:
+        """Show a moment of an episode; return whether whoever watches wants to go on."""
+        ...
+
+
+def with_seed(commands: list[Command], seed: int) -> list[Command]:
+    """Return commands whose environments and actions follow from ``seed``, one more for each."""
+    return [
+        msgspec.structs.replace(
+            command,
+            environment_seed=(seed + k) % 2**31,
+            stream_key=stream_key(seed + k, Purpose.EPISODE),
+        )
+        for k, command in enumerate(commands)
+    ]
+
+
+def filmed(config: Config) -> Environment:
+    """Return the environment of a run, made to be looked at.
+
+    Raises:
+        UnsupportedEnvironment: it has no pictures to show.
+    """
+    kwargs = config.environment_kwargs | {"render_mode": "rgb_array"}
+    return make_environment(msgspec.structs.replace(config, environment_kwargs=kwargs))
+
+
+def fps_of(env: Environment) -> float:
+    """Return how many steps a second of an environment's time has."""
+    return float(env.metadata.get("render_fps") or _USUAL_FPS)
+
+
+def play(
+    agent: Agent,
+    commands: list[Command],
+    *,
+    video: Path | None = None,
+    screen: Screen | None = None,
+) -> Iterator[Rollout]:
+    """Carry out commands one after another and yield each episode when it is over.
+
+    Args:
+        agent: who acts.
+        commands: what it is told.
+        video: a film of all episodes.
+        screen: shows them meanwhile, at its own speed, and may end everything.
+
+    Raises:
+        ConfigError: the film cannot be made.
+        EnvironmentFault: the environment raised an exception.
+        UnsupportedEnvironment: there is nothing to look at.
+    """
+    looks = video is not None or screen is not None
+    policy = agent.policy
+    with ExitStack() as stack:
+        make = filmed if looks else make_environment
+        env = stack.enter_context(closing(make(agent.config)))
+        film = stack.enter_context(Film(video, fps_of(env))) if video is not None else None
+        for command in commands:
+            rollout = Rollout(policy, env, command)
+            if not _watch(rollout, film, screen):
+                return
+            yield rollout
+
+
+def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
+    """Carry out one episode; return whether whoever watches saw it to its end."""
+    while True:
+        if film is not None or screen is not None:
+            picture, said = rollout.picture(), caption(rollout)
+            if film is not None:
+                film.add(picture, said)
+            if screen is not None and not screen.show(rollout, picture, said):
+                return False
+        if rollout.over:
+            return True
+        rollout.step()
+
+
+def caption(rollout: Rollout) -> str:
+    """Return what is asked for still, and what has been obtained."""
+    return (
+        f"step {rollout.steps}: obtained {rollout.episode_return:.1f}; asked for "
+        f"{rollout.desired_return:.1f} more within {max(rollout.desired_horizon, 1)} steps"
+    )

@@ -1,0 +1,99 @@
+"""``udrl runs``: what runs there are, and how far they are."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch.inspection import budget_of, served_at
+from udrl_proto.messages import Hello
+from udrl_replay.run import Progress
+from udrl_replay.store import FILE, Store
+
+State = Literal["running", "stopped", "ended", "failed", "unreadable"]
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """A run in one line.
+
+    Attributes:
+        run_dir: its directory.
+        state: ``running``: somebody works on it; ``stopped``: nobody does, and it can go on;
+            ``ended``; ``failed``; ``unreadable``.
+        environment: what it trains on.
+        seed: of the run.
+        env_steps: done so far.
+        max_env_steps: its budget.
+        best_return: the greatest mean return of an evaluation; None: none yet.
+        changed: when its file was last written, seconds since 1970.
+        problem: why it failed, or cannot be read.
+    """
+
+    run_dir: str
+    state: State
+    environment: str = ""
+    seed: int | None = None
+    env_steps: int = 0
+    max_env_steps: int = 0
+    best_return: float | None = None
+    changed: float = 0.0
+    problem: str = ""
+
+
+def find(folder: Path) -> list[Summary]:
+    """Return the runs in a folder and in the folders below it, the newest first.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such directory; name the one that your runs are in")
+    return sorted(map(summarise, _places(folder)), key=lambda s: s.changed, reverse=True)
+
+
+def _places(folder: Path) -> Iterator[Path]:
+    """Yield the directories of runs; what is below one is its own affair."""
+    if (folder / FILE).exists():
+        yield folder
+        return
+    try:
+        below = sorted(f for f in folder.iterdir() if f.is_dir() and not f.is_symlink())
+    except PermissionError:
+        return  # other people's
+    for one in below:
+        yield from _places(one)
+
+
+def summarise(run_dir: Path) -> Summary:
+    """Return a run in one line, whatever state it is in."""
+    # Not the third file that SQLite has there, which readers write too.
+    files = (run_dir / FILE, run_dir / f"{FILE}-wal")
+    changed = max(f.stat().st_mtime for f in files if f.exists())
+    try:
+        with closing(Store(run_dir, read_only=True)) as store:
+            config = store.fact("hello", Hello).config
+            progress = store.fact("progress", Progress)
+            best = store.best_evaluation()
+        state: State = "stopped"
+        if progress.state in ("ended", "failed"):
+            state = progress.state
+        elif served_at(run_dir) is not None:
+            state = "running"
+        return Summary(
+            run_dir=str(run_dir),
+            state=state,
+            environment=config.environment,
+            seed=config.seed,
+            env_steps=progress.env_steps,
+            max_env_steps=budget_of(run_dir).max_env_steps,
+            best_return=best,
+            changed=changed,
+            problem=progress.problem,
+        )
+    except UdrlError as error:
+        return Summary(
+            run_dir=str(run_dir), state="unreadable", changed=changed, problem=str(error)
+        )

@@ -1,0 +1,204 @@
+"""Looking at runs: play, runs, plot, completion."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import imageio_ffmpeg
+import pytest
+from click.testing import CliRunner
+from PIL import Image, ImageSequence
+
+from udrl.errors import ConfigError, StoreError, UdrlError
+from udrl_launch.agents import evaluate, load_agent
+from udrl_launch.cli import cli
+from udrl_launch.curve import compare
+from udrl_launch.inspection import read_status
+from udrl_launch.runs import find
+
+
+def call(*arguments: object) -> str:
+    result = CliRunner().invoke(
+        cli, [str(a) for a in arguments], standalone_mode=False, catch_exceptions=False
+    )
+    assert result.return_value == 0
+    return result.stdout
+
+
+def lines(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
+    counted = evaluate(
+        load_agent(ended_run), episodes=4, temperature=0.5, desired_return=60, desired_horizon=50
+    )
+    played = lines(
+        call("play", ended_run, "--episodes", 4, "--temperature", 0.5, "--desired-return", 60,
+             "--desired-horizon", 50, "--json")
+    )  # fmt: skip
+    assert [p["episode_return"] for p in played] == counted.returns
+    told = {"desired_return": 60.0, "desired_horizon": 50}
+    assert all(told.items() <= p.items() for p in played)
+    assert all(p["length"] == p["episode_return"] for p in played)  # CartPole: 1 a step
+
+
+def test_play_says_what_was_asked_for_and_obtained(ended_run: Path) -> None:
+    said = call("play", ended_run, "--episodes", 1, "--desired-return", 60, "--desired-horizon", 50)
+    assert "asked for a return of 60.0 within 50 steps (temperature 1, weights version" in said
+    assert ": obtained " in said
+
+
+def test_a_seed_gives_the_same_episodes_again_and_the_next_seed_shares_them(
+    ended_run: Path,
+) -> None:
+    first = lines(call("play", ended_run, "--seed", 5, "--episodes", 3, "--json"))
+    again = lines(call("play", ended_run, "--seed", 5, "--episodes", 3, "--json"))
+    shifted = lines(call("play", ended_run, "--seed", 6, "--episodes", 2, "--json"))
+    assert again == first
+    assert shifted == first[1:]
+
+
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_films_have_a_picture_for_every_moment(ended_run: Path, tmp_path: Path, kind: str) -> None:
+    film = tmp_path / "films" / f"cart.{kind}"
+    (episode,) = lines(call("play", ended_run, "--episodes", 1, "--json", "--video", film))
+    moments = episode["length"] + 1
+    if kind == "mp4":
+        assert imageio_ffmpeg.count_frames_and_secs(str(film)) == (moments, moments / 50)
+    else:  # every second: no browser plays 50 a second
+        with Image.open(film) as gif:
+            assert gif.size == (600, 426)
+            assert sum(1 for _ in ImageSequence.Iterator(gif)) == -(-moments // 2)
+            assert gif.info["duration"] == 40
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("film.avi", "ends with .mp4 or .gif"), ("taken/film.gif", "name a file that you may write")],
+)
+def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, says: str) -> None:
+    (tmp_path / "taken").write_text("a file where a folder should be")
+    with pytest.raises(ConfigError, match=says):
+        call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
+
+
+def test_play_needs_a_run(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="holds no run"):
+        call("play", tmp_path)
+
+
+def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
+    (summary,) = lines(call("runs", ended_run.parent, "--json"))
+    status = read_status(ended_run)
+    assert summary["run_dir"] == str(ended_run)
+    assert summary["state"] == "ended"
+    assert summary["environment"] == "CartPole-v1"
+    assert summary["env_steps"] == status.env_steps
+    assert status.closing_evaluation is not None
+    assert summary["best_return"] >= status.closing_evaluation.mean
+    table = call("runs", ended_run.parent).splitlines()
+    assert table[0].split() == [
+        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "run"
+    ]  # fmt: skip
+    assert f"{summary['best_return']:.1f}" in table[1]
+    assert table[1].endswith(str(ended_run))
+
+
+def test_runs_that_cannot_be_read_are_listed_too(ended_run: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "deep" / "broken"
+    broken.mkdir(parents=True)
+    (broken / "run.sqlite").write_text("not a database, but long enough to be taken for one" * 99)
+    (summary,) = find(tmp_path)
+    assert summary.state == "unreadable"
+    assert "run.sqlite" in summary.problem
+
+
+def test_no_runs(tmp_path: Path) -> None:
+    result = CliRunner().invoke(cli, ["runs", str(tmp_path)])
+    assert "begin one: udrl train LunarLander-v3" in result.stderr
+    with pytest.raises(ConfigError, match=r"no such directory; name the one"):
+        call("runs", tmp_path / "nowhere")
+
+
+def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
+    twin = tmp_path / "twin"
+    twin.mkdir()
+    (twin / "metrics.csv").write_bytes((ended_run / "metrics.csv").read_bytes())
+    picture = tmp_path / "pictures" / "both.svg"
+    assert str(picture) in call("plot", ended_run, twin, "--output", picture, "--x", "wall_s")
+    drawn = ElementTree.fromstring(picture.read_text())
+    assert "cart" in picture.read_text()
+    assert drawn.tag.endswith("svg")
+    with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
+        compare([ended_run], tmp_path / "picture.bmp")
+    with pytest.raises(StoreError, match="name the directory of a run"):
+        compare([tmp_path], tmp_path / "picture.png")
+
+
+def test_nothing_to_plot(ended_run: Path, tmp_path: Path) -> None:
+    head = (ended_run / "metrics.csv").read_text().splitlines()[0]
+    (tmp_path / "metrics.csv").write_text(head + "\n")
+    with pytest.raises(StoreError, match="no evaluation yet"):
+        compare([tmp_path], tmp_path / "picture.png")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion(shell: str) -> None:
+    assert "_UDRL_COMPLETE" in call("completion", shell)
+
+
+def test_commands_are_completed() -> None:
+    asked = {"COMP_WORDS": "udrl pl", "COMP_CWORD": "1", "_UDRL_COMPLETE": "bash_complete"}
+    program = "from udrl_launch.cli import cli; cli(prog_name='udrl')"
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | asked, capture_output=True, text=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+    assert done.stdout.split() == ["plain,play", "plain,plot"]
+
+
+@pytest.fixture
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
+    """A window without a screen, and the keys that are pressed in it, a list for each moment."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    moments: list[Any] = []
+    seen: list[Any] = []
+
+    def get() -> list[Any]:
+        names = moments.pop(0) if moments else []
+        return [pygame.event.Event(pygame.KEYDOWN, key=pygame.key.key_code(n)) for n in names]
+
+    monkeypatch.setattr(pygame.event, "get", get)
+    monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": seen.append})())
+    yield moments
+    assert set(seen) == {50.0}  # the environment's own speed
+
+
+def test_a_window_shows_an_episode(ended_run: Path, keyboard: list[Any]) -> None:
+    (shown,) = lines(call("play", ended_run, "--episodes", 1, "--window", "--json"))
+    (played,) = lines(call("play", ended_run, "--episodes", 1, "--json"))
+    assert shown == played
+
+
+def test_whoever_watches_can_end_it(ended_run: Path, keyboard: list[Any]) -> None:
+    keyboard += [[], ["q"]]
+    assert call("play", ended_run, "--window", "--json") == ""
+
+
+def test_no_screen_for_a_window(ended_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pygame
+
+    def init() -> None:
+        raise pygame.error("No available video device")
+
+    monkeypatch.setattr(pygame.display, "init", init)
+    with pytest.raises(UdrlError, match=r"No available video device; .* --video FILE"):
+        call("play", ended_run, "--window")
