@@ -48,7 +48,7 @@ soak: setup-dev  ## Half an hour of a run: memory, descriptors, threads (docs/re
 	$(VENV)/bin/python benchmarks/soak.py $(ARGS)
 
 fuzz: setup-dev  ## A million inputs for every decoder and queryable (SECURITY.md).
-	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure,dev,fuzz]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure,dev,fuzz]'
 	$(VENV)/bin/python -m tests.fuzz coverage $(ARGS)
 	$(VENV)/bin/python -m tests.fuzz hypothesis $(ARGS)
 
@@ -59,11 +59,11 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[box2d,doom,plot,secure,dev]'
+	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure,dev]'
 	touch $@
 
 clean:

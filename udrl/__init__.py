@@ -16,4 +16,19 @@ Table 2 hyperparameters           :mod:`udrl.config`
 ================================  ======================================
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from udrl.folder import load as load
+
 __version__ = "0.1.0"
+
+#: What is offered at the top, and where it is: imported when wanted, since torch takes a second.
+_OFFERED = {"load": "udrl.folder"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _OFFERED:
+        return getattr(import_module(_OFFERED[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

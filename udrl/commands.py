@@ -144,6 +144,13 @@ class CommandSampler:
     ) -> list[Command]:
         environment_seeds = self._stream(iteration, first).integers(len(desired), *seeds)
         evaluation = kind == "evaluate"
+        def limit(horizon: int) -> int:
+            if evaluation:
+                return self._max_episode_steps
+            if kind == "warm_up" or self._config.cut_at_horizon is None:
+                return self._max_train_steps
+            return min(self._max_train_steps, math.ceil(self._config.cut_at_horizon * horizon))
+
         return [
             Command(
                 id=iteration * COMMANDS_PER_ITERATION + index,
@@ -153,7 +160,7 @@ class CommandSampler:
                 environment_seed=seed,
                 stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
                 weights_version=weights_version(iteration, self._config.lead),
-                max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
+                max_steps=limit(desired_horizon),
                 temperature=self._config.eval_temperature if evaluation else 1.0,
             )
             for index, ((desired_return, desired_horizon), seed) in enumerate(

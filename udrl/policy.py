@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import gymnasium as gym
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -9,7 +11,7 @@ import torch
 from udrl.acting import CommandReader, sample
 from udrl.behavior import BehaviorFunction, stacked_shape
 from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 
 
@@ -24,6 +26,8 @@ class Policy:
         config: the settings that it was trained with.
         spec: of its environment.
         rng: draws the actions; None: seeded by the operating system.
+        desired_return: what to ask it for if one has no wishes; None: unknown.
+        desired_horizon: in how many steps; likewise.
     """
 
     def __init__(
@@ -32,10 +36,15 @@ class Policy:
         config: Config,
         spec: EnvironmentSpec,
         rng: np.random.Generator | None = None,
+        *,
+        desired_return: float | None = None,
+        desired_horizon: int | None = None,
     ) -> None:
         self.behavior = behavior
         self.config = config
         self.spec = spec
+        self.desired_return = desired_return
+        self.desired_horizon = desired_horizon
         self.observation_shape = stacked_shape(spec, config)
         self._rng = rng or np.random.default_rng()
         self._act = behavior.frozen()
@@ -46,6 +55,23 @@ class Policy:
             np.zeros((rows, *self.observation_shape), spec.observation_dtype)
         )
         self._command_in = torch.zeros(rows, 2)
+
+    def make_environment(self, **kwargs: Any) -> Environment:
+        """Return the environment that it was trained in, with observations as it knows them.
+
+        Args:
+            kwargs: further arguments for ``gymnasium.make``, e.g. ``render_mode="human"``.
+
+        Raises:
+            UnsupportedEnvironment: it cannot be made here.
+        """
+        known = self.config.environment_kwargs
+        env = make_environment(
+            msgspec.structs.replace(self.config, environment_kwargs=known | kwargs)
+        )
+        if self.config.frame_stack == 1:
+            return env
+        return gym.wrappers.FrameStackObservation(env, self.config.frame_stack)
 
     def logits(
         self, observation: npt.ArrayLike, desired_return: float, desired_horizon: float

@@ -1,3 +1,4 @@
+import math
 from collections.abc import Sequence
 from math import sqrt
 from typing import Any
@@ -239,3 +240,15 @@ def test_an_iterations_commands_depend_on_nothing_but_seed_iteration_and_buffer(
 def test_iteration_and_index_are_read_from_the_id() -> None:
     command = sampler(n_episodes_per_iter=3).evaluate(12, buffer_of([1.0]))[0]
     assert (command.id, command.iteration, command.index) == (12_000_003, 12, 3)
+
+
+def test_exploratory_episodes_may_be_cut_at_their_horizon() -> None:
+    config = {"cut_at_horizon": 1.5, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1}
+    buffer = buffer_of([1.0, 2.0], [20, 30])
+    explored = sampler(**config).explore(3, buffer)
+    expected = [min(60, math.ceil(1.5 * c.desired_horizon)) for c in explored]
+    assert [c.max_steps for c in explored] == expected
+    assert 60 in expected
+    assert len(set(expected)) > 2
+    assert {c.max_steps for c in sampler(**config).warm_up()} == {60}
+    assert {c.max_steps for c in sampler(**config).evaluate(3, buffer)} == {500}

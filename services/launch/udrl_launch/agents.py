@@ -40,8 +40,15 @@ class Agent(NamedTuple):
 
     @property
     def policy(self) -> Policy:
-        """What to act with."""
-        return Policy(self.behavior, self.config, self.environment)
+        """What to act with; if one has no wishes, ask it for what evaluations ask (2.3.6)."""
+        told = evaluation_commands(self, episodes=1)[0]
+        return Policy(
+            self.behavior,
+            self.config,
+            self.environment,
+            desired_return=told.desired_return,
+            desired_horizon=told.desired_horizon,
+        )
 
 
 def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest") -> Agent:

@@ -18,6 +18,7 @@ _COMMANDS = {
     "actor": "udrl_launch.commands.services",
     "evaluate": "udrl_launch.commands.looking",
     "play": "udrl_launch.commands.playing",
+    "export": "udrl_launch.commands.exporting",
     "reproduce": "udrl_launch.commands.looking",
     "status": "udrl_launch.commands.looking",
     "runs": "udrl_launch.commands.runs",

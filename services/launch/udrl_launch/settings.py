@@ -22,6 +22,10 @@ from udrl.errors import ConfigError
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 
+#: The name of the preset that leaves everything as it is.
+NO_PRESET = "none"
+
+
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Who carries the run out; changes its speed, never its result.
 
@@ -65,7 +69,8 @@ def gather(
 
     Args:
         environment: its ENV argument, which wins over everything.
-        preset_name: a shipped preset; None: the one named like the environment, if there is one.
+        preset_name: a shipped preset, or :data:`NO_PRESET`; None: the one named like the
+            environment, if there is one.
         file: a TOML file.
         stored: the settings of a run to go on with, instead of a preset's.
         options: command-line options; None means: not given.
@@ -77,7 +82,7 @@ def gather(
     values: dict[str, Any] = dict(stored or {})
     if preset_name is None and stored is None and environment in preset_names():
         preset_name = environment
-    if preset_name is not None:
+    if preset_name not in (None, NO_PRESET):
         values |= preset(preset_name)
     if file is not None:
         values |= _from_file(file, environment)

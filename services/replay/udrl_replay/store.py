@@ -359,17 +359,15 @@ class Store:
             "SELECT * FROM evaluations WHERE closing = ? ORDER BY iteration DESC LIMIT 1",
             (int(closing),),
         )
-        if not rows:
-            return None
-        iteration, is_closing, env_steps, desired_return, desired_horizon, *found, _ = rows[0]
-        return EvaluationRow(
-            iteration,
-            bool(is_closing),
-            env_steps,
-            desired_return,
-            desired_horizon,
-            Evaluation(*found),
+        return _evaluation(rows[0]) if rows else None
+
+    def evaluation_of(self, iteration: int, *, closing: bool) -> EvaluationRow | None:
+        """Return the evaluation of an iteration."""
+        rows = self._rows(
+            "SELECT * FROM evaluations WHERE closing = ? AND iteration = ?",
+            (int(closing), iteration),
         )
+        return _evaluation(rows[0]) if rows else None
 
     def best_evaluation(self) -> float | None:
         """Return the greatest mean return of an evaluation, closing ones included."""
@@ -442,6 +440,14 @@ class Store:
     def remove_versions(self, after: int) -> None:
         """Forget versions that were trained beyond the end of the run."""
         self._db.execute("DELETE FROM versions WHERE version > ?", (after,))
+
+
+def _evaluation(row: tuple[Any, ...]) -> EvaluationRow:
+    iteration, closing, env_steps, desired_return, desired_horizon, *found, _ = row
+    result = Evaluation(*found)
+    return EvaluationRow(
+        iteration, bool(closing), env_steps, desired_return, desired_horizon, result
+    )
 
 
 def _sync(folder: Path) -> None:

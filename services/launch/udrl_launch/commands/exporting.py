@@ -1,0 +1,40 @@
+"""``udrl export``."""
+
+from pathlib import Path
+
+import click
+
+from udrl.errors import ConfigError
+from udrl.onnx_model import export_onnx
+from udrl_launch.agents import load_agent
+from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
+from udrl_launch.exporting import export_folder
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR)
+@click.option(
+    "--folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    help="The agent for udrl.load(DIR): weights, settings, and a model card.",
+)  # fmt: skip
+@click.option(
+    "--onnx", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="The agent as an ONNX model; inputs: observation, desired_return, desired_horizon; "
+    "output: logits.",
+)  # fmt: skip
+@WEIGHTS
+def export(run_dir: Path, folder: Path | None, onnx: Path | None, weights: str) -> int:
+    """Hand on a run's agent, in the formats of others.
+
+    Example: udrl export runs/mine --folder my-agent --onnx my-agent.onnx
+    """
+    if folder is None and onnx is None:
+        raise ConfigError("nothing to export: give --folder DIR, --onnx FILE, or both")
+    agent = load_agent(run_dir, version(weights))
+    if folder is not None:
+        export_folder(agent, run_dir, folder)
+        click.echo(f'folder: {folder}; in Python: udrl.load("{folder}")')
+    if onnx is not None:
+        export_onnx(agent.policy, onnx)
+        click.echo(f"ONNX model: {onnx}")
+    return 0

@@ -1,0 +1,123 @@
+"""An agent as a folder with a model card, as the Hugging Face hub shows them."""
+
+from contextlib import closing
+from pathlib import Path
+
+import udrl
+from udrl import folder as folders
+from udrl.errors import ConfigError
+from udrl_launch.agents import Agent
+from udrl_launch.inspection import budget_of
+from udrl_replay.creation import write_config
+from udrl_replay.run import Progress
+from udrl_replay.store import FILE, EvaluationRow, Store
+
+_CARD = """\
+---
+library_name: udrl
+tags:
+  - reinforcement-learning
+  - upside-down-rl
+  - {environment}
+{index}---
+
+# {environment}, told what to do
+
+An agent trained by [Upside-Down Reinforcement Learning](https://arxiv.org/abs/1912.02877): it is
+given an order, *"get this return within this many steps"*, and acts.
+
+{results}
+
+## Use
+
+```python
+{example}```
+
+This needs udrl, and what the environment needs.
+
+## Trained with
+
+```sh
+{command}
+```
+
+udrl {version}, seed {seed}, weights version {weights}. All settings are in `config.toml` beside
+this card. {again}
+"""
+
+_INDEX = """\
+model-index:
+  - name: udrl-{environment}
+    results:
+      - task:
+          type: reinforcement-learning
+          name: reinforcement-learning
+        dataset:
+          name: {environment}
+          type: {environment}
+        metrics:
+          - type: mean_reward
+            name: mean_reward
+            value: {mean:.2f} +/- {std:.2f}
+            verified: false
+"""
+
+_EXAMPLE = """\
+import udrl
+
+policy = udrl.load("{folder}")
+env = policy.make_environment()
+observation, _ = env.reset(seed=1)
+desired_return, desired_horizon, over = policy.desired_return, policy.desired_horizon, False
+while not over:
+    action = policy.predict(observation, desired_return, desired_horizon)
+    observation, reward, terminated, truncated, _ = env.step(action)
+    desired_return, desired_horizon = desired_return - float(reward), desired_horizon - 1
+    over = terminated or truncated
+"""
+
+
+def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
+    """Write an agent, its settings and a model card with what its run's evaluations said.
+
+    Raises:
+        ConfigError: the folder cannot be written, or holds a run.
+        StoreError: the run cannot be read.
+    """
+    if (folder / FILE).exists():
+        raise ConfigError(f"{folder} is the directory of a run; name another folder")
+    with closing(Store(run_dir, read_only=True)) as store:
+        # With a lead the same weights are evaluated in a later iteration.
+        progress = store.fact("progress", Progress)
+        found = store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
+            agent.version + agent.config.lead, closing=False
+        )
+    folders.save(folder, agent.policy, _card(agent, folder, found, progress.inexact_reason))
+    write_config(folder, agent.config, budget_of(run_dir))
+
+
+def _card(agent: Agent, folder: Path, found: EvaluationRow | None, inexact: str) -> str:
+    environment = agent.config.environment
+    results, index = "These weights were never evaluated.", ""
+    if found is not None:
+        mean, std, low, high, episodes = found.evaluation
+        index = _INDEX.format(environment=environment, mean=mean, std=std)
+        results = (
+            f"**Mean return {mean:.1f}** (95 % interval {low:.1f} to {high:.1f}, standard "
+            f"deviation {std:.1f}, {episodes} episodes with seeds not trained on), asked for "
+            f"{found.desired_return:.1f} within {found.desired_horizon} steps, after "
+            f"{found.env_steps:,} env steps of training."
+        )
+    return _CARD.format(
+        environment=environment,
+        index=index,
+        results=results,
+        example=_EXAMPLE.format(folder=folder.name),
+        command=f"udrl train {environment} --preset none --config config.toml",
+        version=udrl.__version__,
+        seed=agent.config.seed,
+        weights=agent.version,
+        again=f"The run was not exact ({inexact}), so the command gives other weights."
+        if inexact
+        else "On the same kind of hardware the command gives the same weights, to the bit.",
+    )

@@ -1,0 +1,120 @@
+"""An agent as a folder that can be handed on: weights, settings, and a card that tells of it.
+
+::
+
+    model.safetensors   the behavior function's weights
+    config.json         :class:`Description`: what they are the weights of
+    README.md           the model card
+"""
+
+from pathlib import Path
+
+import msgspec
+
+from udrl.checkpoint import decode_weights, encode_weights
+from udrl.config import Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.policy import Policy
+
+FORMAT = 1
+
+_WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
+#: Weights of more than this nobody has trained with this project.
+_MOST_BYTES = 4 << 30
+
+
+class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a folder's weights are.
+
+    Attributes:
+        format: of the folder, :data:`FORMAT`.
+        config: the settings that they were trained with.
+        environment: what it looks like to the network.
+        desired_return: what the agent is asked for in evaluations (2.3.6).
+        desired_horizon: in how many steps.
+    """
+
+    format: int
+    config: Config
+    environment: EnvironmentSpec
+    desired_return: float
+    desired_horizon: int
+
+
+def save(folder: Path, policy: Policy, card: str) -> None:
+    """Write a policy to a folder, which may be there already.
+
+    Args:
+        folder: where to.
+        policy: the agent; what to ask it for must be known.
+        card: the text of README.md.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    assert policy.desired_return is not None
+    assert policy.desired_horizon is not None
+    description = Description(
+        format=FORMAT,
+        config=policy.config,
+        environment=policy.spec,
+        desired_return=policy.desired_return,
+        desired_horizon=policy.desired_horizon,
+    )
+    described = msgspec.json.format(msgspec.json.encode(description), indent=2)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _WEIGHTS).write_bytes(encode_weights(policy.behavior))
+        (folder / _DESCRIPTION).write_bytes(described + b"\n")
+        (folder / _CARD).write_text(card, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"{error.filename or folder}: {error.strerror}; name a folder you may write"
+        ) from error
+
+
+def load(folder: str | Path) -> Policy:
+    """Return the policy that :func:`save` wrote.
+
+    Its ``desired_return`` and ``desired_horizon`` are what it was asked for in evaluations.
+
+    Args:
+        folder: from ``udrl export RUN_DIR --folder FOLDER``.
+
+    Raises:
+        ConfigError: there is no such folder.
+        InvalidData: the files are not what was written.
+    """
+    folder = Path(folder)
+    described, weights = (_read(folder / name) for name in (_DESCRIPTION, _WEIGHTS))
+    try:
+        description = msgspec.json.decode(described, type=Description)
+    except (msgspec.ValidationError, msgspec.DecodeError, UdrlError) as error:
+        raise InvalidData(
+            f"{folder / _DESCRIPTION}: {error}; export the run again, with this version of udrl"
+        ) from error
+    if description.format != FORMAT:
+        raise InvalidData(
+            f"{folder / _DESCRIPTION}: format {description.format}, this version of udrl reads "
+            f"{FORMAT}; export the run again"
+        )
+    behavior = decode_weights(weights, description.config, description.environment)
+    return Policy(
+        behavior,
+        description.config,
+        description.environment,
+        desired_return=description.desired_return,
+        desired_horizon=description.desired_horizon,
+    )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InvalidData(f"{path}: larger than {_MOST_BYTES:,} bytes; these are no weights")
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: {error.strerror}; name a folder that udrl export --folder wrote"
+        ) from error
