@@ -144,6 +144,7 @@ class CommandSampler:
     ) -> list[Command]:
         environment_seeds = self._stream(iteration, first).integers(len(desired), *seeds)
         evaluation = kind == "evaluate"
+
         def limit(horizon: int) -> int:
             if evaluation:
                 return self._max_episode_steps

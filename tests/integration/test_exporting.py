@@ -1,0 +1,100 @@
+"""``udrl export``, and what others read of it."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import onnxruntime
+import pytest
+from click.testing import CliRunner
+from huggingface_hub import ModelCard
+
+import udrl
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch.agents import load_agent
+from udrl_launch.cli import cli as command_line
+from udrl_launch.inspection import read_status
+from whole_run import Cli
+
+
+def export(*arguments: object) -> str:
+    result = CliRunner().invoke(
+        command_line,
+        ["export", *map(str, arguments)],
+        standalone_mode=False,
+        catch_exceptions=False,
+    )
+    assert result.return_value == 0
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(ended_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("exported") / "agent"
+    assert f'udrl.load("{folder}")' in export(ended_run, "--folder", folder)
+    return folder
+
+
+def test_the_folder_holds_the_runs_agent(ended_run: Path, folder: Path) -> None:
+    agent, loaded = load_agent(ended_run), udrl.load(folder)
+    seen = [0.1, 0.2, -0.3, 0.4]
+    assert loaded.logits(seen, 70.0, 50).tolist() == agent.policy.logits(seen, 70.0, 50).tolist()
+    assert (loaded.desired_return, loaded.desired_horizon) == (
+        agent.policy.desired_return, agent.policy.desired_horizon,
+    )  # fmt: skip
+
+
+def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
+    card = ModelCard.load(folder / "README.md")
+    closing = read_status(ended_run).closing_evaluation
+    assert closing is not None
+    (result,) = card.data.eval_results
+    assert result.dataset_name == "CartPole-v1"
+    assert result.metric_value == f"{closing.mean:.2f} +/- {closing.std:.2f}"
+    assert f"**Mean return {closing.mean:.1f}**" in card.text
+    assert card.data.library_name == "udrl"
+
+
+def test_the_cards_example_runs(folder: Path) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)
+    subprocess.run(
+        [sys.executable, "-W", "error", "-c", example + "assert terminated or truncated"],
+        cwd=folder.parent, env=os.environ, check=True, timeout=100,
+    )  # fmt: skip
+
+
+def test_the_cards_command_trains_the_same_agent(
+    folder: Path, tmp_path: Path, cli: Callable[..., Cli]
+) -> None:
+    (command,) = re.findall(r"```sh\nudrl (.*)\n```", (folder / "README.md").read_text())
+    words = command.replace("config.toml", str(folder / "config.toml")).split()
+    cli(*words, "--run-dir", str(tmp_path / "run"), "--in-process", "--json").status()
+    again = (tmp_path / "run" / "weights.safetensors").read_bytes()
+    assert again == (folder / "model.safetensors").read_bytes()
+
+
+def test_the_best_weights_have_the_evaluation_that_chose_them(
+    ended_run: Path, tmp_path: Path
+) -> None:
+    export(ended_run, "--folder", tmp_path / "best", "--weights", "best")
+    assert "**Mean return" in (tmp_path / "best" / "README.md").read_text()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_model_for_onnx(ended_run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "agent.onnx"
+    assert str(path) in export(ended_run, "--onnx", path)
+    inputs = onnxruntime.InferenceSession(str(path)).get_inputs()
+    assert [i.name for i in inputs] == ["observation", "desired_return", "desired_horizon"]
+
+
+def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nothing to export"):
+        export(ended_run)
+    with pytest.raises(ConfigError, match="is the directory of a run"):
+        export(ended_run, "--folder", ended_run)
+    with pytest.raises(UdrlError, match="not kept"):
+        export(ended_run, "--folder", tmp_path / "x", "--weights", "1")
