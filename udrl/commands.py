@@ -99,14 +99,21 @@ class CommandSampler:
         """
         best = buffer.best(self._config.last_few)
         spread = self._config.horizon_spread
-        numbers = self._stream(iteration).uniforms(2 * self._config.n_episodes_per_iter)
+        n = self._config.n_episodes_per_iter
+        u, v, w = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
         desired = []
-        for u, v in numbers.reshape(2, -1).T.tolist():
-            desired_return, horizon = ask(self._strategy, best, u)
+        for k in range(n):
+            desired_return, horizon = ask(self._strategy, best, u[k])
             desired.append(
-                self.desired(desired_return, nearest(horizon * (1 + spread * (2 * v - 1))))
+                self.desired(desired_return, nearest(horizon * (1 + spread * (2 * v[k] - 1))))
             )
-        return self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
+        commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
+        return [
+            msgspec.structs.replace(c, max_steps=min(c.max_steps, c.desired_horizon))
+            if w[k] < self._config.cut_at_horizon
+            else c
+            for k, c in enumerate(commands)
+        ]
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
@@ -145,13 +152,6 @@ class CommandSampler:
         environment_seeds = self._stream(iteration, first).integers(len(desired), *seeds)
         evaluation = kind == "evaluate"
 
-        def limit(horizon: int) -> int:
-            if evaluation:
-                return self._max_episode_steps
-            if kind == "warm_up" or self._config.cut_at_horizon is None:
-                return self._max_train_steps
-            return min(self._max_train_steps, math.ceil(self._config.cut_at_horizon * horizon))
-
         return [
             Command(
                 id=iteration * COMMANDS_PER_ITERATION + index,
@@ -161,7 +161,7 @@ class CommandSampler:
                 environment_seed=seed,
                 stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
                 weights_version=weights_version(iteration, self._config.lead),
-                max_steps=limit(desired_horizon),
+                max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
                 temperature=self._config.eval_temperature if evaluation else 1.0,
             )
             for index, ((desired_return, desired_horizon), seed) in enumerate(

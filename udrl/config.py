@@ -50,8 +50,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
             ``ranked``, ``record``, or a class of your own as ``package.module:Class``
             (:mod:`udrl.strategies`).
-        cut_at_horizon: an exploratory episode is cut after so many times its desired horizon; None,
-            as in the paper: it may go on.
+        cut_at_horizon: share of exploratory episodes that are cut when their desired horizon has
+            run out; 0 is the paper's.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
@@ -102,7 +102,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
-    cut_at_horizon: Annotated[float, Meta(gt=0, le=1000)] | None = None
+    cut_at_horizon: Annotated[float, Meta(ge=0, le=1)] = 0.0
     desired_horizon: Literal["mean", "return"] = "mean"
     horizon_scale: Scale = 0.01
     horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0

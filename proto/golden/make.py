@@ -29,6 +29,8 @@ from udrl_proto.messages import (
     CommandLedger,
     CommandsReply,
     CommandsRequest,
+    Contents,
+    ContentsRequest,
     EpisodeLedger,
     EpisodeMessage,
     EpisodeReply,
@@ -38,6 +40,9 @@ from udrl_proto.messages import (
     FailureMessage,
     Hello,
     HelloRequest,
+    History,
+    HistoryRequest,
+    IterationStatus,
     JoinReply,
     JoinRequest,
     Message,
@@ -114,6 +119,20 @@ EVALUATION = EvaluationStatus(
 )
 COMMANDS = CommandLedger(issued=120, accepted=100, cancelled=0, outstanding=20)
 EPISODES = EpisodeLedger(delivered=103, accepted=100, duplicate=2, rejected=1)
+ITERATION = IterationStatus(
+    iteration=5,
+    env_steps=24_120,
+    wall_s=6.125,
+    return_min=21.0,
+    return_mean=95.5,
+    return_max=500.0,
+    explored_return=88.25,
+    commanded_min=290.5,
+    commanded_max=480.75,
+    admitted=12,
+    weights_version=4,
+    loss=0.6875,
+)
 BUFFER = BufferStatus(episodes=90, return_min=21.0, return_mean=95.5, return_max=500.0)
 ACTOR = ActorStatus(
     id="actor-1",
@@ -232,6 +251,22 @@ EXAMPLES: tuple[Message, ...] = (
         problem="",
         audit=AUDIT,
         quarantined=(QUARANTINED,),
+    ),
+    HistoryRequest(after=-1),
+    ITERATION,
+    History(iterations=(ITERATION,), evaluations=(EVALUATION,), more=False),
+    ContentsRequest(),
+    Contents(
+        iteration=5,
+        returns=(21.0, 95.5, 500.0),
+        lengths=(21, 96, 500),
+        iterations=(0, 3, 5),
+        desired_return=297.75,
+        desired_horizon=298,
+        return_std=202.25,
+        desired_returns=(297.75, 450.5),
+        desired_horizons=(298, 298),
+        versions=(4, 5),
     ),
 )
 

@@ -46,7 +46,7 @@ RIGHTS = {
         hears=(keys.NEW_WEIGHTS,),
         joins=True,
     ),
-    "observer": Rights(asks=(keys.HELLO, keys.STATUS, keys.WEIGHTS)),
+    "observer": Rights(asks=(keys.HELLO, keys.STATUS, keys.WEIGHTS, keys.HISTORY, keys.CONTENTS)),
 }
 
 #: Every role that there are certificates for.

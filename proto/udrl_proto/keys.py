@@ -16,6 +16,8 @@ VERSION = "version"
 STATE = "state"
 WEIGHTS = "weights"
 STATUS = "status"
+HISTORY = "history"
+CONTENTS = "contents"
 VERBS = (
     HELLO,
     JOIN,
@@ -28,6 +30,8 @@ VERBS = (
     STATE,
     WEIGHTS,
     STATUS,
+    HISTORY,
+    CONTENTS,
 )
 
 #: Publications; each may be lost, and nothing depends on one.

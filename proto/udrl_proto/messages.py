@@ -19,6 +19,11 @@ Positive = Annotated[int, Meta(ge=1, le=2**62)]
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Role = Literal["actor", "learner"]
 
+#: Iterations in one :class:`History`.
+HISTORY_PAGE = 2000
+#: Episodes and commands in one :class:`Contents`.
+MOST_SHOWN = 2000
+
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all messages."""
@@ -373,3 +378,72 @@ class Status(Message, frozen=True, kw_only=True):
     problem: Text
     audit: AuditStatus
     quarantined: tuple[Quarantined, ...]
+
+
+class HistoryRequest(Message, frozen=True, kw_only=True):
+    """Anyone asks what came of the iterations after one; -1: of all."""
+
+    after: Annotated[int, Meta(ge=-1, le=2**62)]
+
+
+class IterationStatus(Message, frozen=True, kw_only=True):
+    """A completed iteration; names and units as in ``metrics.csv``."""
+
+    iteration: Number
+    env_steps: Number
+    wall_s: float
+    return_min: float
+    return_mean: float
+    return_max: float
+    explored_return: float
+    commanded_min: float | None
+    commanded_max: float | None
+    admitted: Number
+    weights_version: Number
+    loss: float | None
+
+
+class History(Message, frozen=True, kw_only=True):
+    """The first of them, and the evaluations that were made in these; ask again for the others.
+
+    Attributes:
+        iterations: in their order, at most :data:`HISTORY_PAGE`.
+        evaluations: likewise, without closing ones.
+        more: whether there are iterations after the last of these.
+    """
+
+    iterations: tuple[IterationStatus, ...]
+    evaluations: tuple[EvaluationStatus, ...]
+    more: bool
+
+
+class ContentsRequest(Message, frozen=True, kw_only=True):
+    """Anyone asks what the replay buffer holds, and what its next commands ask for."""
+
+
+class Contents(Message, frozen=True, kw_only=True):
+    """The replay buffer, episode by episode, and what is drawn from it.
+
+    Attributes:
+        iteration: the buffer is as it was after this one.
+        returns: of its episodes, least first; of more than :data:`MOST_SHOWN` every so many.
+        lengths: of the same episodes, steps.
+        iterations: in which they were made.
+        desired_return: what evaluations ask for, M of the ``last_few`` best; None: it is empty.
+        desired_horizon: in how many steps.
+        return_std: S of the ``last_few`` best.
+        desired_returns: of exploratory commands that are outstanding.
+        desired_horizons: of the same commands.
+        versions: weights versions that are kept.
+    """
+
+    iteration: Number
+    returns: tuple[float, ...]
+    lengths: tuple[Number, ...]
+    iterations: tuple[Number, ...]
+    desired_return: float | None
+    desired_horizon: Number | None
+    return_std: float | None
+    desired_returns: tuple[float, ...]
+    desired_horizons: tuple[Number, ...]
+    versions: tuple[Number, ...]

@@ -1,4 +1,3 @@
-import math
 from collections.abc import Sequence
 from math import sqrt
 from typing import Any
@@ -242,13 +241,21 @@ def test_iteration_and_index_are_read_from_the_id() -> None:
     assert (command.id, command.iteration, command.index) == (12_000_003, 12, 3)
 
 
-def test_exploratory_episodes_may_be_cut_at_their_horizon() -> None:
-    config = {"cut_at_horizon": 1.5, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1}
-    buffer = buffer_of([1.0, 2.0], [20, 30])
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_a_share_of_exploratory_episodes_is_cut_at_its_horizon(share: float) -> None:
+    config = {
+        "cut_at_horizon": share, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1,
+        "n_episodes_per_iter": 1000,
+    }  # fmt: skip
+    buffer = buffer_of([1.0, 2.0], [20, 50])
     explored = sampler(**config).explore(3, buffer)
-    expected = [min(60, math.ceil(1.5 * c.desired_horizon)) for c in explored]
-    assert [c.max_steps for c in explored] == expected
-    assert 60 in expected
-    assert len(set(expected)) > 2
+    asked = sampler(**config | {"cut_at_horizon": 0.0}).explore(3, buffer)
+    assert [(c.desired_return, c.desired_horizon) for c in explored] == [
+        (c.desired_return, c.desired_horizon) for c in asked
+    ]
+    short = [c for c in explored if c.desired_horizon < 60]
+    cut = [c for c in short if c.max_steps == c.desired_horizon]
+    assert {c.max_steps for c in explored if c not in cut} <= {60}
+    assert abs(len(cut) - share * len(short)) < 5 * sqrt(1000 * share * (1 - share)) + 1
     assert {c.max_steps for c in sampler(**config).warm_up()} == {60}
     assert {c.max_steps for c in sampler(**config).evaluate(3, buffer)} == {500}

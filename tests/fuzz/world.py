@@ -31,6 +31,8 @@ from udrl_proto.messages import (
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
+    Contents,
+    ContentsRequest,
     EpisodeMessage,
     EpisodeReply,
     EpisodesReply,
@@ -38,6 +40,8 @@ from udrl_proto.messages import (
     FailureMessage,
     Hello,
     HelloRequest,
+    History,
+    HistoryRequest,
     JoinReply,
     JoinRequest,
     Message,
@@ -73,6 +77,8 @@ REPLIES: dict[str, type[Message]] = {
     keys.STATE: StateReply,
     keys.WEIGHTS: Weights,
     keys.STATUS: Status,
+    keys.HISTORY: History,
+    keys.CONTENTS: Contents,
 }
 
 #: Where a file is synced at once.
@@ -249,6 +255,8 @@ def honest_questions() -> list[tuple[str, bytes]]:
     held = next(iter(world.service.run.dealer.outstanding))
     ask(keys.FAILURE, FailureMessage(actor="actor-1", command_id=held, error="no fuel"))
     ask(keys.STATUS, StatusRequest())
+    ask(keys.HISTORY, HistoryRequest(after=-1))
+    ask(keys.CONTENTS, ContentsRequest())
     generator.close()
     world.close()
     return asked

@@ -30,7 +30,7 @@ DEADLINE_S = 10.0
 MAY_ASK = {
     "learner": {"hello", "join", "changes", "episodes", "version", "state"},
     "actor": {"hello", "join", "commands", "episode", "failure", "weights"},
-    "observer": {"hello", "status", "weights"},
+    "observer": {"hello", "status", "weights", "history", "contents"},
     "replay": set(),
 }
 

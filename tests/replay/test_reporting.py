@@ -5,13 +5,32 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from tests.replay.synthetic import arrive, config, episode, finish, join, work
 from udrl.config import Budget
+from udrl.schedule import weights_version
 from udrl_proto.codec import decode, encode
-from udrl_proto.messages import CommandsRequest, Status, Waiting
-from udrl_replay.reporting import COLUMNS, MetricsFile, Throughput, Waits, status
+from udrl_proto.messages import (
+    CommandsRequest,
+    Contents,
+    EvaluationStatus,
+    History,
+    IterationStatus,
+    Status,
+    Waiting,
+)
+from udrl_replay import reporting
+from udrl_replay.reporting import (
+    COLUMNS,
+    MetricsFile,
+    Throughput,
+    Waits,
+    contents,
+    history,
+    status,
+)
 from udrl_replay.run import Run
 
 MakeRun = Callable[..., Run]
@@ -214,3 +233,94 @@ def test_waits_are_bounded() -> None:
     for i in range(20_000):
         waits.begin(f"learner {i}", "actors", "iteration 1", 0.0)
     assert len(waits.list(1.0)) == 10_000
+
+
+# History and contents, for whoever draws pictures.
+
+
+def test_history_is_what_the_metrics_say(make_run: MakeRun, tmp_path: Path) -> None:
+    run = make_run(lead=1, max_env_steps=60)
+    finish(run)
+    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    found = history(run.store, -1)
+    assert decode(encode(found), History) == found
+    assert not found.more
+    assert len(found.iterations) == len(lines(tmp_path))
+    for line, row in zip(lines(tmp_path), found.iterations, strict=True):
+        for name, value in msgspec.structs.asdict(row).items():
+            assert line[name] == ("" if value is None else str(value))
+    means = [line["eval_mean"] for line in lines(tmp_path) if line["eval_mean"]]
+    assert [str(e.mean) for e in found.evaluations] == means
+    assert found.iterations[0].commanded_min is None
+    assert all(
+        r.commanded_min is not None and r.commanded_max is not None and
+        r.commanded_min <= r.commanded_max for r in found.iterations[1:]
+    )  # fmt: skip
+    assert 0 < sum(r.admitted for r in found.iterations) <= run.progress.accepted
+
+
+def test_history_comes_in_pages(make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = make_run(max_env_steps=60)
+    finish(run)
+    whole = history(run.store, -1)
+    monkeypatch.setattr(reporting, "HISTORY_PAGE", 3)
+    iterations: list[IterationStatus] = []
+    evaluations: list[EvaluationStatus] = []
+    after, more = -1, True
+    while more:
+        page = history(run.store, after)
+        assert len(page.iterations) <= 3
+        iterations += page.iterations
+        evaluations += page.evaluations
+        after, more = page.iterations[-1].iteration, page.more
+    assert (tuple(iterations), tuple(evaluations)) == (whole.iterations, whole.evaluations)
+    assert history(run.store, after) == History(iterations=(), evaluations=(), more=False)
+
+
+def test_contents_are_the_buffer_and_what_is_drawn_from_it(make_run: MakeRun) -> None:
+    run = make_run(lead=1)
+    empty = contents(run)
+    assert (empty.returns, empty.desired_return, empty.desired_horizon) == ((), None, None)
+    for _ in range(4):
+        work(run)
+    found = contents(run)
+    assert decode(encode(found), Contents) == found
+    assert found.iteration == run.progress.iteration
+    shown = list(zip(found.returns, found.lengths, found.iterations, strict=True))
+    assert shown == [(e.episode_return, e.length, e.iteration) for e in run.buffer]
+    best = run.buffer.best(run.config.last_few)
+    mean = math.fsum(e.episode_return for e in best) / len(best)
+    assert found.desired_return == pytest.approx(mean)
+    asked = [
+        (o.command.desired_return, o.command.desired_horizon)
+        for o in run.dealer.outstanding.values() if o.command.kind == "explore"
+    ]  # fmt: skip
+    assert asked
+    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == asked
+    assert set(found.versions) == set(run.store.versions_kept())
+
+
+def test_of_many_episodes_every_so_many_are_shown(
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run()
+    for _ in range(3):
+        work(run)
+    monkeypatch.setattr(reporting, "MOST_SHOWN", 3)
+    found = contents(run)
+    returns = [e.episode_return for e in run.buffer]
+    assert len(returns) > 3
+    assert len(found.returns) <= 3
+    assert found.returns[-1] == returns[-1], "the best is always shown"
+    assert list(found.returns) == sorted(found.returns)
+
+
+def test_evaluated_weights_are_kept(make_run: MakeRun, reopened: MakeRun) -> None:
+    run = make_run(lead=1, max_env_steps=200)
+    finish(run)
+    evaluated = {weights_version(e.iteration, 1) for e in run.store.evaluations(-1, 2**62)}
+    assert len(evaluated) > 3
+    assert evaluated <= set(run.store.versions_kept())
+    again = reopened(run, Budget(max_env_steps=300))
+    finish(again)
+    assert evaluated < set(again.store.versions_kept())

@@ -36,6 +36,7 @@ from udrl.commands import CLOSING, Command
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Refused
 from udrl.replay import Entry
+from udrl.schedule import weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage, Status
 from udrl_replay.arrival import Arrival
 from udrl_replay.reporting import Throughput, Waits, status
@@ -297,8 +298,10 @@ class RunMachine(RuleBasedStateMachine):
         assert {i for i in self.accepted if store.episode_digest(i) is not None} == wanted
         named = {c.weights_version for c in store.commands(cancelled=True)}
         named |= {c.weights_version for c in store.commands(cancelled=False)}
-        named |= {progress.best_version, progress.latest_version}
-        latest = progress.latest_version
+        latest, lead = progress.latest_version, self.run.config.lead
+        evaluated = {weights_version(e.iteration, lead) for e in store.evaluations(-1, 2**62)}
+        assert progress.best_version in evaluated | {0}
+        named |= evaluated | {latest}
         assert set(store.versions_kept()) == {v for v in named if 0 < v <= latest}
 
     def teardown(self) -> None:

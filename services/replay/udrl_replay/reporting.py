@@ -9,13 +9,19 @@ from pathlib import Path
 
 from udrl.digests import replay_digest
 from udrl.errors import StoreError
+from udrl.strategies import Best
 from udrl_proto.messages import (
+    HISTORY_PAGE,
+    MOST_SHOWN,
     ActorStatus,
     AuditStatus,
     BufferStatus,
     CommandLedger,
+    Contents,
     EpisodeLedger,
     EvaluationStatus,
+    History,
+    IterationStatus,
     Quarantined,
     Status,
     Waiting,
@@ -27,6 +33,7 @@ COLUMNS = (
     "iteration", "env_steps", "eval_env_steps", "wall_s", "eval_at_env_steps", "eval_mean",
     "eval_std", "eval_ci95_low", "eval_ci95_high", "loss", "weights_version", "return_min",
     "return_mean", "return_max", "explored_return", "eval_desired_return", "eval_desired_horizon",
+    "commanded_min", "commanded_max", "admitted",
 )  # fmt: skip
 
 log = logging.getLogger("udrl")
@@ -211,8 +218,48 @@ def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: fl
 
 
 def _evaluation(row: EvaluationRow | None) -> EvaluationStatus | None:
-    if row is None:
-        return None
+    return None if row is None else _evaluated(row)
+
+
+def _evaluated(row: EvaluationRow) -> EvaluationStatus:
     return EvaluationStatus(
         iteration=row.iteration, env_steps=row.env_steps, **row.evaluation._asdict()
+    )
+
+
+def history(store: Store, after: int) -> History:
+    """Return what came of the iterations after one, a page of them."""
+    rows = store.history(after, HISTORY_PAGE + 1)
+    names = IterationStatus.__struct_fields__
+    page = tuple(
+        IterationStatus(**dict(zip(names, row, strict=True))) for row in rows[:HISTORY_PAGE]
+    )
+    evaluations = store.evaluations(after, page[-1].iteration) if page else []
+    return History(
+        iterations=page,
+        evaluations=tuple(map(_evaluated, evaluations)),
+        more=len(rows) > HISTORY_PAGE,
+    )
+
+
+def contents(run: Run) -> Contents:
+    """Return what the replay buffer holds, and what its next commands ask for."""
+    config = run.config
+    entries = list(run.buffer)
+    # The best are always among those that are shown.
+    shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
+    best = Best.of(run.buffer.best(config.last_few)) if entries else None
+    told = best and run.sampler.desired(best.mean, best.horizon)
+    commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
+    return Contents(
+        iteration=max(run.progress.iteration, 0),
+        returns=tuple(e.episode_return for e in shown),
+        lengths=tuple(e.length for e in shown),
+        iterations=tuple(e.iteration for e in shown),
+        desired_return=told[0] if told else None,
+        desired_horizon=told[1] if told else None,
+        return_std=best.deviation if best else None,
+        desired_returns=tuple(c.desired_return for c in commands[:MOST_SHOWN]),
+        desired_horizons=tuple(c.desired_horizon for c in commands[:MOST_SHOWN]),
+        versions=tuple(run.store.versions_kept()),
     )

@@ -96,7 +96,11 @@ class Run:
         self.auditor = Auditor(audit)
         self.quarantined = Quarantine(store)
         self._entered = store.fact("entered", dict[str, int], {})
-        self._sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
+        self._evaluated = {
+            weights_version(e.iteration, self.config.lead)
+            for e in store.evaluations(-1, self.progress.iteration)
+        }
+        self.sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
         self._began = time.monotonic() - self.progress.wall_s
         held = store.buffer(self.progress.iteration)
         self.buffer = ReplayBuffer(self.config, (p.entry for p in held))
@@ -112,7 +116,7 @@ class Run:
         self.progress.audit = audit
         with store.transaction():
             if self.progress.issued == 0:
-                self._issue(self._sampler.warm_up())
+                self._issue(self.sampler.warm_up())
             if self.progress.state == "failed":
                 self._try_again()
             if self.progress.state != "running" and not self._budget_spent():
@@ -335,7 +339,9 @@ class Run:
 
         if evaluated:
             self._note_evaluation(iteration, evaluated, closing=False)
-        returns = [e.episode_return for e in self.buffer.best(self.config.replay_size)]
+        best = self.buffer.best(self.config.replay_size)
+        returns = [e.episode_return for e in best]
+        commands = [self._open[i] for i in ids]
         self.store.add_iteration(
             iteration,
             len(ids),
@@ -347,6 +353,8 @@ class Run:
             returns[-1],
             math.fsum(p.entry.episode_return for p in explored) / len(explored),
             weights_version(iteration, self.config.lead),
+            *_range([c.desired_return for c in commands if c.kind == "explore"]),
+            sum(e.iteration == iteration for e in best),
         )
         self.store.remove_commands(ids)
         for i in ids:
@@ -354,9 +362,9 @@ class Run:
 
         due = evaluation_due(iteration, steps_before, progress.env_steps, self.config.eval_every)
         for opened in opened_by(iteration, self.config.lead):
-            self._issue(self._sampler.explore(opened, self.buffer))
+            self._issue(self.sampler.explore(opened, self.buffer))
             if due:
-                self._issue(self._sampler.evaluate(opened, self.buffer))
+                self._issue(self.sampler.evaluate(opened, self.buffer))
             due = False
         if self._budget_spent():
             self._close()
@@ -375,6 +383,8 @@ class Run:
             "iteration %d, evaluation at %d env steps: mean return %.1f (95 %% from %.1f to %.1f)",
             iteration, source, result.mean, result.ci95_low, result.ci95_high,
         )  # fmt: skip
+        if not closing:
+            self._evaluated.add(version)
         best = self.progress.best_mean
         if not closing and (best is None or result.mean > best):
             self.progress.best_mean, self.progress.best_version = result.mean, version
@@ -412,7 +422,7 @@ class Run:
         if final == 0:
             self.progress.state = "ended"
         elif self.progress.latest_version == final:
-            self._issue(self._sampler.close(final, self.buffer))
+            self._issue(self.sampler.close(final, self.buffer))
 
     def _end_if_closed(self) -> None:
         final = self.progress.iteration
@@ -511,7 +521,12 @@ class Run:
         wanted = [*self._open.values(), *self.store.commands(cancelled=True)]
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
         needed |= self.auditor.versions
+        needed |= self._evaluated  # for whoever wants to look at them later
         self.store.drop_weights(v for v in self.store.versions_kept() if v not in needed)
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.
         self.store.remove_evicted(latest)
+
+
+def _range(numbers: list[float]) -> tuple[float | None, float | None]:
+    return (min(numbers), max(numbers)) if numbers else (None, None)

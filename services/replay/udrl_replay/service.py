@@ -29,6 +29,7 @@ from udrl_proto.messages import (
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
+    ContentsRequest,
     EpisodeMessage,
     EpisodeReply,
     EpisodesReply,
@@ -36,6 +37,7 @@ from udrl_proto.messages import (
     FailureMessage,
     Hello,
     HelloRequest,
+    HistoryRequest,
     JoinReply,
     JoinRequest,
     Message,
@@ -52,7 +54,15 @@ from udrl_proto.messages import (
 )
 from udrl_replay.arrival import Arrival, Malformed, inspect
 from udrl_replay.dealing import MOST_ACTORS
-from udrl_replay.reporting import MetricsFile, Throughput, Waits, status, write_weights
+from udrl_replay.reporting import (
+    MetricsFile,
+    Throughput,
+    Waits,
+    contents,
+    history,
+    status,
+    write_weights,
+)
 from udrl_replay.run import Run
 from udrl_replay.store import Store, Version
 
@@ -129,6 +139,8 @@ class ReplayService:
             keys.STATE: self._state,
             keys.WEIGHTS: self._weights,
             keys.STATUS: self._status,
+            keys.HISTORY: self._history,
+            keys.CONTENTS: self._contents,
         }
 
     def serve(self, stop: threading.Event) -> None:
@@ -199,6 +211,8 @@ class ReplayService:
             keys.STATE: Verb(StateRequest, _OVERHEAD),
             keys.WEIGHTS: Verb(WeightsRequest, _OVERHEAD),
             keys.STATUS: Verb(StatusRequest, _OVERHEAD),
+            keys.HISTORY: Verb(HistoryRequest, _OVERHEAD),
+            keys.CONTENTS: Verb(ContentsRequest, _OVERHEAD),
         }
 
     def _presence(self, sample: zenoh.Sample) -> None:
@@ -406,3 +420,9 @@ class ReplayService:
 
     def _status(self, request: StatusRequest, now: float) -> Message:
         return status(self.run, self._throughput, self._waits, self._lag_s, now)
+
+    def _history(self, request: HistoryRequest, now: float) -> Message:
+        return history(self._store, request.after)
+
+    def _contents(self, request: ContentsRequest, now: float) -> Message:
+        return contents(self.run)

@@ -8,7 +8,7 @@ columns are documented in ``docs/operations.md``.
 import hashlib
 from collections.abc import Iterable
 
-SCHEMA = 3
+SCHEMA = 4
 
 #: SQLite writes a whole row anew when a column changes its size; so an episode's body, which may
 #: be a megabyte and never changes, has a table of its own. Elsewhere large columns stand last:
@@ -28,7 +28,8 @@ CREATE TABLE iterations (
     iteration INTEGER PRIMARY KEY, commands INTEGER NOT NULL, env_steps INTEGER NOT NULL,
     eval_env_steps INTEGER NOT NULL, wall_s REAL NOT NULL, return_min REAL NOT NULL,
     return_mean REAL NOT NULL, return_max REAL NOT NULL, explored_return REAL,
-    weights_version INTEGER NOT NULL, seal BLOB NOT NULL);
+    weights_version INTEGER NOT NULL, commanded_min REAL, commanded_max REAL,
+    admitted INTEGER NOT NULL, seal BLOB NOT NULL);
 CREATE TABLE evaluations (
     iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
     desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
@@ -47,7 +48,8 @@ SEALED = {
     "commands": "id, cancelled, body",
     "episodes": "id, episode_return, length, digest, admitted, evicted, checksum",
     "iterations": "iteration, commands, env_steps, eval_env_steps, wall_s, return_min, "
-    "return_mean, return_max, explored_return, weights_version",
+    "return_mean, return_max, explored_return, weights_version, commanded_min, commanded_max, "
+    "admitted",
     "evaluations": "iteration, closing, env_steps, desired_return, desired_horizon, mean, std, "
     "ci95_low, ci95_high, episodes",
     "versions": "version, digest, loss, train_s, checksum",
