@@ -21,12 +21,13 @@ _COMMANDS = {
     "export": "udrl_launch.commands.exporting",
     "reproduce": "udrl_launch.commands.looking",
     "status": "udrl_launch.commands.looking",
+    # Like the studies it stands above this package, and imports it.
+    "board": "udrl_board.command",
     "runs": "udrl_launch.commands.runs",
     "plot": "udrl_launch.commands.runs",
     "health": "udrl_launch.commands.health",
     "keys": "udrl_launch.commands.keys",
     "completion": "udrl_launch.commands.completion",
-    # It stands above this package, and imports it.
     "study": "udrl_experiments.command",
 }
 

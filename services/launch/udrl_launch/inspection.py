@@ -73,8 +73,12 @@ def read_status(run_dir: Path) -> Status:
         StoreError: there is no run, or it is damaged.
     """
     with closing(Store(run_dir, read_only=True)) as store:
-        run = Run(store, budget_of(run_dir))
-        return status(run, Throughput(), Waits(), 0.0, 0.0)
+        return status(read_run(run_dir, store), Throughput(), Waits(), 0.0, 0.0)
+
+
+def read_run(run_dir: Path, store: Store) -> Run:
+    """Return a run by its directory and its store, to look at."""
+    return Run(store, budget_of(run_dir))
 
 
 def budget_of(run_dir: Path) -> Budget:

@@ -10,6 +10,7 @@ import msgspec
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
+from udrl.errors import UnsupportedEnvironment
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
 from udrl_launch.agents import Agent
@@ -45,6 +46,12 @@ def filmed(config: Config) -> Environment:
     Raises:
         UnsupportedEnvironment: it has no pictures to show.
     """
+    with closing(make_environment(config)) as env:
+        if "rgb_array" not in env.metadata.get("render_modes", ()):
+            raise UnsupportedEnvironment(
+                f"environment {config.environment!r} has no pictures to show: it supports no "
+                f"render_mode of 'rgb_array'; play without a film or window"
+            )
     kwargs = config.environment_kwargs | {"render_mode": "rgb_array"}
     return make_environment(msgspec.structs.replace(config, environment_kwargs=kwargs))
 

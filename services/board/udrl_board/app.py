@@ -1,0 +1,212 @@
+"""The board's web server: a page, what is new for it, and a stage for each that wants one."""
+
+import asyncio
+import contextlib
+import hmac
+import logging
+import re
+from collections.abc import AsyncIterator, Awaitable, Callable
+from http.cookies import SimpleCookie
+from importlib import resources
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from udrl_board.feed import Feed
+from udrl_board.stage import Moment, Order, Stage, Trouble
+
+log = logging.getLogger("udrl")
+
+#: Stages at a time; each has an environment of its own.
+MOST_STAGES = 8
+#: Bytes of an order; the server is told.
+MOST_BYTES = 4096
+#: Seconds that a picture may take to be sent; who is slower is not there any more.
+_SEND_S = 20.0
+
+_COOKIE = "udrl_board"
+
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+def make_app(feed: Feed, *, hosts: tuple[str, ...] = (), token: str = "") -> Starlette:
+    """Return the web application.
+
+    Args:
+        feed: what it shows.
+        hosts: names that it may be called by; empty: any. A page of elsewhere whose name leads here
+            (DNS rebinding) is refused by it.
+        token: what a browser must know; empty: nothing.
+    """
+    static = Path(str(resources.files("udrl_board"))) / "static"
+    board = _Board(feed)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+        feed.source.close()
+
+    return Starlette(
+        routes=[
+            Route("/news", board.news),
+            WebSocketRoute("/stage", board.stage),
+            Mount("/", StaticFiles(directory=static, html=True)),
+        ],
+        middleware=[Middleware(_Guard, hosts=hosts, token=token)],
+        lifespan=lifespan,
+    )
+
+
+class _Guard:
+    """Lets in who knows the token and calls the board by a name of its own, and no other page."""
+
+    def __init__(self, app: ASGIApp, *, hosts: tuple[str, ...], token: str) -> None:
+        self._app = app
+        self._hosts = hosts
+        self._token = token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        connection = HTTPConnection(scope)
+        refusal = self._refusal(connection)
+        if scope["type"] == "websocket":
+            if refusal is not None:
+                await send({"type": "websocket.close", "code": 1008})
+                return
+            await self._app(scope, receive, send)
+            return
+        response = refusal or self._welcome(connection)
+        if response is not None:
+            response.headers.update(_HEADERS)
+            await response(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = [(k.lower().encode(), v.encode()) for k, v in _HEADERS.items()]
+                message["headers"] = [*message["headers"], *headers]
+            await send(message)
+
+        await self._app(scope, receive, with_headers)
+
+    def _refusal(self, connection: HTTPConnection) -> Response | None:
+        host = connection.headers.get("host", "")
+        name = urlsplit(f"//{host}").hostname or ""
+        if self._hosts and name not in self._hosts:
+            return PlainTextResponse(f"This board is not called {name!r}.", 421)
+        origin = connection.headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return PlainTextResponse("Another page may not use this board.", 403)
+        if self._token and not self._knows(connection):
+            return PlainTextResponse(
+                "This board asks for a token: open it by the address that `udrl board` printed.",
+                401,
+            )
+        return None
+
+    def _knows(self, connection: HTTPConnection) -> bool:
+        cookie = SimpleCookie(connection.headers.get("cookie", "")).get(_COOKIE)
+        shown = [cookie.value if cookie else "", *self._shown(connection)]
+        return any(hmac.compare_digest(one.encode(), self._token.encode()) for one in shown)
+
+    def _shown(self, connection: HTTPConnection) -> list[str]:
+        return parse_qs(connection.url.query).get("token", [])
+
+    def _welcome(self, connection: HTTPConnection) -> Response | None:
+        """Turn a token in the address into a cookie, so that it does not stay there."""
+        if not self._token or not self._shown(connection):
+            return None
+        response = RedirectResponse("/", 303)
+        response.set_cookie(_COOKIE, self._token, httponly=True, samesite="strict")
+        return response
+
+
+class _Board:
+    """What the routes do."""
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self._stages = 0
+
+    async def news(self, request: Request) -> Response:
+        """Answer what is new after an iteration."""
+        text = request.query_params.get("after", "-1")
+        if not re.fullmatch(r"-?\d{1,18}", text):
+            return PlainTextResponse(f"after={text[:40]!r}: expected an iteration", 400)
+        news = await run_in_threadpool(self._feed.news, int(text))
+        return Response(msgspec.json.encode(news), media_type="application/json")
+
+    async def stage(self, socket: WebSocket) -> None:
+        """Let somebody give orders, and show what comes of them."""
+        await socket.accept()
+        if self._stages >= MOST_STAGES:
+            problem = f"{MOST_STAGES} others are watching an agent, which is the most; try later"
+            await socket.send_text(msgspec.json.encode(Trouble(problem=problem)).decode())
+            await socket.close(1013)
+            return
+        self._stages += 1
+        stage = Stage(self._feed.source, _sender(socket, asyncio.get_running_loop()))
+        stage.start()
+        try:
+            await _listen(socket, stage)
+        finally:
+            stage.close()
+            await run_in_threadpool(stage.join)
+            self._stages -= 1
+
+
+async def _listen(socket: WebSocket, stage: Stage) -> None:
+    """Pass on orders until whoever gives them leaves."""
+    while True:
+        try:
+            text = await socket.receive_text()
+        except (WebSocketDisconnect, KeyError):  # a binary message has no text
+            return
+        problem = ""
+        try:
+            if not stage.order(msgspec.json.decode(text, type=Order)):
+                problem = "too many orders at once"
+        except (msgspec.ValidationError, msgspec.DecodeError) as error:
+            problem = f"not an order: {error}"
+        if problem:
+            await socket.send_text(msgspec.json.encode(Trouble(problem=problem)).decode())
+
+
+Sender = Callable[[Moment | Trouble, bytes | None], None]
+
+
+def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
+    """Return what a stage's thread shows its moments with; it waits until they are sent."""
+
+    async def send(news: Moment | Trouble, picture: bytes | None) -> None:
+        await socket.send_text(msgspec.json.encode(news).decode())
+        if picture is not None:
+            await socket.send_bytes(picture)
+
+    def show(news: Moment | Trouble, picture: bytes | None) -> None:
+        sending: Awaitable[None] = asyncio.wait_for(send(news, picture), _SEND_S)
+        try:
+            asyncio.run_coroutine_threadsafe(sending, loop).result(_SEND_S + 1)  # type: ignore[arg-type]
+        except (RuntimeError, WebSocketDisconnect, TimeoutError, asyncio.CancelledError) as error:
+            raise ConnectionError(f"nobody watches: {error}") from error
+
+    return show

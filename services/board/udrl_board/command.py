@@ -1,0 +1,137 @@
+"""``udrl board``."""
+
+import ipaddress
+import logging
+import secrets
+import socket
+import threading
+import webbrowser
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from udrl.errors import ConfigError
+from udrl.numerics import use_one_thread
+from udrl_launch.address import Address
+from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
+from udrl_launch.process import GRACE_S, log_to_stderr, run_service
+from udrl_proto.credentials import load
+from udrl_proto.session import check_endpoint
+
+if TYPE_CHECKING:
+    import uvicorn
+
+#: Names of this machine that no other can have.
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR, required=False)
+@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@click.option("--port", type=click.IntRange(0, 65_535), default=0, show_default=True,
+              help="Where the page is served; 0: any that is free.")  # fmt: skip
+@click.option("--host", default="127.0.0.1", show_default=True,
+              help="Address to serve on. Beyond loopback, browsers must know a token.")  # fmt: skip
+@click.option("--token", envvar="UDRL_BOARD_TOKEN", metavar="TOKEN",
+              help="What browsers must know. Default: a new one, beyond loopback.")  # fmt: skip
+@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@KEYS
+@RUN
+def board(
+    run_dir: Path | None,
+    connect: str | None,
+    port: int,
+    host: str,
+    token: str | None,
+    opens: bool,
+    keys: Path | None,
+    run_id: str | None,
+) -> int:
+    """Watch a run in the browser, and tell its agent what to do.
+
+    Example: udrl board runs/mine --open
+    """
+    if (run_dir is None) == (connect is None):
+        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+    try:
+        import uvicorn
+
+        from udrl_board.app import MOST_BYTES, make_app
+        from udrl_board.feed import Feed
+        from udrl_board.source import Directory, Served, Source
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f'the board needs {error.name}; install it with: pip install "udrl[board]"'
+        ) from error
+    if keys is not None:
+        load(keys, "observer")
+    source: Source
+    if run_dir is not None:
+        source = Directory(run_dir, keys)
+        source.hello()  # is there a run?
+    else:
+        endpoint = check_endpoint(connect or "", secure=keys is not None)
+        source = Served(Address(endpoint, run_id, keys=keys))
+        source.hello()
+    is_local = _is_loopback(host)
+    if not is_local:
+        token = token or secrets.token_urlsafe(18)
+    use_one_thread()
+    log_to_stderr(logging.WARNING)
+    app = make_app(Feed(source), hosts=_LOOPBACK if is_local else (), token=token or "")
+    with _listening(host, port) as listener:
+        shown = f"[{host}]" if ":" in host else host
+        address = f"http://{shown}:{listener.getsockname()[1]}/"
+        click.echo(f"board: {address}{f'?token={token}' if token else ''}")
+        if opens:
+            webbrowser.open(f"{address}{f'?token={token}' if token else ''}")
+        server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                access_log=False,
+                timeout_graceful_shutdown=2,
+                ws_max_size=MOST_BYTES,
+                server_header=False,
+            )
+        )
+        return run_service(partial(_serve, server, listener))
+
+
+def _serve(server: "uvicorn.Server", listener: socket.socket, stop: threading.Event) -> None:
+    """Serve until ``stop`` is set."""
+    thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
+    thread.start()
+    while thread.is_alive() and not stop.wait(0.2):
+        pass
+    server.should_exit = True
+    thread.join(GRACE_S)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    listener = None
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
+    except OSError as error:
+        if listener is not None:
+            listener.close()
+        raise ConfigError(
+            f"--host {host} --port {port}: {error.strerror}; name an address of this machine and a "
+            f"port that is free, or 0"
+        ) from error
+    return listener

@@ -1,0 +1,103 @@
+"""What the page is told: asked of the run once a second at most, however many look at the page."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import msgspec
+
+import udrl
+from udrl.errors import UdrlError
+from udrl_board.source import Source
+from udrl_proto.messages import Contents, EvaluationStatus, Hello, IterationStatus, Status
+
+#: Seconds that an answer is good for.
+FRESH_S = 1.0
+#: Pages of history in one go; the rest comes with the next.
+_PAGES = 20
+
+Answer = TypeVar("Answer")
+
+
+class News(msgspec.Struct, frozen=True, kw_only=True):
+    """What is new for a page.
+
+    Attributes:
+        software: version of udrl that the board is of.
+        hello: the run's specification; None: the page has it.
+        status: how the run is doing; None: nobody can say now.
+        iterations: completed after the one that the page named.
+        evaluations: made in these.
+        contents: the replay buffer; None: the page has it.
+        problem: why something cannot be said now; empty: nothing is wrong.
+    """
+
+    software: str
+    hello: Hello | None
+    status: Status | None
+    iterations: list[IterationStatus]
+    evaluations: list[EvaluationStatus]
+    contents: Contents | None
+    problem: str
+
+
+class Feed:
+    """Knows a run, as fresh as :data:`FRESH_S`.
+
+    Args:
+        source: asked for it.
+        clock: seconds.
+    """
+
+    def __init__(self, source: Source, clock: Callable[[], float] = time.monotonic) -> None:
+        self.source = source
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._asked_at = float("-inf")
+        self._hello: Hello | None = None
+        self._status: Status | None = None
+        self._contents: Contents | None = None
+        self._iterations: list[IterationStatus] = []
+        self._evaluations: list[EvaluationStatus] = []
+        self._problem = ""
+
+    def news(self, after: int = -1) -> News:
+        """Return what is new for a page that knows all iterations up to ``after``; -1: nothing."""
+        with self._lock:
+            if self._clock() - self._asked_at >= FRESH_S:
+                self._ask()
+                self._asked_at = self._clock()
+            known = self._iterations
+            # The page may be older than this board, and know of another run.
+            first = after + 1 if after < len(known) else 0
+            contents = self._contents
+            return News(
+                software=udrl.__version__,
+                hello=self._hello if first == 0 else None,
+                status=self._status,
+                iterations=known[first:],
+                evaluations=[e for e in self._evaluations if e.iteration >= first],
+                contents=contents if contents and contents.iteration > after else None,
+                problem=self._problem,
+            )
+
+    def _ask(self) -> None:
+        self._problem = ""
+        try:
+            self._hello = self._hello or self.source.hello()
+            self._status = self.source.status()
+            if self._iterations and self._status.iteration < self._iterations[-1].iteration:
+                self._iterations, self._evaluations = [], []  # the run came back from a backup
+            for _ in range(_PAGES):
+                page = self.source.history(len(self._iterations) - 1)
+                self._iterations += page.iterations
+                self._evaluations += page.evaluations
+                if not page.more:
+                    break
+            known = self._contents
+            if known is None or not known.returns or known.iteration < self._status.iteration:
+                self._contents = self.source.contents()
+        except UdrlError as error:
+            self._status = None
+            self._problem = str(error)

@@ -1,0 +1,230 @@
+"""Where the board knows things from: a replay service, or the file of a run that nobody serves."""
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Literal, Protocol, TypeVar
+
+from udrl.errors import PeerError, Unreachable
+from udrl_launch.address import Address, connected
+from udrl_launch.agents import load_agent
+from udrl_launch.inspection import read_run, read_status, served_at
+from udrl_proto import keys
+from udrl_proto.asking import Asker
+from udrl_proto.codec import LARGEST
+from udrl_proto.messages import (
+    Contents,
+    ContentsRequest,
+    Hello,
+    History,
+    HistoryRequest,
+    Status,
+    StatusRequest,
+    Weights,
+    WeightsRequest,
+)
+from udrl_replay.reporting import contents, history
+from udrl_replay.store import Store
+
+log = logging.getLogger("udrl")
+
+Answer = TypeVar("Answer")
+Wanted = int | Literal["latest", "best"]
+
+#: Seconds that an answer may take; who looks at a page does not wait for longer.
+_ANSWER_S = 3.0
+
+
+class Source(Protocol):
+    """What can be asked about a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
+
+    def hello(self) -> Hello:
+        """Return the run's specification."""
+        ...
+
+    def status(self) -> Status:
+        """Return how the run is doing."""
+        ...
+
+    def history(self, after: int) -> History:
+        """Return what came of the iterations after one, or the first of them."""
+        ...
+
+    def contents(self) -> Contents:
+        """Return what the replay buffer holds."""
+        ...
+
+    def weights(self, version: Wanted) -> Weights:
+        """Return a weights version that is kept."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what is held."""
+        ...
+
+
+class Stored:
+    """A run by its directory alone; what is read is of the moment.
+
+    Args:
+        run_dir: its directory.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+
+    def hello(self) -> Hello:
+        """Return the run's specification."""
+        with closing(Store(self._run_dir, read_only=True)) as store:
+            return store.fact("hello", Hello)
+
+    def status(self) -> Status:
+        """Return how the run was doing when it was last worked on."""
+        return read_status(self._run_dir)
+
+    def history(self, after: int) -> History:
+        """Return what came of the iterations after one, or the first of them."""
+        with closing(Store(self._run_dir, read_only=True)) as store:
+            return history(store, after)
+
+    def contents(self) -> Contents:
+        """Return what the replay buffer holds."""
+        with closing(Store(self._run_dir, read_only=True)) as store:
+            return contents(read_run(self._run_dir, store))
+
+    def weights(self, version: Wanted) -> Weights:
+        """Return a weights version that is kept."""
+        agent = load_agent(self._run_dir, version)
+        return Weights(version=agent.version, weights=agent.weights)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Served:
+    """A run by the replay service that answers for it; connects again after it did not.
+
+    Args:
+        address: where it is.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self._address = address
+        self._stack = ExitStack()
+        self._line: tuple[Asker, Hello] | None = None
+        self._lock = threading.Lock()
+
+    def hello(self) -> Hello:
+        """Return the run's specification."""
+        with self._lock:
+            return self._connected()[1]
+
+    def status(self) -> Status:
+        """Return how the run is doing."""
+        return self._ask(lambda asker: asker.ask(keys.STATUS, StatusRequest(), Status))
+
+    def history(self, after: int) -> History:
+        """Return what came of the iterations after one, or the first of them."""
+        request = HistoryRequest(after=after)
+        return self._ask(lambda asker: asker.ask(keys.HISTORY, request, History))
+
+    def contents(self) -> Contents:
+        """Return what the replay buffer holds."""
+        return self._ask(lambda asker: asker.ask(keys.CONTENTS, ContentsRequest(), Contents))
+
+    def weights(self, version: Wanted) -> Weights:
+        """Return a weights version that is kept."""
+        request = WeightsRequest(version=version)
+        return self._ask(lambda asker: asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
+
+    def close(self) -> None:
+        """Leave the run's router."""
+        with self._lock:
+            self._disconnect()
+
+    def _ask(self, question: Callable[[Asker], Answer]) -> Answer:
+        with self._lock:
+            asker, _ = self._connected()
+            try:
+                return question(asker)
+            except Unreachable:
+                self._disconnect()
+                raise
+
+    def _connected(self) -> tuple[Asker, Hello]:
+        if self._line is None:
+            session, hello = self._stack.enter_context(connected("observer", self._address))
+            self._line = Asker(session, hello.run_id, "the board", patience_s=_ANSWER_S), hello
+        return self._line
+
+    def _disconnect(self) -> None:
+        self._line = None
+        self._stack.close()
+
+
+class Directory:
+    """A run by its directory: asked where it is served, read where it is not.
+
+    Args:
+        run_dir: its directory.
+        keys_dir: folder with the keys that an observer proves its role with.
+    """
+
+    def __init__(self, run_dir: Path, keys_dir: Path | None = None) -> None:
+        self._run_dir = run_dir
+        self._keys_dir = keys_dir
+        self._stored = Stored(run_dir)
+        self._served: tuple[str, Served] | None = None
+        self._lock = threading.Lock()
+
+    def hello(self) -> Hello:
+        """Return the run's specification."""
+        return self._stored.hello()
+
+    def status(self) -> Status:
+        """Return how the run is doing, or was when it was last worked on."""
+        return self._ask(lambda source: source.status())
+
+    def history(self, after: int) -> History:
+        """Return what came of the iterations after one, or the first of them."""
+        return self._ask(lambda source: source.history(after))
+
+    def contents(self) -> Contents:
+        """Return what the replay buffer holds."""
+        return self._ask(lambda source: source.contents())
+
+    def weights(self, version: Wanted) -> Weights:
+        """Return a weights version that is kept."""
+        return self._ask(lambda source: source.weights(version))
+
+    def close(self) -> None:
+        """Leave the run's router."""
+        with self._lock:
+            if self._served is not None:
+                self._served[1].close()
+                self._served = None
+
+    def _ask(self, question: Callable[[Source], Answer]) -> Answer:
+        served = self._service()
+        if served is not None:
+            try:
+                return question(served)
+            except PeerError as error:
+                log.debug("%s is read, since it does not answer: %s", self._run_dir, error)
+        return question(self._stored)
+
+    def _service(self) -> Served | None:
+        endpoint = served_at(self._run_dir)
+        with self._lock:
+            if self._served is not None and self._served[0] != endpoint:
+                self._served[1].close()
+                self._served = None
+            if endpoint is None:
+                return None
+            if self._served is None:
+                run_id = self._stored.hello().run_id
+                address = Address(endpoint, run_id, _ANSWER_S, self._keys_dir)
+                self._served = endpoint, Served(address)
+            return self._served[1]

@@ -1,0 +1,174 @@
+// Commanding the agent: what to ask for, the episode as it goes on, and what came of each.
+import { Plane, Seen, spans } from "./map.js";
+
+const $ = (id) => document.getElementById(id);
+const number = (x, digits = 1) => (x == null ? "–" : x.toLocaleString("en", { maximumFractionDigits: digits }));
+
+export class Command {
+  constructor() {
+    this.map = new Plane($("map"), { x: "desired return", y: "desired horizon", label: "Commands: what the replay buffer has seen, and what is asked for" });
+    this.obeyed = new Plane($("obeyed"), { x: "asked", y: "obtained", label: "Asked against obtained returns" });
+    this.ended = [];
+    this.contents = null;
+    this.moment = null;
+    this.orders = [];
+    for (const name of ["desired-return", "desired-horizon"]) {
+      const [slider, field] = [$(`${name}-slider`), $(name)];
+      slider.addEventListener("input", () => { field.value = Math.round(slider.value * 10) / 10; this.choose(); });
+      field.addEventListener("input", () => { slider.value = field.value; this.choose(); });
+    }
+    this.map.svg.addEventListener("click", (event) => {
+      if (!this.contents) return;
+      const [r, h] = this.map.at(event);
+      this.fill(r, h);
+    });
+    $("order").addEventListener("submit", (event) => { event.preventDefault(); this.begin(); });
+    $("tell").addEventListener("click", () => this.send({ do: "tell", ...this.command() }));
+    $("pause").addEventListener("click", () => this.send({ do: "pause", paused: !this.moment?.paused }));
+    $("step").addEventListener("click", () => this.send({ do: "step" }));
+    this.drawObeyed();
+  }
+
+  // What the run says of the buffer: fields, sliders and map follow.
+  know({ hello, contents }) {
+    const first = !this.contents;
+    this.contents = contents;
+    if (!contents.returns.length) { this.contents = null; return; }
+    this.follows = hello.config.desired_horizon === "return";
+    const [xs, ys] = spans(contents, [[0, 1]]);
+    [$("desired-return-slider").min, $("desired-return-slider").max] = xs.map(Math.round);
+    [$("desired-horizon-slider").min, $("desired-horizon-slider").max] = [1, Math.max(2, Math.round(ys[1]))];
+    for (const id of ["desired-horizon", "desired-horizon-slider"]) $(id).disabled = this.follows;
+    const versions = $("version"), chosen = versions.value;
+    const known = ["latest", "best", ...contents.versions.map(String).reverse()];
+    if (known.join() !== [...versions.options].map((o) => o.value).join())
+      versions.replaceChildren(...known.map((value) => new Option(value, value, false, value === chosen)));
+    if (first) this.fill(contents.desired_return, contents.desired_horizon);
+    else this.choose();
+  }
+
+  fill(r, h) {
+    for (const [name, value] of [["desired-return", Math.round(r * 10) / 10], ["desired-horizon", Math.max(1, Math.round(h))]])
+      for (const id of [name, `${name}-slider`]) $(id).value = value;
+    this.choose();
+  }
+
+  command() {
+    const desired_return = Number($("desired-return").value);
+    return {
+      desired_return,
+      desired_horizon: this.follows ? Math.max(0, Math.floor(desired_return)) : Math.round(Number($("desired-horizon").value)),
+      temperature: $("greedy").checked ? 0 : 1,
+    };
+  }
+
+  // Draw the map with what is chosen, and say whether the buffer has seen the like.
+  choose() {
+    if (!this.contents) return;
+    const { desired_return: r, desired_horizon: h } = this.command();
+    const [xs, ys] = spans(this.contents, [[r, h], [0, 1]]);
+    this.map.begin(xs, ys);
+    const seen = new Seen(this.contents, xs, ys);
+    seen.shade(this.map);
+    this.contents.returns.forEach((x, i) => this.map.dot(x, this.contents.lengths[i], { class: "episode", opacity: 0.5, r: 2 }));
+    this.map.cross(r, h, "told", 8);
+    $("unseen").textContent = seen.has(r, h)
+      ? "The replay buffer has episodes like this."
+      : "The replay buffer has no episode like this: the agent has to make do without an example.";
+  }
+
+  begin() {
+    const version = $("version").value;
+    this.send({
+      do: "begin", ...this.command(), seed: Number($("seed").value),
+      version: /^\d+$/.test(version) ? Number(version) : version,
+    });
+  }
+
+  send(order) {
+    if (this.socket?.readyState === WebSocket.OPEN) { this.socket.send(JSON.stringify(order)); return; }
+    this.orders = order.do === "begin" ? [order] : [];
+    if (this.socket?.readyState !== WebSocket.CONNECTING) this.connect();
+  }
+
+  connect() {
+    const url = new URL("stage", location.href);
+    url.protocol = url.protocol.replace("http", "ws");
+    this.socket = new WebSocket(url);
+    this.socket.binaryType = "blob";
+    this.socket.addEventListener("open", () => this.orders.splice(0).forEach((o) => this.socket.send(JSON.stringify(o))));
+    this.socket.addEventListener("message", ({ data }) => (data instanceof Blob ? this.picture(data) : this.said(JSON.parse(data))));
+    this.socket.addEventListener("close", () => {
+      if (this.moment && !this.moment.over) $("outcome").textContent = "The board's server left; the episode is lost.";
+      this.moment = null;
+      this.buttons();
+    });
+  }
+
+  picture(blob) {
+    const image = $("picture"), url = URL.createObjectURL(blob);
+    image.onload = () => URL.revokeObjectURL(url);
+    image.src = url;
+    image.hidden = false;
+    $("no-picture").hidden = true;
+  }
+
+  said(message) {
+    if (message.problem !== undefined) {
+      $("outcome").textContent = message.problem;
+      this.moment = null;
+      this.buttons();
+      return;
+    }
+    const fresh = !this.moment?.over && message.over;
+    this.moment = message;
+    if (!message.picture) {
+      $("picture").hidden = true;
+      $("no-picture").hidden = false;
+      $("no-picture").textContent = "This environment draws no pictures.";
+    }
+    const entries = [
+      ["step", number(message.step)],
+      ["obtained", number(message.obtained)],
+      ["still desired", number(message.desired_return)],
+      ["within", `${number(Math.max(message.desired_horizon, 1))} steps`],
+      ["last action", message.action ?? "–"],
+      ["next action", message.probabilities.map((p) => p.toFixed(2)).join(" ") || "–"],
+    ];
+    $("moment").replaceChildren(...entries.map(([name, value]) => {
+      const pair = document.createElement("div");
+      pair.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: value }));
+      return pair;
+    }));
+    if (fresh) this.end(message);
+    this.buttons();
+  }
+
+  buttons() {
+    const on = this.moment && !this.moment.over;
+    $("tell").disabled = $("pause").disabled = !on;
+    $("step").disabled = !(on && this.moment.paused);
+    $("pause").textContent = on && this.moment.paused ? "Go on" : "Pause";
+    $("pause").setAttribute("aria-pressed", String(Boolean(on && this.moment.paused)));
+  }
+
+  end(m) {
+    this.ended.push(m);
+    const how = [m.temperature === 0 ? "greedy" : "sampled", m.was_told ? "told anew on the way" : "", m.truncated ? "cut" : ""].filter(Boolean).join(", ");
+    const row = $("episodes").tBodies[0].insertRow(0);
+    for (const value of [m.seed, m.version, number(m.asked_return), number(m.asked_horizon), number(m.obtained), number(m.step), how]) row.insertCell().textContent = value;
+    $("outcome").textContent = `Asked for ${number(m.asked_return)} within ${number(m.asked_horizon)} steps, obtained ${number(m.obtained)} in ${number(m.step)}.`;
+    this.drawObeyed();
+  }
+
+  drawObeyed() {
+    const n = this.ended.length;
+    const both = this.ended.flatMap((m) => [m.asked_return, m.obtained]);
+    const low = Math.min(0, ...both), high = Math.max(1, ...both), room = 0.08 * (high - low);
+    const ends = [low - room, high + room];
+    this.obeyed.begin(ends, ends);
+    this.obeyed.line(ends[0], ends[0], ends[1], ends[1], "even");
+    for (const m of this.ended) this.obeyed.dot(m.asked_return, m.obtained, { class: "episode", r: 4, opacity: m.was_told ? 0.4 : 0.9 });
+    if (n) $("obeyed-said").textContent = `${n} ${n === 1 ? "episode" : "episodes"}; on the dashed line asked and obtained are equal. Pale: told anew on the way.`;
+  }
+}

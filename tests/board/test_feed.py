@@ -1,0 +1,187 @@
+"""What the page is told, and how seldom the run is asked for it."""
+
+from collections import Counter
+from typing import Any
+
+import msgspec
+import pytest
+
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.errors import Unreachable
+from udrl_board.feed import FRESH_S, Feed
+from udrl_proto.messages import (
+    Contents,
+    EvaluationStatus,
+    Hello,
+    History,
+    IterationStatus,
+    Status,
+    Weights,
+)
+
+HELLO = Hello(
+    protocol=1, software="1", run_id="run", config=Config(environment="CartPole-v1"),
+    environment=EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=500),
+    allow_inexact=False, exact=True,
+)  # fmt: skip
+
+
+def iteration(number: int) -> IterationStatus:
+    return IterationStatus(
+        iteration=number, env_steps=100 * number, wall_s=1.0, return_min=0.0, return_mean=1.0,
+        return_max=2.0, explored_return=1.0, commanded_min=None, commanded_max=None, admitted=1,
+        weights_version=number, loss=None,
+    )  # fmt: skip
+
+
+def evaluation(number: int) -> EvaluationStatus:
+    return EvaluationStatus(
+        iteration=number, env_steps=100 * number, mean=1.0, std=0.0, ci95_low=1.0, ci95_high=1.0,
+        episodes=1,
+    )  # fmt: skip
+
+
+class Told:
+    """A run that has got so far, and counts what it is asked."""
+
+    def __init__(self, iterations: int) -> None:
+        self.iterations = iterations
+        self.page = 1000
+        self.asked: Counter[str] = Counter()
+        self.is_gone = False
+
+    def _ask(self, what: str) -> None:
+        self.asked[what] += 1
+        if self.is_gone:
+            raise Unreachable("nobody answers")
+
+    def hello(self) -> Hello:
+        self._ask("hello")
+        return HELLO
+
+    def status(self) -> Status:
+        self._ask("status")
+        # Only this is read of it here; tests of the whole system have whole ones.
+        fields: dict[str, Any] = dict.fromkeys(Status.__struct_fields__)
+        return Status(**fields | {"iteration": self.iterations - 1})
+
+    def history(self, after: int) -> History:
+        self._ask("history")
+        numbers = list(range(after + 1, self.iterations))
+        page = numbers[: self.page]
+        return History(
+            iterations=tuple(map(iteration, page)),
+            evaluations=tuple(evaluation(n) for n in page if n % 2),
+            more=len(numbers) > len(page),
+        )
+
+    def contents(self) -> Contents:
+        self._ask("contents")
+        return Contents(
+            iteration=self.iterations - 1, returns=(1.0,), lengths=(1,), iterations=(0,),
+            desired_return=1.0, desired_horizon=1, return_std=0.0, desired_returns=(),
+            desired_horizons=(), versions=(),
+        )  # fmt: skip
+
+    def weights(self, version: object) -> Weights:
+        raise AssertionError("a feed needs no weights")
+
+    def close(self) -> None:
+        pass
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def run() -> Told:
+    return Told(5)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def feed(run: Told, clock: Clock) -> Feed:
+    return Feed(run, clock)
+
+
+def test_a_new_page_is_told_everything(feed: Feed) -> None:
+    news = feed.news()
+    assert news.hello == HELLO
+    assert [i.iteration for i in news.iterations] == [0, 1, 2, 3, 4]
+    assert [e.iteration for e in news.evaluations] == [1, 3]
+    assert news.contents is not None
+    assert news.problem == ""
+    assert msgspec.json.decode(msgspec.json.encode(news))["iterations"]
+
+
+def test_a_page_that_knows_something_is_told_the_rest(feed: Feed, run: Told, clock: Clock) -> None:
+    feed.news()
+    run.iterations = 8
+    clock.now += FRESH_S
+    news = feed.news(after=4)
+    assert [i.iteration for i in news.iterations] == [5, 6, 7]
+    assert [e.iteration for e in news.evaluations] == [5, 7]
+    assert news.hello is None
+    assert news.contents is not None
+    again = feed.news(after=7)
+    assert (again.iterations, again.evaluations, again.contents) == ([], [], None)
+
+
+def test_however_many_look_the_run_is_asked_once_a_second(
+    feed: Feed, run: Told, clock: Clock
+) -> None:
+    for _ in range(10):
+        feed.news()
+    assert run.asked == {"hello": 1, "status": 1, "history": 1, "contents": 1}
+    clock.now += FRESH_S
+    for _ in range(10):
+        feed.news(after=4)
+    # The buffer has not changed since.
+    assert run.asked == {"hello": 1, "status": 2, "history": 2, "contents": 1}
+
+
+def test_a_long_history_is_fetched_page_by_page(feed: Feed, run: Told) -> None:
+    run.iterations, run.page = 100, 7
+    assert [i.iteration for i in feed.news().iterations] == list(range(100))
+
+
+def test_when_nobody_answers_the_page_keeps_what_it_knows(
+    feed: Feed, run: Told, clock: Clock
+) -> None:
+    feed.news()
+    run.is_gone = True
+    clock.now += FRESH_S
+    news = feed.news(after=4)
+    assert (news.status, news.iterations, news.problem) == (None, [], "nobody answers")
+    assert len(feed.news().iterations) == 5
+    run.is_gone, run.iterations = False, 6
+    clock.now += FRESH_S
+    news = feed.news(after=4)
+    assert (news.problem, [i.iteration for i in news.iterations]) == ("", [5])
+
+
+def test_a_page_of_another_run_is_told_everything(feed: Feed) -> None:
+    news = feed.news(after=77)
+    assert news.hello == HELLO
+    assert len(news.iterations) == 5
+
+
+def test_a_run_that_came_back_from_a_backup_is_told_anew(
+    feed: Feed, run: Told, clock: Clock
+) -> None:
+    feed.news()
+    run.iterations = 3
+    clock.now += FRESH_S
+    news = feed.news(after=4)
+    assert news.hello == HELLO
+    assert [i.iteration for i in news.iterations] == [0, 1, 2]

@@ -1,0 +1,296 @@
+"""The board's server on real runs: what it tells, what it refuses, and how its stage obeys."""
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from click.testing import CliRunner
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from udrl.errors import ConfigError, StoreError, Unreachable
+from udrl_board import app as board
+from udrl_board.app import make_app
+from udrl_board.command import board as command
+from udrl_board.feed import Feed
+from udrl_board.source import Directory, Served, Stored
+from udrl_launch.address import Address
+from udrl_launch.agents import load_agent
+from udrl_launch.cli import cli as command_line
+from udrl_launch.inspection import read_status
+from udrl_proto.messages import Status
+from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
+
+
+def page(run_dir: Path, **options: Any) -> TestClient:
+    return TestClient(make_app(Feed(Directory(run_dir)), **options), base_url="http://127.0.0.1")
+
+
+@pytest.fixture
+def client(ended_run: Path) -> Iterator[TestClient]:
+    with page(ended_run) as client:
+        yield client
+
+
+# What it tells.
+
+
+def test_the_page_and_its_parts(client: TestClient) -> None:
+    main = client.get("/")
+    assert "<title>udrl board</title>" in main.text
+    assert "default-src 'none'" in main.headers["content-security-policy"]
+    assert main.headers["x-content-type-options"] == "nosniff"
+    for part in ("board.js", "board.css", "vendor/uplot/uPlot.esm.js", "vendor/uplot/LICENSE"):
+        assert client.get(f"/{part}").status_code == 200
+    assert client.get("/../app.py").status_code == 404
+    assert "://" not in main.text.replace("http://www.w3.org", ""), "the page needs nobody else"
+
+
+def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
+    news = client.get("/news", params={"after": -1}).json()
+    status = read_status(ended_run)
+    assert msgspec.convert(news["status"], Status) == status
+    assert [i["iteration"] for i in news["iterations"]] == list(range(status.iteration + 1))
+    assert news["evaluations"]
+    assert len(news["contents"]["returns"]) >= status.buffer.episodes
+    assert client.get("/news", params={"after": status.iteration}).json()["iterations"] == []
+
+
+@pytest.mark.parametrize("after", ["x", "1.5", "--1", "9" * 40])
+def test_bad_questions(client: TestClient, after: str) -> None:
+    answer = client.get("/news", params={"after": after})
+    assert answer.status_code == 400
+    assert "expected an iteration" in answer.text
+
+
+def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    process = cli(*arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 3, "some iterations")
+    with (
+        closing(Served(Address(endpoint))) as served,
+        closing(Directory(run_dir)) as directory,
+    ):
+        stored = Stored(run_dir)
+        assert served.hello().run_id == directory.hello().run_id == stored.hello().run_id
+        assert served.status().actors
+        assert directory.status().actors, "a directory that is served is asked, not read"
+        first = served.history(-1).iterations[:3]
+        assert first == directory.history(-1).iterations[:3] == stored.history(-1).iterations[:3]
+        assert served.contents().returns
+        assert stored.contents().returns
+        version = served.weights("latest")
+        assert version.weights
+        process.process.terminate()
+        process.finish()
+        with pytest.raises(Unreachable):
+            served.status()
+        assert not directory.status().actors
+        assert directory.contents() == stored.contents()
+        assert directory.weights("latest") == stored.weights("latest")
+
+
+# Who may look.
+
+
+def test_a_board_has_a_name(ended_run: Path) -> None:
+    with page(ended_run, hosts=("127.0.0.1", "localhost")) as client:
+        assert client.get("/").status_code == 200
+        answer = client.get("/", headers={"host": "evil.example"})
+        assert answer.status_code == 421
+        assert client.get("/news", headers={"host": "localhost:80"}).status_code == 200
+
+
+def test_pages_of_elsewhere_may_not_use_it(client: TestClient) -> None:
+    assert client.get("/news", headers={"origin": "http://evil.example"}).status_code == 403
+    assert client.get("/news", headers={"origin": "http://127.0.0.1"}).status_code == 200
+    with (
+        pytest.raises(WebSocketDisconnect) as refused,
+        client.websocket_connect("/stage", headers={"origin": "http://evil.example"}) as socket,
+    ):
+        socket.receive_text()
+    assert refused.value.code == 1008
+
+
+def test_a_token_is_asked_for_and_becomes_a_cookie(ended_run: Path) -> None:
+    with page(ended_run, token="open-sesame") as client:
+        for path in ("/", "/news", "/board.js"):
+            answer = client.get(path)
+            assert answer.status_code == 401
+            assert "the address that `udrl board` printed" in answer.text
+        assert client.get("/", params={"token": "wrong"}).status_code == 401
+        let_in = client.get("/", params={"token": "open-sesame"}, follow_redirects=False)
+        assert (let_in.status_code, let_in.headers["location"]) == (303, "/")
+        assert "HttpOnly" in let_in.headers["set-cookie"]
+        assert "SameSite=strict" in let_in.headers["set-cookie"]
+        assert client.get("/").status_code == 200
+        known = {"cookie": "udrl_board=open-sesame"}
+        with client.websocket_connect("/stage", headers=known) as socket:
+            socket.send_text("{}")
+            assert "not an order" in socket.receive_json()["problem"]
+
+
+# The stage.
+
+
+def begin(**changes: Any) -> dict[str, Any]:
+    usual = {
+        "do": "begin", "desired_return": 30.0, "desired_horizon": 40, "seed": 5,
+        "temperature": 1.0, "version": "latest",
+    }  # fmt: skip
+    return usual | changes
+
+
+def moments(socket: Any) -> Iterator[dict[str, Any]]:
+    """Yield moments, with their pictures under the name that they have as a promise."""
+    while True:
+        moment = socket.receive_json()
+        if moment.get("picture"):
+            moment["picture"] = socket.receive_bytes()
+        yield moment
+
+
+def ending(socket: Any) -> dict[str, Any]:
+    return next(m for m in moments(socket) if m.get("over"))
+
+
+def played(run_dir: Path, *options: object) -> dict[str, Any]:
+    words = ["play", run_dir, "--episodes", 1, "--json", *options]
+    result = CliRunner().invoke(
+        command_line, list(map(str, words)), standalone_mode=False, catch_exceptions=False
+    )
+    report: dict[str, Any] = json.loads(result.stdout)
+    return report
+
+
+def test_the_stage_shows_the_episode_that_play_shows(client: TestClient, ended_run: Path) -> None:
+    with client.websocket_connect("/stage") as socket:
+        for temperature in (1.0, 0.0):
+            socket.send_json(begin(temperature=temperature))
+            first = next(moments(socket))
+            assert (first["step"], first["action"], first["over"]) == (0, None, False)
+            assert first["picture"].startswith(b"\xff\xd8"), "a JPEG"
+            assert sum(first["probabilities"]) == pytest.approx(1)
+            last = ending(socket)
+            expected = played(
+                ended_run, "--seed", 5, "--desired-return", 30, "--desired-horizon", 40,
+                "--temperature", temperature,
+            )  # fmt: skip
+            assert last["obtained"] == expected["episode_return"]
+            assert last["step"] == expected["length"]
+            assert (last["asked_return"], last["asked_horizon"]) == (30.0, 40)
+            assert last["version"] == load_agent(ended_run).version
+
+
+def test_pause_step_and_another_order_on_the_way(client: TestClient) -> None:
+    with client.websocket_connect("/stage") as socket:
+        seen = moments(socket)
+        socket.send_json(begin(paused=True))
+        assert next(seen)["paused"]
+        for step in (1, 2):
+            socket.send_json({"do": "step"})
+            moment = next(seen)
+            assert (moment["step"], moment["desired_return"]) == (step, 30.0 - step)
+        socket.send_json(
+            {"do": "tell", "desired_return": 90.0, "desired_horizon": 70, "temperature": 0.0}
+        )
+        told = next(seen)
+        assert (told["desired_return"], told["desired_horizon"]) == (90.0, 70)
+        assert (told["step"], told["was_told"], told["temperature"]) == (2, True, 0.0)
+        socket.send_json({"do": "pause", "paused": False})
+        last = ending(socket)
+        assert last["was_told"]
+        assert last["desired_return"] == 90.0 - (last["step"] - 2)
+
+
+def test_a_checkpoint_of_the_run_can_be_chosen(client: TestClient, ended_run: Path) -> None:
+    kept = client.get("/news").json()["contents"]["versions"]
+    assert len(kept) > 1
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(begin(version=kept[0], paused=True))
+        assert next(moments(socket))["version"] == kept[0]
+        socket.send_json(begin(version=10**9, paused=True))
+        assert "not kept" in next(moments(socket))["problem"]
+        socket.send_json(begin(paused=True))
+        assert next(moments(socket))["version"] == max(kept)
+
+
+@pytest.mark.parametrize(
+    "order",
+    ["", "[]", '{"do": "fly"}', '{"do": "begin"}', json.dumps(begin(desired_return="much")),
+     json.dumps(begin(seed=-1)), json.dumps(begin(temperature=-1.0)),
+     json.dumps(begin(surplus=1, desired_horizon=2**40))],
+)  # fmt: skip
+def test_what_is_no_order_is_said_to_be_none(client: TestClient, order: str) -> None:
+    with client.websocket_connect("/stage") as socket:
+        socket.send_text(order)
+        assert "not an order" in socket.receive_json()["problem"]
+        socket.send_json(begin(paused=True))
+        assert next(moments(socket))["step"] == 0
+
+
+def test_orders_before_an_episode_has_begun_do_nothing(client: TestClient) -> None:
+    with client.websocket_connect("/stage") as socket:
+        for order in ({"do": "step"}, {"do": "pause", "paused": True}):
+            socket.send_json(order)
+        socket.send_json(begin(paused=True))
+        assert next(moments(socket))["step"] == 0
+
+
+def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board, "MOST_STAGES", 1)
+    with client.websocket_connect("/stage") as first:
+        first.send_json(begin(paused=True))
+        next(moments(first))
+        with client.websocket_connect("/stage") as second:
+            assert "try later" in second.receive_json()["problem"]
+    with client.websocket_connect("/stage") as third:
+        third.send_json(begin(paused=True))
+        assert next(moments(third))["step"] == 0
+
+
+def test_an_environment_without_pictures_is_played_all_the_same(
+    run: Callable[..., Status], tmp_path: Path
+) -> None:
+    from whole_run import toy
+
+    run(toy(), 200, run_dir=tmp_path / "toy")
+    with page(tmp_path / "toy") as client, client.websocket_connect("/stage") as socket:
+        socket.send_json(begin(desired_return=1.0, desired_horizon=1, temperature=0.0))
+        last = ending(socket)
+        assert last["picture"] is False
+        assert last["step"] in (1, 2)
+
+
+# The command.
+
+
+def test_the_command_refuses_what_cannot_be(tmp_path: Path, ended_run: Path) -> None:
+    def call(*words: object) -> None:
+        CliRunner().invoke(
+            command, list(map(str, words)), standalone_mode=False, catch_exceptions=False
+        )
+
+    with pytest.raises(ConfigError, match="give either RUN_DIR or --connect"):
+        call()
+    with pytest.raises(StoreError, match="holds no run"):
+        call(tmp_path)
+    with pytest.raises(Unreachable):
+        call("--connect", f"tcp/127.0.0.1:{free_port()}")
+    with pytest.raises(ConfigError, match="name an address of this machine"):
+        call(ended_run, "--host", "203.0.113.7")
+
+
+def test_beyond_loopback_a_token_is_made(cli: Callable[..., Cli], ended_run: Path) -> None:
+    process = cli("board", str(ended_run), "--host", "0.0.0.0").process
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    assert said.startswith("board: http://0.0.0.0:")
+    assert len(said.split("?token=")[1].strip()) >= 20
+    process.terminate()
+    assert process.wait(20) == 128 + signal.SIGTERM
