@@ -12,16 +12,19 @@ ARGS ?=
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: train test test-slow test-compose lint format types bench chaos soak fuzz setup setup-dev clean
+.PHONY: train test test-slow test-browser test-compose lint format types bench chaos soak fuzz setup setup-dev clean
 
 train: setup  ## Train LunarLander until it lands.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 100 $(ARGS)
 
 test: setup-dev  ## The tests, except the slow ones.
-	$(VENV)/bin/python -m pytest -m "not slow and not compose" -n 2 $(ARGS)
+	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 2 $(ARGS)
 
 test-slow: setup-dev  ## What is too slow for `make test`.
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)
+
+test-browser: setup-dev  ## The board in Chromium; skipped where there is none.
+	$(VENV)/bin/python -m pytest -m browser $(ARGS)
 
 test-compose: setup-dev  ## The containers, with a real Docker engine; skipped where there is none.
 	$(VENV)/bin/python -m pytest -m compose $(ARGS)

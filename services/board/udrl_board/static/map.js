@@ -1,7 +1,7 @@
 // The plane of returns and lengths: what the replay buffer has seen, and what somebody asks for.
 const SVG = "http://www.w3.org/2000/svg";
 const WIDTH = 520, HEIGHT = 300, LEFT = 52, BOTTOM = 34, TOP = 8, RIGHT = 10;
-const CELLS = 24;
+const CELLS = 36;
 
 export function element(name, attributes = {}, text = "") {
   const made = document.createElementNS(SVG, name);
@@ -81,20 +81,24 @@ export class Plane {
   }
 }
 
-// Which cells of the plane the buffer has episodes in.
+// Which cells of the plane the buffer has episodes in, or next to.
 export class Seen {
   constructor(contents, xs, ys) {
     Object.assign(this, { xs, ys });
-    this.cells = new Set(contents.returns.map((r, i) => this.cell(r, contents.lengths[i])));
+    this.cells = new Set();
+    contents.returns.forEach((r, i) => {
+      const [x, y] = this.cell(r, contents.lengths[i]);
+      for (const dx of [-1, 0, 1]) for (const dy of [-1, 0, 1]) this.cells.add(`${x + dx},${y + dy}`);
+    });
   }
 
   cell(r, length) {
     const part = (value, [low, high]) => Math.floor(((value - low) / (high - low)) * CELLS);
-    return `${part(r, this.xs)},${part(length, this.ys)}`;
+    return [part(r, this.xs), part(length, this.ys)];
   }
 
   has(r, length) {
-    return this.cells.has(this.cell(r, length));
+    return this.cells.has(this.cell(r, length).join());
   }
 
   shade(plane) {

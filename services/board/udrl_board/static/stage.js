@@ -4,6 +4,8 @@ import { Plane, Seen, spans } from "./map.js";
 const $ = (id) => document.getElementById(id);
 const number = (x, digits = 1) => (x == null ? "–" : x.toLocaleString("en", { maximumFractionDigits: digits }));
 
+const round = (x) => Math.round(x * 100) / 100;
+
 export class Command {
   constructor() {
     this.map = new Plane($("map"), { x: "desired return", y: "desired horizon", label: "Commands: what the replay buffer has seen, and what is asked for" });
@@ -14,7 +16,7 @@ export class Command {
     this.orders = [];
     for (const name of ["desired-return", "desired-horizon"]) {
       const [slider, field] = [$(`${name}-slider`), $(name)];
-      slider.addEventListener("input", () => { field.value = Math.round(slider.value * 10) / 10; this.choose(); });
+      slider.addEventListener("input", () => { field.value = round(slider.value); this.choose(); });
       field.addEventListener("input", () => { slider.value = field.value; this.choose(); });
     }
     this.map.svg.addEventListener("click", (event) => {
@@ -36,7 +38,8 @@ export class Command {
     if (!contents.returns.length) { this.contents = null; return; }
     this.follows = hello.config.desired_horizon === "return";
     const [xs, ys] = spans(contents, [[0, 1]]);
-    [$("desired-return-slider").min, $("desired-return-slider").max] = xs.map(Math.round);
+    [$("desired-return-slider").min, $("desired-return-slider").max] = xs.map(round);
+    $("desired-return-slider").step = Math.max(0.01, round((xs[1] - xs[0]) / 100));
     [$("desired-horizon-slider").min, $("desired-horizon-slider").max] = [1, Math.max(2, Math.round(ys[1]))];
     for (const id of ["desired-horizon", "desired-horizon-slider"]) $(id).disabled = this.follows;
     const versions = $("version"), chosen = versions.value;
@@ -48,7 +51,7 @@ export class Command {
   }
 
   fill(r, h) {
-    for (const [name, value] of [["desired-return", Math.round(r * 10) / 10], ["desired-horizon", Math.max(1, Math.round(h))]])
+    for (const [name, value] of [["desired-return", round(r)], ["desired-horizon", Math.max(1, Math.round(h))]])
       for (const id of [name, `${name}-slider`]) $(id).value = value;
     this.choose();
   }

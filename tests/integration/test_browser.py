@@ -1,0 +1,251 @@
+"""The board in a real browser: it shows a live run, obeys orders, and needs nobody else."""
+
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from udrl.config import Budget, Config, build
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
+
+#: What keeps Chromium from calling home.
+_ALONE = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update",
+]  # fmt: skip
+#: Milliseconds that a page gets on a slow machine.
+SOON = 20_000
+
+#: An agent for which obeying is trivial: it collects exactly what it is told to, of 0 to 4.
+OBEDIENT: dict[str, Any] = {
+    "environment": "Obedience-v0", "environment_kwargs": {"steps": 4}, "hidden": [32, 32],
+    "n_warm_up_episodes": 300, "replay_size": 400, "recent_size": 400, "last_few": 100,
+    "batch_size": 128, "learning_rate": 0.01, "n_updates_per_iter": 300, "n_episodes_per_iter": 5,
+    "return_scale": 1.0, "horizon_scale": 0.3, "eval_every": 100, "eval_episodes": 5,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium here; name one with the environment variable CHROMIUM")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=_ALONE)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def pages(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Open pages that may talk to loopback only, and must not fail."""
+    wrong: list[str] = []
+    contexts = []
+
+    def watch(url: str) -> None:
+        if urlsplit(url).hostname not in ("127.0.0.1", None):
+            wrong.append(f"asked for {url}")
+
+    def start(url: str, **options: Any) -> Page:
+        contexts.append(browser.new_context(**options))
+        page = contexts[-1].new_page()
+        page.on("request", lambda request: watch(request.url))
+        page.on("websocket", lambda socket: watch(socket.url))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.goto(url)
+        return page
+
+    yield start
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def obedient(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = tmp_path_factory.mktemp("obedient") / "run"
+    settings = Settings(
+        build(Config, OBEDIENT), Budget(max_env_steps=1280), Fleet(actors=1, envs_per_actor=8)
+    )
+    train(settings, run_dir, threading.Event(), in_process=True)
+    return run_dir
+
+
+@pytest.fixture
+def board(cli: Callable[..., Cli]) -> Callable[..., str]:
+    def start(*words: object) -> str:
+        process = cli("board", *map(str, words)).process
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        assert said.startswith("board: "), said
+        return said.split()[1]
+
+    return start
+
+
+def order(page: Page, desired_return: float, horizon: int = 4, seed: int = 1) -> None:
+    page.get_by_label("Desired return", exact=True).fill(str(desired_return))
+    page.get_by_label("Desired horizon, steps", exact=True).fill(str(horizon))
+    page.get_by_label("Seed").fill(str(seed))
+    page.get_by_role("button", name="Begin an episode").click()
+
+
+def rows(page: Page) -> Any:
+    return page.locator("#episodes tbody tr")
+
+
+def test_a_live_run_appears_and_its_curve_grows(
+    cli: Callable[..., Cli], board: Callable[..., str], pages: Callable[..., Page], tmp_path: Path
+) -> None:
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    cli(*arguments(SMALL, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 2, "some iterations")
+    url = board("--connect", endpoint)
+    page = pages(url)
+    other = pages(url)
+    for one in (page, other):
+        expect(one.get_by_role("status").first).to_contain_text("running; exact", timeout=SOON)
+        expect(one.locator("#curve canvas")).to_be_visible(timeout=SOON)
+        expect(one.locator("#actor-table tbody tr")).to_have_count(1)
+    for _ in range(3):
+        points = page.locator("#curve").get_attribute("data-points")
+        grown = page.locator(f'#curve[data-points]:not([data-points="{points}"])')
+        expect(grown).to_be_visible(timeout=SOON)
+        now = page.locator("#curve").get_attribute("data-points")
+        assert int(now or 0) > int(points or 0) > 0
+    expect(page.locator("#buffer circle").first).to_be_visible()
+    expect(page.locator("#buffer .asked").first).to_be_visible()
+
+
+def test_a_command_is_given_and_obeyed(
+    board: Callable[..., str], pages: Callable[..., Page], obedient: Path
+) -> None:
+    page = pages(board(obedient))
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    page.get_by_label("greedy").check()
+    for number, told in enumerate((3, 1, 4, 0, 2), start=1):
+        order(page, told)
+        expect(rows(page)).to_have_count(number, timeout=SOON)
+        cells = rows(page).first.locator("td").all_text_contents()
+        assert cells[2:6] == [str(told), "4", str(told), "4"]
+        expect(page.locator("#obeyed circle")).to_have_count(number)
+    expect(page.locator("#no-picture")).to_contain_text("draws no pictures")
+
+
+def test_keyboard_only(
+    board: Callable[..., str], pages: Callable[..., Page], obedient: Path
+) -> None:
+    page = pages(board(obedient))
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+
+    def focused() -> str:
+        return str(page.evaluate("document.activeElement.id"))
+
+    def tab_to(name: str) -> None:
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if focused() == name:
+                return
+        raise AssertionError(f"the Tab key does not lead to {name}")
+
+    def type_into(name: str, text: str) -> None:
+        tab_to(name)
+        page.keyboard.press("Control+A")
+        page.keyboard.type(text)
+
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")  # skip to commanding
+    tab_to("desired-return-slider")
+    before = page.locator("#desired-return").input_value()
+    page.keyboard.press("ArrowLeft")
+    assert page.locator("#desired-return").input_value() != before
+    type_into("desired-return", "2")
+    type_into("desired-horizon", "4")
+    tab_to("greedy")
+    page.keyboard.press("Space")
+    tab_to("begin")
+    page.keyboard.press("Enter")
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    assert rows(page).first.locator("td").all_text_contents()[4] == "2"
+
+
+def test_an_order_is_changed_on_the_way(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
+) -> None:
+    page = pages(board(ended_run))
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    order(page, 400, 400)
+    page.get_by_role("button", name="Pause").click()
+    expect(page.get_by_role("button", name="Go on")).to_be_visible(timeout=SOON)
+    step = page.locator("#moment dd").first
+    at = int(step.inner_text())
+    page.get_by_role("button", name="Step").click()
+    expect(step).to_have_text(str(at + 1))
+    page.get_by_label("Desired return", exact=True).fill("77")
+    page.get_by_role("button", name="Change the command now").click()
+    expect(page.locator("#moment dd").nth(2)).to_have_text("77")
+    expect(page.locator("#picture")).to_be_visible()
+    page.get_by_role("button", name="Go on").click()
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    expect(rows(page).first).to_contain_text("told anew on the way")
+
+
+def test_the_map_is_clicked_and_says_what_was_never_seen(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
+) -> None:
+    page = pages(board(ended_run))
+    expect(page.locator("#map .unseen").first).to_be_visible(timeout=SOON)
+    expect(page.locator("#unseen")).to_contain_text("has episodes like this")
+    box = page.locator("#map svg").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.1 * box["height"])
+    expect(page.locator("#unseen")).to_contain_text("no episode like this")
+    assert float(page.locator("#desired-return").input_value()) > 0
+
+
+def test_the_server_dies_and_comes_back(
+    cli: Callable[..., Cli], pages: Callable[..., Page], obedient: Path
+) -> None:
+    port = str(free_port())
+    first = cli("board", str(obedient), "--port", port).process
+    assert first.stdout is not None
+    page = pages(first.stdout.readline().split()[1])
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    order(page, 1)
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    first.kill()
+    expect(page.get_by_role("alert")).to_contain_text("does not answer", timeout=SOON)
+    second = cli("board", str(obedient), "--port", port).process
+    assert second.stdout is not None
+    assert second.stdout.readline()
+    expect(page.get_by_role("alert")).to_be_hidden(timeout=SOON)
+    order(page, 1)
+    expect(rows(page)).to_have_count(2, timeout=SOON)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [400, 1200])
+def test_it_is_accessible_and_fits(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, scheme: str, width: int
+) -> None:
+    page = pages(
+        board(ended_run), viewport={"width": width, "height": 800}, color_scheme=scheme,
+        bypass_csp=True,  # the checker is put into the page
+    )  # fmt: skip
+    expect(page.locator("#curve canvas")).to_be_visible(timeout=SOON)
+    order(page, 50, 50)
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    found = Axe().run(page)
+    assert found.violations_count == 0, found.generate_report()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
