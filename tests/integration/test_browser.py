@@ -204,8 +204,12 @@ def test_an_order_is_changed_on_the_way(
 def test_the_map_is_clicked_and_says_what_was_never_seen(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
-    page = pages(board(ended_run))
+    url = board(ended_run)
+    page = pages(url)
     expect(page.locator("#map .unseen").first).to_be_visible(timeout=SOON)
+    seen = page.request.get(f"{url}news").json()["contents"]
+    page.get_by_label("Desired return", exact=True).fill(str(seen["returns"][0]))
+    page.get_by_label("Desired horizon, steps", exact=True).fill(str(seen["lengths"][0]))
     expect(page.locator("#unseen")).to_contain_text("has episodes like this")
     box = page.locator("#map svg").bounding_box()
     assert box is not None
