@@ -213,9 +213,13 @@ def test_the_map_is_clicked_and_says_what_was_never_seen(
     expect(page.locator("#unseen")).to_contain_text("has episodes like this")
     box = page.locator("#map svg").bounding_box()
     assert box is not None
-    page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.1 * box["height"])
+    page.mouse.click(box["x"] + 0.15 * box["width"], box["y"] + 0.1 * box["height"])
     expect(page.locator("#unseen")).to_contain_text("no episode like this")
-    assert float(page.locator("#desired-return").input_value()) > 0
+    chosen = [
+        float(page.locator(f"#desired-{what}").input_value()) for what in ("return", "horizon")
+    ]
+    assert chosen[0] < min(seen["returns"])
+    assert chosen[1] >= max(seen["lengths"])
 
 
 def test_the_server_dies_and_comes_back(
