@@ -9,6 +9,8 @@ TORCH_INDEX ?=
 ENV ?= LunarLander-v3
 ARGS ?=
 
+EXTRAS = board,box2d,doom,play,plot,secure
+
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
@@ -51,7 +53,7 @@ soak: setup-dev  ## Half an hour of a run: memory, descriptors, threads (docs/re
 	$(VENV)/bin/python benchmarks/soak.py $(ARGS)
 
 fuzz: setup-dev  ## A million inputs for every decoder and queryable (SECURITY.md).
-	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure,dev,fuzz]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS),dev,fuzz]'
 	$(VENV)/bin/python -m tests.fuzz coverage $(ARGS)
 	$(VENV)/bin/python -m tests.fuzz hypothesis $(ARGS)
 
@@ -62,11 +64,11 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS)]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[box2d,doom,play,plot,secure,dev]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS),onnx,dev]'
 	touch $@
 
 clean:

@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from udrl.folder import load as load
+    from udrl_launch.api import train as train
 
 __version__ = "0.1.0"
 
 #: What is offered at the top, and where it is: imported when wanted, since torch takes a second.
-_OFFERED = {"load": "udrl.folder"}
+_OFFERED = {"load": "udrl.folder", "train": "udrl_launch.api"}
 
 
 def __getattr__(name: str) -> Any:

@@ -5,10 +5,10 @@ import socket
 import threading
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Protocol
 
 from udrl.errors import Interrupted, Unreachable
 from udrl_launch.address import Address, connected
-from udrl_launch.display import Display
 from udrl_launch.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.settings import Settings
@@ -23,6 +23,15 @@ from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run
 
 log = logging.getLogger("udrl")
+
+
+class Watcher(Protocol):
+    """Who is shown how a run is doing while it goes on."""
+
+    def show(self, status: Status) -> None:
+        """Take note of a status; called about twice a second."""
+        ...
+
 
 #: Seconds between two looks at the services.
 _POLL_S = 0.5
@@ -42,7 +51,7 @@ def train(
     insecure: bool = False,
     keys: Path | None = None,
     audit: float = 0.0,
-    display: Display | None = None,
+    display: Watcher | None = None,
 ) -> Status:
     """Train an agent and return the final status of its run.
 
@@ -57,7 +66,7 @@ def train(
         insecure: allow ``listen`` to be beyond loopback without keys.
         keys: folder with the keys of all roles (``udrl keys create``); None: nobody is asked.
         audit: share of the episodes that a second actor makes again, 0 to 1.
-        display: shows the progress.
+        display: is shown the progress.
 
     Raises:
         UdrlError: the run cannot be started or cannot go on.
@@ -97,7 +106,7 @@ def train(
 
 
 def _watch(
-    services: Local, address: Address, stop: threading.Event, display: Display | None
+    services: Local, address: Address, stop: threading.Event, display: Watcher | None
 ) -> None:
     """Show the status until the services are done or ``stop`` is set."""
     give_up = _GiveUp(services, stop)

@@ -1,0 +1,69 @@
+"""``udrl.train``."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import udrl
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch.agents import load_agent
+from udrl_proto.messages import Status
+from whole_run import SMALL, digests, small
+
+SETTINGS: dict[str, Any] = {k: v for k, v in SMALL.items() if k != "environment"}
+
+
+def test_it_trains_what_the_command_trains(run: Callable[..., Status], tmp_path: Path) -> None:
+    seen: list[Status] = []
+    trained = udrl.train(
+        "CartPole-v1", run_dir=tmp_path / "api", preset="none", callbacks=seen.append,
+        max_env_steps=3000, actors=1, **SETTINGS,
+    )  # fmt: skip
+    assert digests(trained.status) == digests(run(small(), 3000))
+    assert seen[-1] == trained.status
+    assert trained.status.state == "ended"
+    assert trained.run_dir == tmp_path / "api"
+    told = trained.policy
+    seen_now = [0.0, 0.1, 0.0, -0.1]
+    assert told.logits(seen_now, 50.0, 50).tolist() == (
+        load_agent(tmp_path / "api").policy.logits(seen_now, 50.0, 50).tolist()
+    )
+
+
+def test_a_callback_stops_a_run_that_can_be_resumed(
+    run: Callable[..., Status], tmp_path: Path
+) -> None:
+    def enough(status: Status) -> bool:
+        return status.iteration < 2
+
+    others: list[int] = []
+    stopped = udrl.train(
+        "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
+        callbacks=[enough, lambda status: others.append(status.iteration)], **SETTINGS,
+    )  # fmt: skip
+    assert stopped.status.state == "running"
+    assert others
+    budget = stopped.status.env_steps + 1000
+    ended = udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, max_env_steps=budget)
+    assert digests(ended.status) == digests(run(small(), budget))
+
+
+def test_a_new_directory_is_made_in_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    trained = udrl.train(
+        "Figure2-v0", max_env_steps=60, n_warm_up_episodes=5, n_episodes_per_iter=5,
+        n_updates_per_iter=2, last_few=3, eval_episodes=2,
+    )  # fmt: skip
+    assert trained.run_dir.parent == Path("runs")
+    assert (trained.run_dir / "run.sqlite").exists()
+
+
+def test_what_cannot_be_trained(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="did you mean 'batch_size'"):
+        udrl.train("CartPole-v1", batchsize=3)
+    with pytest.raises(ConfigError, match="resume needs run_dir"):
+        udrl.train("CartPole-v1", resume=True)
+    with pytest.raises(UdrlError, match="cannot be made"):
+        udrl.train("Nothing-v0", run_dir=tmp_path / "run")
