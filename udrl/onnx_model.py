@@ -84,7 +84,7 @@ def export_onnx(policy: Policy, path: Path) -> None:
     ):
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            _Model(behavior, config).eval(),
+            _Model(behavior, config),
             (observation, *desired),
             input_names=["observation", "desired_return", "desired_horizon"],
             output_names=["logits"],

@@ -85,7 +85,7 @@ def train(
     watcher = _Callbacks([callbacks] if callable(callbacks) else list(callbacks), stop)
     try:
         status = run_training(
-            gathered, folder, stop, go_on=resume, in_process=in_process, display=watcher
+            gathered, folder, stop, go_on=resume, in_process=in_process, watcher=watcher
         )
     except Interrupted:
         status = read_status(folder)

@@ -23,6 +23,7 @@ _COMMANDS = {
     "status": "udrl_launch.commands.looking",
     # Like the studies it stands above this package, and imports it.
     "board": "udrl_board.command",
+    "metrics": "udrl_launch.commands.metrics",
     "runs": "udrl_launch.commands.runs",
     "plot": "udrl_launch.commands.runs",
     "health": "udrl_launch.commands.health",

@@ -33,6 +33,28 @@ class Watcher(Protocol):
         ...
 
 
+class Watchers:
+    """Several watchers, and the last status that they were shown."""
+
+    def __init__(self) -> None:
+        self._watchers: list[Watcher] = []
+        self._latest: Status | None = None
+
+    def add(self, watcher: Watcher) -> None:
+        """Let one more watch."""
+        self._watchers.append(watcher)
+
+    def show(self, status: Status) -> None:
+        """Show all of them a status."""
+        self._latest = status
+        for watcher in self._watchers:
+            watcher.show(status)
+
+    def latest(self) -> Status | None:
+        """Return the last status that was shown; None: none yet."""
+        return self._latest
+
+
 #: Seconds between two looks at the services.
 _POLL_S = 0.5
 #: Seconds that freshly started services get until the replay service answers.
@@ -51,7 +73,7 @@ def train(
     insecure: bool = False,
     keys: Path | None = None,
     audit: float = 0.0,
-    display: Watcher | None = None,
+    watcher: Watcher | None = None,
 ) -> Status:
     """Train an agent and return the final status of its run.
 
@@ -66,7 +88,7 @@ def train(
         insecure: allow ``listen`` to be beyond loopback without keys.
         keys: folder with the keys of all roles (``udrl keys create``); None: nobody is asked.
         audit: share of the episodes that a second actor makes again, 0 to 1.
-        display: is shown the progress.
+        watcher: is shown the progress.
 
     Raises:
         UdrlError: the run cannot be started or cannot go on.
@@ -95,7 +117,7 @@ def train(
         run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
     )
     try:
-        _watch(services, Address(endpoint, patience_s=_START_S, keys=keys), stop, display)
+        _watch(services, Address(endpoint, patience_s=_START_S, keys=keys), stop, watcher)
     finally:
         services.end()
     if stop.is_set():
@@ -106,7 +128,7 @@ def train(
 
 
 def _watch(
-    services: Local, address: Address, stop: threading.Event, display: Watcher | None
+    services: Local, address: Address, stop: threading.Event, watcher: Watcher | None
 ) -> None:
     """Show the status until the services are done or ``stop`` is set."""
     give_up = _GiveUp(services, stop)
@@ -121,8 +143,8 @@ def _watch(
             except (Unreachable, Interrupted) as error:
                 log.debug("no status: %s", error)
                 continue
-            if display is not None:
-                display.show(status)
+            if watcher is not None:
+                watcher.show(status)
 
 
 class _GiveUp(threading.Event):

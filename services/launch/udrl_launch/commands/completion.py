@@ -9,7 +9,9 @@ from click.shell_completion import get_completion_class
 def completion(shell: str) -> int:
     """Print what makes a shell complete udrl's commands, options and run directories.
 
-    Example: udrl completion bash >> ~/.bashrc
+    Evaluate it where your shell starts, e.g. in ~/.bashrc: eval "$(udrl completion bash)"
+
+    Example: udrl completion bash
     """
     from udrl_launch.cli import cli
 

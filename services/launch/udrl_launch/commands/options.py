@@ -23,6 +23,10 @@ AUDIT = click.option(
 RUN = click.option(
     "--run", "run_id", metavar="RUN_ID", help="Which run, where a router carries several."
 )
+METRICS_HOST = click.option(
+    "--metrics-host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
+    help="Where Prometheus may ask; everybody who reaches it may read.",
+)  # fmt: skip
 WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
     help="Which of the versions that the run keeps.",

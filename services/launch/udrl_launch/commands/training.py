@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,15 @@ import click
 import msgspec
 
 from udrl.errors import ConfigError, UdrlError
-from udrl_launch.commands.options import AUDIT, KEYS, RUN_DIR
+from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
 from udrl_launch.curve import draw
 from udrl_launch.display import Display
+from udrl_launch.event_files import EventFiles
 from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.prometheus import Exporter
 from udrl_launch.settings import Settings
+from udrl_launch.training import Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.messages import Status
 
@@ -38,6 +42,10 @@ log = logging.getLogger("udrl")
 @KEYS
 @click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
 @AUDIT
+@click.option("--tensorboard", is_flag=True, help="Write event files into RUN_DIR/tensorboard.")
+@click.option("--metrics-port", type=click.IntRange(0, 65_535), metavar="PORT",
+              help="Tell Prometheus how the run is doing at this port.")  # fmt: skip
+@METRICS_HOST
 @click.option(
     "--json", "as_json", is_flag=True, help="End with the final status as a line of JSON."
 )
@@ -51,6 +59,9 @@ def train(
     keys: Path | None,
     allow_inexact: bool,
     audit: float,
+    tensorboard: bool,
+    metrics_port: int | None,
+    metrics_host: str,
     as_json: bool,
     **given: Any,
 ) -> int:
@@ -66,12 +77,21 @@ def train(
     _warn_of_idle_actors(settings)
 
     def service(stop: threading.Event) -> None:
-        with Display() as display:
+        with ExitStack() as stack:
+            watchers = Watchers()
+            if metrics_port is not None:
+                exporter = Exporter(watchers.latest, metrics_host, metrics_port)
+                stack.enter_context(closing(exporter))
+                click.echo(f"metrics: http://{metrics_host}:{exporter.port}/metrics", err=True)
+            if tensorboard:
+                watchers.add(stack.enter_context(closing(EventFiles(run_dir))))
+            watchers.add(stack.enter_context(Display()))
             status = run_training(
                 settings, run_dir, stop, go_on=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
-                audit=audit, display=display,
+                audit=audit, watcher=watchers,
             )  # fmt: skip
+            watchers.show(status)
         _finish(run_dir, status)
         if as_json:
             click.echo(msgspec.json.encode(status).decode())

@@ -1,0 +1,77 @@
+"""``udrl metrics``."""
+
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+import click
+
+from udrl.errors import ConfigError, UdrlError
+from udrl_launch.address import Address
+from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
+from udrl_launch.inspection import status_at, status_of
+from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.prometheus import Exporter
+from udrl_proto.credentials import load
+from udrl_proto.messages import Status
+from udrl_proto.session import check_endpoint
+
+#: Seconds that a status is good for.
+_FRESH_S = 1.0
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR, required=False)
+@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@click.option("--port", type=click.IntRange(0, 65_535), default=9464, show_default=True,
+              help="Where Prometheus asks; 0: any that is free.")  # fmt: skip
+@click.option("--host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
+              help="Where Prometheus may ask; everybody who reaches it may read.")  # fmt: skip
+@KEYS
+@RUN
+def metrics(
+    run_dir: Path | None,
+    connect: str | None,
+    port: int,
+    host: str,
+    keys: Path | None,
+    run_id: str | None,
+) -> int:
+    """Tell Prometheus how a run is doing, until stopped.
+
+    Example: udrl metrics --connect tcp/127.0.0.1:7447 --port 9464
+    """
+    if (run_dir is None) == (connect is None):
+        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+    if keys is not None:
+        load(keys, "observer")
+    endpoint = check_endpoint(connect, secure=keys is not None) if connect else ""
+    lock = threading.Lock()
+    held: list[tuple[float, Status | None]] = []
+
+    def status() -> Status | None:
+        with lock:
+            if not held or time.monotonic() - held[0][0] > _FRESH_S:
+                held[:] = [(time.monotonic(), _ask(run_dir, endpoint, run_id, keys))]
+            return held[0][1]
+
+    log_to_stderr()
+
+    def service(stop: threading.Event) -> None:
+        with closing(Exporter(status, host, port)) as exporter:
+            click.echo(f"metrics: http://{host}:{exporter.port}/metrics")
+            stop.wait()
+
+    return run_service(service)
+
+
+def _ask(
+    run_dir: Path | None, endpoint: str, run_id: str | None, keys: Path | None
+) -> Status | None:
+    try:
+        if run_dir is not None:
+            return status_of(run_dir, keys)
+        return status_at(Address(endpoint, run_id, keys=keys))
+    except UdrlError:
+        return None  # Prometheus is told that the run does not answer

@@ -1,0 +1,156 @@
+"""A run's status as metrics for Prometheus; each is explained in ``docs/metrics.md``."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from udrl.errors import ConfigError
+from udrl_proto.messages import EvaluationStatus, Status
+
+STATES = ("running", "closing", "ended", "failed")
+
+#: What a metric is called, what it counts, and whether it only grows.
+_NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
+    ("udrl_iteration", "iteration", "The last iteration completed.", False),
+    ("udrl_env_steps", "env_steps", "Steps of warm-up and exploratory episodes.", True),
+    ("udrl_eval_env_steps", "eval_env_steps", "Steps of evaluation episodes.", True),
+    ("udrl_env_steps_per_second", "env_steps_per_s", "In the last 10 s.", False),
+    ("udrl_max_env_steps", "max_env_steps", "The budget.", False),
+    ("udrl_wall_seconds", "wall_s", "Time that the run was worked on.", True),
+    ("udrl_time_left_seconds", "time_left_s", "Until the budget is spent.", False),
+    ("udrl_weights_version", "weights_version", "The newest.", False),
+    ("udrl_weights_lag_versions", "weights_lag", "Versions the slowest actor is behind.", False),
+    ("udrl_weights_lag_seconds", "weights_lag_s", "From a version to its first command.", False),
+    ("udrl_loss_nats", "loss", "Of the newest version.", False),
+    ("udrl_env_failures", "env_failures", "Failures that actors reported.", True),
+    ("udrl_useful_concurrency", "useful_concurrency", "Episodes that can run at once.", False),
+    ("udrl_exact", "exact", "1: the result is a function of the configuration.", False),
+)
+
+
+class StatusCollector:
+    """What Prometheus collects when it asks.
+
+    Args:
+        get: returns the status; None: nobody can say now, and only ``udrl_up`` is told, as 0.
+    """
+
+    def __init__(self, get: Callable[[], Status | None]) -> None:
+        self._get = get
+
+    def describe(self) -> list[Any]:
+        """Return nothing: what there is depends on the run."""
+        return []
+
+    def collect(self) -> Iterator[Any]:
+        """Yield the metrics of the run as it is now."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        def labelled(
+            name: str, about: str, labels: list[str], rows: list[tuple[list[str], float | None]]
+        ) -> Any:
+            family = GaugeMetricFamily(name, about, labels=labels)
+            for values, number in rows:
+                if number is not None:
+                    family.add_metric(values, number)
+            return family
+
+        status = self._get()
+        yield GaugeMetricFamily("udrl_up", "1: the run answers.", value=float(status is not None))
+        if status is None:
+            return
+        for name, attribute, about, grows in _NUMBERS:
+            number = getattr(status, attribute)
+            if number is not None:
+                kind = CounterMetricFamily if grows else GaugeMetricFamily
+                yield kind(name, about, value=float(number))
+        yield labelled(
+            "udrl_run_info", "Which run it is; always 1.", ["run_id", "environment"],
+            [([status.run_id, status.environment], 1.0)],
+        )  # fmt: skip
+        yield labelled(
+            "udrl_state", "1 for the state that the run is in.", ["state"],
+            [([s], float(s == status.state)) for s in STATES],
+        )  # fmt: skip
+        for name, found in (
+            ("udrl_eval_return", status.evaluation),
+            ("udrl_closing_eval_return", status.closing_evaluation),
+        ):
+            yield labelled(name, "Of the last evaluation's episodes.", ["stat"], _stats(found))
+        held = status.buffer
+        yield labelled(
+            "udrl_replay_return", "Of the replay buffer's episodes.", ["stat"],
+            [(["min"], held.return_min), (["mean"], held.return_mean), (["max"], held.return_max)],
+        )  # fmt: skip
+        yield GaugeMetricFamily("udrl_replay_episodes", "In the buffer.", value=held.episodes)
+        for name, ledger in (
+            ("udrl_commands", status.commands),
+            ("udrl_episodes", status.episodes),
+        ):
+            fields = ledger.__struct_fields__
+            yield labelled(
+                name, "The ledger.", ["state"],
+                [([field], float(getattr(ledger, field))) for field in fields],
+            )  # fmt: skip
+        actors = status.actors
+        yield GaugeMetricFamily("udrl_actors", "Actors that are here.", value=len(actors))
+        for name, attribute, about in (
+            ("udrl_actor_env_steps_per_second", "env_steps_per_s", "As the actor says."),
+            ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind the newest."),
+            ("udrl_actor_last_seen_seconds", "last_seen_s", "Since its last message."),
+        ):
+            yield labelled(
+                name, about, ["actor", "host"],
+                [([a.id, a.host], float(getattr(a, attribute))) for a in actors],
+            )  # fmt: skip
+        yield labelled(
+            "udrl_waiting_seconds", "Who waits for whom, and for how long.", ["who", "for"],
+            [([w.who, w.on], w.seconds) for w in status.waiting],
+        )  # fmt: skip
+        yield GaugeMetricFamily(
+            "udrl_quarantined_actors", "Actors that are refused.", value=len(status.quarantined)
+        )
+
+
+def _stats(found: EvaluationStatus | None) -> list[tuple[list[str], float | None]]:
+    names = ("mean", "std", "ci95_low", "ci95_high")
+    return [([name], getattr(found, name)) for name in names] if found is not None else []
+
+
+class Exporter:
+    """Answers Prometheus over HTTP.
+
+    Args:
+        get: see :class:`StatusCollector`.
+        host: address to listen on.
+        port: likewise; 0: any that is free.
+
+    Attributes:
+        port: that it listens on.
+
+    Raises:
+        ConfigError: the extra is not installed, or the address cannot be listened on.
+    """
+
+    def __init__(self, get: Callable[[], Status | None], host: str, port: int) -> None:
+        try:
+            from prometheus_client import CollectorRegistry, start_http_server
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                'metrics need prometheus_client; install it with: pip install "udrl[metrics]"'
+            ) from error
+        registry = CollectorRegistry()
+        registry.register(StatusCollector(get))
+        try:
+            self._server, self._thread = start_http_server(port, host, registry)
+        except OSError as error:
+            raise ConfigError(
+                f"metrics on {host}, port {port}: {error.strerror}; name an address of this "
+                f"machine and a port that is free, or 0"
+            ) from error
+        self.port: int = self._server.server_port
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

@@ -1,0 +1,85 @@
+"""Runs that are watched by TensorBoard and Prometheus, each read by the project's own tools."""
+
+import csv
+import re
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+from prometheus_client.parser import text_string_to_metric_families
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from udrl_launch.event_files import EVALUATION_TAGS, FOLDER, TAGS
+from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
+
+
+def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return (env steps, value) by tag, as TensorBoard reads them."""
+    found = EventAccumulator(str(run_dir / FOLDER), size_guidance={"scalars": 0})
+    found.Reload()
+    return {
+        tag: [(event.step, event.value) for event in found.Scalars(tag)]
+        for tag in found.Tags()["scalars"]
+    }
+
+
+def metrics(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    for budget in (3000, 4500):
+        cli(
+            *arguments(SMALL, budget, run_dir), "--resume", "--tensorboard", "--in-process"
+        ).status()
+        told, rows = read(run_dir), metrics(run_dir)
+        assert set(told) == {*TAGS, *EVALUATION_TAGS}
+        for tags, steps in ((TAGS, "env_steps"), (EVALUATION_TAGS, "eval_at_env_steps")):
+            for tag, column in tags.items():
+                expected = [(int(r[steps]), float(r[column])) for r in rows if r[column]]
+                assert [step for step, _ in told[tag]] == [step for step, _ in expected]
+                for (_, value), (_, wanted) in zip(told[tag], expected, strict=True):
+                    assert abs(value - wanted) <= 1e-6 * abs(wanted) + 1e-9
+        assert len(list((run_dir / FOLDER).iterdir())) == 1
+
+
+def scrape(port: int) -> dict[str, float]:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+            text = answer.read().decode()
+    except OSError:
+        return {}
+    return {
+        s.name: s.value for f in text_string_to_metric_families(text) for s in f.samples
+        if not s.labels
+    }  # fmt: skip
+
+
+def test_prometheus_sees_a_run_while_it_goes_on(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    port, run_dir = free_port(), tmp_path / "run"
+    cli(*arguments(SMALL, 10_000_000, run_dir), "--metrics-port", str(port), "--actors", "1")
+    wait_for(lambda: scrape(port).get("udrl_iteration", 0) > 2, "some iterations")
+    first = scrape(port)["udrl_env_steps_total"]
+    wait_for(lambda: scrape(port)["udrl_env_steps_total"] > first, "more env steps")
+    assert scrape(port)["udrl_actors"] == 1
+
+    other = cli("metrics", str(run_dir), "--port", "0").process
+    assert other.stdout is not None
+    said = re.fullmatch(r"metrics: http://127\.0\.0\.1:(\d+)/metrics\n", other.stdout.readline())
+    assert said is not None
+    assert scrape(int(said[1]))["udrl_actors"] == 1
+
+
+def test_the_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    training = cli(*arguments(SMALL, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 0, "an iteration")
+    exporter = cli("metrics", "--connect", endpoint, "--port", "0").process
+    assert exporter.stdout is not None
+    port = int(exporter.stdout.readline().split(":")[-1].split("/")[0])
+    assert scrape(port)["udrl_up"] == 1
+    training.process.terminate()
+    training.finish()
+    wait_for(lambda: scrape(port).get("udrl_up") == 0, "nobody to answer")

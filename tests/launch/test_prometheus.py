@@ -1,0 +1,93 @@
+"""What Prometheus is told, read by its own parser; and what the dashboard asks for."""
+
+import json
+import re
+import urllib.request
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from tests.launch.test_display import STATUS
+from udrl.errors import ConfigError
+from udrl_launch.prometheus import Exporter
+from udrl_proto.messages import ActorStatus, Quarantined, Status
+
+ROOT = Path(__file__).parents[2]
+FULL = msgspec.structs.replace(
+    STATUS,
+    actors=(
+        ActorStatus(id="actor-1", host="here", environments=16, env_steps_per_s=500.5,
+                    weights_version=5, weights_lag=1, running=3, last_seen_s=0.5),
+    ),
+    quarantined=(Quarantined(id="liar", why="lied"),),
+    closing_evaluation=STATUS.evaluation,
+)  # fmt: skip
+
+
+def scraped(status: Status | None) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
+    with closing(Exporter(lambda: status, "127.0.0.1", 0)) as exporter:
+        url = f"http://127.0.0.1:{exporter.port}/metrics"
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            text = answer.read().decode()
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_every_number_of_the_status_is_told() -> None:
+    told = scraped(FULL)
+    assert told["udrl_up", ()] == 1
+    assert told["udrl_env_steps_total", ()] == 12345
+    assert told["udrl_env_steps_per_second", ()] == 9876.5
+    assert told["udrl_weights_lag_seconds", ()] == 0.25
+    assert told["udrl_loss_nats", ()] == 0.5
+    assert told["udrl_exact", ()] == 1
+    assert told["udrl_state", (("state", "running"),)] == 1
+    assert told["udrl_state", (("state", "ended"),)] == 0
+    assert told["udrl_eval_return", (("stat", "mean"),)] == 42
+    assert told["udrl_replay_return", (("stat", "max"),)] == 3
+    assert told["udrl_commands", (("state", "issued"),)] == 1
+    actor = (("actor", "actor-1"), ("host", "here"))
+    assert told["udrl_actor_env_steps_per_second", actor] == 500.5
+    assert told["udrl_waiting_seconds", (("for", "actors"), ("who", "learner l"))] == 2.5
+    assert told["udrl_quarantined_actors", ()] == 1
+
+
+def test_what_is_not_known_is_not_told() -> None:
+    told = scraped(
+        msgspec.structs.replace(STATUS, loss=None, time_left_s=None, evaluation=None, waiting=())
+    )
+    names = {name for name, _ in told}
+    assert not names & {"udrl_loss_nats", "udrl_time_left_seconds", "udrl_eval_return"}
+    assert scraped(None) == {("udrl_up", ()): 0}
+
+
+def test_the_dashboard_asks_for_metrics_that_there_are() -> None:
+    told = {name for name, _ in scraped(FULL)}
+    dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text())
+    asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
+    assert len(asked) > 10
+    for expression in asked:
+        found = re.findall(r"udrl_\w+", expression)
+        assert found, expression
+        assert set(found) <= told, expression
+
+
+def test_every_metric_is_in_the_glossary() -> None:
+    page = (ROOT / "docs" / "metrics.md").read_text()
+    named = set(re.findall(r"`(udrl_\w+)`", page))
+    assert {name for name, _ in scraped(FULL)} == named
+
+
+def test_a_port_that_is_taken() -> None:
+    with (
+        closing(Exporter(lambda: None, "127.0.0.1", 0)) as first,
+        pytest.raises(ConfigError, match=f"port {first.port}: .*a port that is free"),
+    ):
+        Exporter(lambda: None, "127.0.0.1", first.port)
