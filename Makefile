@@ -68,7 +68,7 @@ $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,onnx,tensorboard,dev]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,minari,onnx,tensorboard,dev]'
 	touch $@
 
 clean:

@@ -14,6 +14,7 @@ from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
 from udrl.numerics import settle, use_one_thread
+from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
@@ -83,15 +84,16 @@ def algorithm1(
     use_one_thread()
     config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
+    config, offline = settle_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec.max_episode_steps)
 
-    # 1: initialise replay buffer with warm-up episodes using random actions
+    # 1: initialise replay buffer with warm-up episodes using random actions (or others')
     run = Run(
         ReplayBuffer(config),
         untrained(config, generator.spec),  # 2: initialise a behavior function
         Experience(config, generator.spec),
     )
-    run.add(generate_episodes(generator, sample.warm_up(), None))
+    run.add(offline or generate_episodes(generator, sample.warm_up(), None))
     due = evaluation_due(0, 0, run.env_steps, config.eval_every)
     report(run)
 

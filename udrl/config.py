@@ -50,6 +50,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
             ``ranked``, ``record``, or a class of your own as ``package.module:Class``
             (:mod:`udrl.strategies`).
+        dataset: a Minari dataset whose episodes take the place of the warm-up's; None: none.
+        dataset_sha256: digest of these; empty: whatever they are when the run is created.
         cut_at_horizon: share of exploratory episodes that are cut when their desired horizon has
             run out; 0 is the paper's.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
@@ -62,7 +64,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         learning_rate: Adam's.
         n_episodes_per_iter: exploratory episodes in an iteration.
         n_updates_per_iter: gradient steps in an iteration.
-        n_warm_up_episodes: episodes of random actions before the first iteration.
+        n_warm_up_episodes: episodes of random actions before the first iteration; with a
+            ``dataset`` as many as it has.
         warm_up_hold: steps that a random action of the warm-up is held for; 1 is the paper's.
         replay_size: episodes that the replay buffer holds (2.3.1).
         max_age: iterations after which an episode leaves the replay buffer; None, as in the paper:
@@ -102,6 +105,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
+    dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
+    dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
     cut_at_horizon: Annotated[float, Meta(ge=0, le=1)] = 0.0
     desired_horizon: Literal["mean", "return"] = "mean"
     horizon_scale: Scale = 0.01

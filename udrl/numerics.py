@@ -53,8 +53,11 @@ def settle(config: Config) -> Config:
 
 
 def settle_as(held: Config, config: Config) -> Config:
-    """Return settings with what says ``auto`` as it was chosen for another run."""
+    """Return settings with what they leave open as it was chosen for another run."""
     chosen = {n: getattr(held, n) for n in ("device", "precision") if getattr(config, n) == "auto"}
+    if config.dataset is not None and config.dataset == held.dataset:
+        chosen["n_warm_up_episodes"] = held.n_warm_up_episodes
+        chosen["dataset_sha256"] = config.dataset_sha256 or held.dataset_sha256
     return msgspec.structs.replace(config, **chosen)
 
 

@@ -1,13 +1,16 @@
-"""An agent as a folder with a model card, as the Hugging Face hub shows them."""
+"""A run's agent as a folder with a model card, and its episodes as a dataset."""
 
 from contextlib import closing
 from pathlib import Path
 
 import udrl
 from udrl import folder as folders
-from udrl.errors import ConfigError
+from udrl.errors import ConfigError, StoreError
+from udrl.offline import write_dataset
 from udrl_launch.agents import Agent
 from udrl_launch.inspection import budget_of
+from udrl_proto.codec import LARGEST, decode, decode_episode
+from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
 from udrl_replay.run import Progress
 from udrl_replay.store import FILE, EvaluationRow, Store
@@ -94,6 +97,27 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
         )
     folders.save(folder, agent.policy, _card(agent, folder, found, progress.inexact_reason))
     write_config(folder, agent.config, budget_of(run_dir))
+
+
+def export_buffer(run_dir: Path, name: str) -> int:
+    """Write the replay buffer as a Minari dataset, least return first; return how many episodes.
+
+    Raises:
+        ConfigError: the dataset cannot be written.
+        StoreError: the run cannot be read.
+    """
+    with closing(Store(run_dir, read_only=True)) as store:
+        hello = store.fact("hello", Hello)
+        ids = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
+        if not ids:
+            raise StoreError(f"{run_dir}: the replay buffer is empty; wait for the warm-up's end")
+        messages = (
+            decode(body, EpisodeMessage, LARGEST)
+            for i in ids
+            for body in store.episode_bodies([i], LARGEST)
+        )
+        write_dataset(name, map(decode_episode, messages), hello.config, hello.environment)
+    return len(ids)
 
 
 def _card(agent: Agent, folder: Path, found: EvaluationRow | None, inexact: str) -> str:

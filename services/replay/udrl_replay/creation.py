@@ -13,15 +13,22 @@ import msgspec
 import udrl
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
+from udrl.episode import Episode
 from udrl.errors import OtherConfiguration, StoreError
 from udrl.numerics import environment_replays, settle, settle_as
+from udrl.offline import settle_dataset
 from udrl.strategies import make_strategy
 from udrl_proto import PROTOCOL
-from udrl_proto.messages import Hello
-from udrl_replay.run import Progress
+from udrl_proto.codec import LARGEST, decode, encode_episode
+from udrl_proto.messages import EpisodeMessage, Hello
+from udrl_replay.arrival import inspect
+from udrl_replay.run import Progress, Run
 from udrl_replay.store import FILE, Store
 
 log = logging.getLogger("udrl")
+
+#: Who brings the episodes of a dataset.
+OFFLINE = "dataset"
 
 
 def directory_name(config: Config) -> str:
@@ -46,13 +53,14 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
     replay an episode after another one; if it cannot, the run is marked inexact, and goes on.
 
     Raises:
-        ConfigError: the command strategy cannot be made.
+        ConfigError: the command strategy cannot be made, or the dataset cannot be used.
         UnsupportedEnvironment: the environment does not exist or is not supported.
         StoreError: the directory holds a run already, or cannot be written.
     """
     config = settle(config)
     make_strategy(config)
     generator = EpisodeGenerator(config, 1)
+    config, offline = settle_dataset(config, generator.spec)
     exact = environment_replays(config, generator)
     generator.close()
     progress = Progress(exact=exact)
@@ -70,7 +78,22 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         allow_inexact=allow_inexact,
         exact=exact,
     )
-    return Store.create(run_dir, hello=hello, progress=progress)
+    store = Store.create(run_dir, hello=hello, progress=progress)
+    if offline is not None:
+        with _closed_on_error(store):
+            _begin_with(store, offline)
+    return store
+
+
+def _begin_with(store: Store, episodes: list[Episode]) -> None:
+    """Let episodes of others answer the commands of the warm-up."""
+    spec = store.fact("hello", Hello).environment
+    run = Run(store, Budget(max_env_steps=2**53))
+    with store.transaction():
+        for episode in episodes:
+            message = decode(encode_episode(episode, OFFLINE), EpisodeMessage, LARGEST)
+            run.accept(inspect(message, spec), 0.0)
+        run.save()
 
 
 def resume(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:

@@ -8,7 +8,7 @@ from udrl.errors import ConfigError
 from udrl.onnx_model import export_onnx
 from udrl_launch.agents import load_agent
 from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
-from udrl_launch.exporting import export_folder
+from udrl_launch.exporting import export_buffer, export_folder
 
 
 @click.command()
@@ -22,14 +22,24 @@ from udrl_launch.exporting import export_folder
     help="The agent as an ONNX model; inputs: observation, desired_return, desired_horizon; "
     "output: logits.",
 )  # fmt: skip
+@click.option(
+    "--minari", metavar="NAME",
+    help="The replay buffer as a Minari dataset, e.g. LunarLander/mine-v0.",
+)  # fmt: skip
 @WEIGHTS
-def export(run_dir: Path, folder: Path | None, onnx: Path | None, weights: str) -> int:
-    """Hand on a run's agent, in the formats of others.
+def export(
+    run_dir: Path, folder: Path | None, onnx: Path | None, minari: str | None, weights: str
+) -> int:
+    """Hand on a run's agent and its episodes, in the formats of others.
 
     Example: udrl export runs/mine --folder my-agent --onnx my-agent.onnx
     """
+    if folder is None and onnx is None and minari is None:
+        raise ConfigError("nothing to export: give --folder DIR, --onnx FILE or --minari NAME")
+    if minari is not None:
+        click.echo(f"dataset: {minari}, {export_buffer(run_dir, minari)} episodes")
     if folder is None and onnx is None:
-        raise ConfigError("nothing to export: give --folder DIR, --onnx FILE, or both")
+        return 0
     agent = load_agent(run_dir, version(weights))
     if folder is not None:
         export_folder(agent, run_dir, folder)

@@ -24,6 +24,8 @@ def settings_options(command: Command) -> Command:
                      help="Settings from a TOML file."),
         click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
                      help="Set any setting, e.g. --set batch_size=512; may be repeated."),
+        click.option("--from-dataset", "dataset", metavar="NAME",
+                     help="Begin with the episodes of a Minari dataset, not with random ones."),
         click.option("--seed", type=int, help="Seed of the run."),
         click.option("--lead", type=int, help="Iterations that acting may run ahead of training."),
         click.option("--max-env-steps", type=int, help="Budget in env steps."),

@@ -1,0 +1,161 @@
+"""Datasets: written, read by Minari itself, and begun with."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import minari
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from udrl.algorithm1 import algorithm1
+from udrl.config import Budget, Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import ConfigError, OtherConfiguration
+from udrl.offline import dataset_digest, read_dataset, write_dataset
+from udrl_launch.cli import cli as command_line
+from udrl_launch.inspection import read_status, settings_of
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from udrl_proto.messages import Status
+from udrl_replay.store import Store
+from whole_run import digests, small
+
+VECTOR = EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=500)
+IMAGE = EnvironmentSpec(
+    observation_shape=(1, 12, 10), observation_dtype="uint8", n_actions=3, max_episode_steps=500
+)
+
+
+@pytest.fixture(autouse=True)
+def _datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+
+
+def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Episode]:
+    rng = np.random.default_rng(1)
+
+    def observations(n: int) -> Any:
+        shape = (n, *spec.observation_shape)
+        if spec.is_image:
+            return rng.integers(0, 256, shape).astype(np.uint8)
+        return rng.normal(size=shape).astype(np.float32)
+
+    return [
+        Episode(
+            command_id=i,
+            observations=observations(n),
+            actions=rng.integers(0, spec.n_actions, n).astype(np.uint8),
+            rewards=rng.normal(size=n).astype(np.float32),
+            terminated=i % 2 == 0,
+            truncated=i % 2 == 1,
+        )
+        for i, n in enumerate(lengths)
+    ]
+
+
+@pytest.mark.parametrize("spec", [VECTOR, IMAGE], ids=["vector", "image"])
+def test_what_is_written_is_what_is_read_to_the_bit(spec: EnvironmentSpec) -> None:
+    episodes = some(spec)
+    write_dataset("some/ours-v0", episodes, small(), spec)
+    assert dataset_digest(read_dataset("some/ours-v0", small(), spec)) == dataset_digest(episodes)
+    # As Minari itself reads it.
+    for theirs, ours in zip(minari.load_dataset("some/ours-v0"), episodes, strict=True):
+        assert theirs.observations[:-1].dtype == ours.observations.dtype
+        assert (theirs.observations[:-1] == ours.observations).all()
+        assert theirs.actions.tolist() == ours.actions.tolist()
+        assert theirs.rewards.tolist() == ours.rewards.tolist()
+        assert theirs.terminations.tolist()[-1] == ours.terminated
+        assert theirs.truncations.tolist()[-1] == ours.truncated
+
+
+def test_a_name_that_is_taken_or_unknown() -> None:
+    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+    with pytest.raises(ConfigError, match=r"already exists.*CartPole/mine-v0"):
+        write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+    with pytest.raises(ConfigError, match=r"not found locally.*minari list local"):
+        read_dataset("some/thing-v0", small(), VECTOR)
+
+
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        (EnvironmentSpec(observation_shape=(5,), n_actions=2, max_episode_steps=500),
+         r"observations float32 \(3, 4\).*float32 \(3, 5\)"),
+        (EnvironmentSpec(observation_shape=(4,), n_actions=1, max_episode_steps=500),
+         "actions from 0 to 1, the run's environment has 0 to 0"),
+        (EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=8),
+         "an episode of 9 steps, training episodes have at most 8"),
+        (IMAGE, "name a dataset of that environment"),
+    ],
+)  # fmt: skip
+def test_datasets_of_another_environment(spec: EnvironmentSpec, says: str) -> None:
+    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+    with pytest.raises(ConfigError, match=says):
+        read_dataset("some/ours-v0", small(), spec)
+
+
+@pytest.fixture
+def dataset(ended_run: Path) -> str:
+    """The replay buffer of a run, exported by the command."""
+    words = ["export", str(ended_run), "--minari", "CartPole/elite-v0"]
+    result = CliRunner().invoke(command_line, words, standalone_mode=False, catch_exceptions=False)
+    assert result.stdout.startswith("dataset: CartPole/elite-v0, ")
+    return "CartPole/elite-v0"
+
+
+def offline(dataset: str, **changes: object) -> Config:
+    return small(dataset=dataset, lead=0, **changes)
+
+
+def test_the_exported_dataset_is_the_buffer(dataset: str, ended_run: Path) -> None:
+    store = Store(ended_run, read_only=True)
+    held = store.buffer(10**9)
+    store.close()
+    found = minari.load_dataset(dataset)
+    assert [float(np.sum(e.rewards)) for e in found] == [p.entry.episode_return for p in held]
+
+
+def test_a_run_begins_with_a_dataset(
+    dataset: str, run: Callable[..., Status], tmp_path: Path
+) -> None:
+    config = offline(dataset)
+    status = run(config, 3000, run_dir=tmp_path / "run")
+    n = len(list(minari.load_dataset(dataset)))
+    settings = settings_of(tmp_path / "run")
+    assert settings["n_warm_up_episodes"] == n
+    assert len(settings["dataset_sha256"]) == 64
+    assert status.episodes.accepted >= n
+    # The services equal the reference, and so do they with other actors.
+    assert digests(status) == digests(algorithm1(config, Budget(max_env_steps=3000)))
+    assert digests(status) == digests(run(config, 3000, actors=2, envs=3))
+    assert digests(status) != digests(run(small(lead=0), 3000))
+
+
+def test_it_goes_on_without_the_dataset(
+    dataset: str, run: Callable[..., Status], tmp_path: Path
+) -> None:
+    config = offline(dataset)
+    run(config, 2000, run_dir=tmp_path / "run")
+    whole = digests(run(config, 4000))
+    minari.delete_dataset(dataset)
+    status = run(config, 4000, run_dir=tmp_path / "run", go_on=True)
+    assert digests(status) == whole
+
+
+def test_another_dataset_of_the_same_name_is_noticed(dataset: str, tmp_path: Path) -> None:
+    settings = Settings(offline(dataset, dataset_sha256="0" * 64), Budget(), Fleet())
+    with pytest.raises(ConfigError, match="it is another one than the run began with"):
+        train(settings, tmp_path / "run", threading.Event(), in_process=True)
+
+
+def test_a_run_with_another_beginning_is_another_run(
+    dataset: str, run: Callable[..., Status], tmp_path: Path
+) -> None:
+    run(offline(dataset), 1000, run_dir=tmp_path / "run")
+    assert read_status(tmp_path / "run").exact
+    with pytest.raises(OtherConfiguration, match="dataset = 'CartPole/elite-v0', not None"):
+        run(small(lead=0), 2000, run_dir=tmp_path / "run", go_on=True)

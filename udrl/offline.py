@@ -1,0 +1,175 @@
+"""Episodes of others: Minari datasets, to learn from and to hand on.
+
+A run that names a ``dataset`` begins with its episodes where others begin with random ones: they
+are its warm-up (section 2.3.1). A dataset has one observation more than steps, on the last of which
+nobody acted. Episodes here have none, so in what is written the last one is there twice.
+"""
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from udrl.config import Config
+from udrl.digests import episode_digest, replay_digest
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Episode, action_dtype
+from udrl.errors import ConfigError
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f'datasets need {error.name}; install it with: pip install "udrl[minari]"'
+        ) from error
+    return minari
+
+
+def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episode]:
+    """Return a dataset's episodes, numbered as those of a warm-up.
+
+    Args:
+        name: of a dataset that Minari finds on this machine.
+        config: ``max_train_steps``.
+        spec: what the run's environment looks like.
+
+    Raises:
+        ConfigError: there is no such dataset, it is empty, or its episodes are none of this
+            environment.
+    """
+    minari = _minari()
+    try:
+        dataset = minari.load_dataset(name)
+        episodes = [_episode(i, data, name, spec) for i, data in enumerate(dataset)]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(
+            f"dataset {name!r}: {error}; name one that `minari list local` shows"
+        ) from error
+    if not episodes:
+        raise ConfigError(f"dataset {name!r} has no episodes; there is nothing to begin with")
+    longest = max(e.length for e in episodes)
+    limit = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
+    if longest > limit:
+        raise ConfigError(
+            f"dataset {name!r} has an episode of {longest} steps, training episodes have at most "
+            f"{limit}; raise max_train_steps or max_episode_steps"
+        )
+    return episodes
+
+
+def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[Episode] | None]:
+    """Return the settings of a new run with what its dataset decides, and the dataset's episodes.
+
+    Raises:
+        ConfigError: the dataset cannot be used, or is another one than the settings say.
+    """
+    if config.dataset is None:
+        return config, None
+    episodes = read_dataset(config.dataset, config, spec)
+    digest = dataset_digest(episodes)
+    if config.dataset_sha256 not in ("", digest):
+        raise ConfigError(
+            f"dataset {config.dataset!r} has the digest {digest}, the settings name "
+            f"{config.dataset_sha256}; it is another one than the run began with"
+        )
+    settled = msgspec.structs.replace(
+        config, dataset_sha256=digest, n_warm_up_episodes=len(episodes)
+    )
+    return settled, episodes
+
+
+def _episode(number: int, data: Any, name: str, spec: EnvironmentSpec) -> Episode:
+    rewards = np.asarray(data.rewards, np.float32)
+    actions = np.asarray(data.actions)
+    observations = np.asarray(data.observations)[: len(rewards)]
+    expected = (len(rewards), *spec.observation_shape)
+    fits = observations.shape == expected and (not spec.is_image or observations.dtype == np.uint8)
+    if not fits or actions.shape != (len(rewards),) or actions.dtype.kind not in "iu":
+        raise ConfigError(
+            f"dataset {name!r}, episode {number}: observations {observations.dtype} "
+            f"{observations.shape} and actions {actions.dtype} {actions.shape}; the run's "
+            f"environment has {spec.observation_dtype} {expected} and one whole number a step; "
+            f"name a dataset of that environment"
+        )
+    if actions.min() < 0 or actions.max() >= spec.n_actions:
+        raise ConfigError(
+            f"dataset {name!r}, episode {number}: actions from {actions.min()} to "
+            f"{actions.max()}, the run's environment has 0 to {spec.n_actions - 1}"
+        )
+    if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
+        raise ConfigError(
+            f"dataset {name!r}, episode {number}: an observation or reward is not a finite number"
+        )
+    terminated = bool(data.terminations[-1])
+    return Episode(
+        command_id=number,
+        observations=observations.astype(spec.observation_dtype),
+        actions=actions.astype(action_dtype(spec.n_actions)),
+        rewards=rewards,
+        terminated=terminated,
+        truncated=not terminated,
+    )
+
+
+def dataset_digest(episodes: Sequence[Episode]) -> str:
+    """Return the SHA-256 of a dataset's episodes, in hexadecimal."""
+    return replay_digest(map(episode_digest, episodes)).hex()
+
+
+def write_dataset(
+    name: str, episodes: Iterable[Episode], config: Config, spec: EnvironmentSpec
+) -> None:
+    """Write episodes as a Minari dataset, every bit of them.
+
+    Args:
+        name: of the dataset, as Minari has them, e.g. ``LunarLander/udrl-v0``.
+        episodes: of the environment.
+        config: the settings that they were made with.
+        spec: what the environment looks like.
+
+    Raises:
+        ConfigError: the name is taken or impossible, or it cannot be written.
+    """
+    minari = _minari()
+    from gymnasium import spaces
+    from minari.data_collector import EpisodeBuffer
+
+    buffers = [
+        EpisodeBuffer(
+            id=number,
+            observations=list(np.concatenate([e.observations, e.observations[-1:]])),
+            actions=list(e.actions.astype(np.int64)),
+            rewards=list(e.rewards),
+            terminations=[False] * (e.length - 1) + [e.terminated],
+            truncations=[False] * (e.length - 1) + [e.truncated],
+        )
+        for number, e in enumerate(episodes)
+    ]
+    shape = spec.observation_shape
+    observations = (
+        spaces.Box(0, 255, shape, np.uint8)
+        if spec.is_image
+        else spaces.Box(-np.inf, np.inf, shape, np.float32)
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of what only its author can tell
+            minari.create_dataset_from_buffers(
+                name,
+                buffers,
+                observation_space=observations,
+                action_space=spaces.Discrete(spec.n_actions),
+                algorithm_name="Upside-Down Reinforcement Learning",
+                description=f"Episodes of a udrl run on {config.environment}, seed {config.seed}; "
+                f"the last observation of each is there twice.",
+                jpeg_encoding=False,  # which would change the images
+            )
+    except (OSError, ValueError, AssertionError) as error:
+        raise ConfigError(
+            f"dataset {name!r}: {error}; name one that is not there yet, e.g. "
+            f"{config.environment.split('-')[0]}/mine-v0"
+        ) from error
