@@ -56,8 +56,9 @@ def test_wheel_ships_presets_and_types_but_no_tests(site: Path) -> None:
     assert spaces | {"udrl_experiments/tuned.toml"} <= files
     packages = (
         "udrl", "udrl_proto", "udrl_actor", "udrl_learner", "udrl_replay", "udrl_launch",
-        "udrl_experiments",
+        "udrl_board", "udrl_experiments",
     )  # fmt: skip
     assert {f"{package}/py.typed" for package in packages} <= files
+    assert {f"udrl_board/static/{n}" for n in ("index.html", "vendor/uplot/LICENSE")} <= files
     top_level = {name.split("/")[0] for name in files if "dist-info" not in name}
     assert top_level == set(packages)
