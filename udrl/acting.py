@@ -43,6 +43,8 @@ MAX_FAILURES = 3
 
 _FIRST_CAPACITY = 1024
 _FIRST_BYTES = 64 << 20
+#: A round that does not come.
+_NEVER = np.iinfo(np.int64).max
 
 _Rows = npt.NDArray[np.int64]
 
@@ -139,6 +141,9 @@ class EpisodeGenerator:
         self._behaviors: list[BehaviorFunction | None] = [None] * n_environments
         self._calls: list[_Call] | None = None
         self._greedy: list[int] = []
+        # The round from which on a row's action is held, and how many rows have one.
+        self._hold_at = np.full(n_environments, _NEVER)
+        self._n_holding = 0
 
         # What the network reads in one call. See training._Batch for why torch owns it.
         self._inference_rows = rows = config.inference_rows
@@ -214,6 +219,9 @@ class EpisodeGenerator:
             self._cap[row] = self.spec.max_return
         self._logits[row] = 0.0
         self._began[row] = self._round
+        if command.hold_from is not None:
+            self._hold_at[row] = self._round + command.hold_from
+            self._n_holding += 1
         self._lay_out_uniforms(row, command)
         return None
 
@@ -275,6 +283,9 @@ class EpisodeGenerator:
         actions = sample(logits, self._temperature, uniforms)
         if self._greedy:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
+        if self._n_holding:
+            held = self._hold_at <= self._round
+            actions[held] = (uniforms[held] * logits.shape[1]).astype(np.int64)
         return actions
 
     def _stacks(self) -> npt.NDArray[np.generic]:
@@ -325,6 +336,9 @@ class EpisodeGenerator:
         self._commands[row] = self._behaviors[row] = self._calls = None
         if row in self._greedy:
             self._greedy.remove(row)
+        if self._hold_at[row] != _NEVER:
+            self._hold_at[row] = _NEVER
+            self._n_holding -= 1
         self._reward[row] = self._desired[row] = 0.0
 
     def _rebuild(self, row: int) -> None:
@@ -341,12 +355,15 @@ class EpisodeGenerator:
     def _lay_out_uniforms(self, row: int, command: Command) -> None:
         """Put number t of the command's stream where step t of its episode will look.
 
-        Numbers of the warm-up are used ``warm_up_hold`` times, and so are the actions they choose.
+        Numbers of the warm-up are used ``warm_up_hold`` times, and so are the actions they choose;
+        number ``hold_from`` of a command that has one is used from there on.
         """
         numbers = Stream(command.stream_key).uniforms(self._capacity)
         if command.kind == "warm_up":
             hold = self._config.warm_up_hold
             numbers = numbers[np.arange(self._capacity) // hold * hold]
+        if command.hold_from is not None:
+            numbers[command.hold_from :] = Stream(command.stream_key).number(command.hold_from)
         self._uniforms[self._places(int(self._began[row]), self._capacity), row] = numbers
 
     def _make_room(self) -> None:

@@ -41,6 +41,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         weights_version: the behavior function to act with; 0 in the warm-up: act at random.
         max_steps: the episode is truncated after so many steps.
         temperature: logits are divided by it before an action is sampled; 0: take the mode.
+        hold_from: the action of this step is drawn at random, and taken again until the episode
+            ends; None: none is.
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
@@ -52,6 +54,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     weights_version: Annotated[int, Meta(ge=0, le=2**62)]
     max_steps: Annotated[int, Meta(ge=1, le=2**31)]
     temperature: Temperature = 1.0
+    hold_from: Annotated[int, Meta(ge=0, le=2**31)] | None = None
 
     @property
     def iteration(self) -> int:
@@ -92,7 +95,8 @@ class CommandSampler:
         What they ask for is the strategy's choice (:mod:`udrl.strategies`): in the paper the mean
         length of the ``last_few`` best episodes, and a return that is uniform in [M, M + S]. Not in
         the paper: with a ``horizon_spread`` s, the desired horizon is then multiplied with a number
-        that is uniform in [1 - s, 1 + s].
+        that is uniform in [1 - s, 1 + s]; and of the episodes a share, ``held_endings``, ends with
+        one action that is drawn at random and held, from a step within the desired horizon on.
 
         Raises:
             ConfigError: the strategy cannot be imported, or asks for what cannot be.
@@ -100,7 +104,7 @@ class CommandSampler:
         best = buffer.best(self._config.last_few)
         spread = self._config.horizon_spread
         n = self._config.n_episodes_per_iter
-        u, v, w = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
+        u, v, w, x = self._stream(iteration).uniforms(4 * n).reshape(4, n).tolist()
         desired = []
         for k in range(n):
             desired_return, horizon = ask(self._strategy, best, u[k])
@@ -109,8 +113,10 @@ class CommandSampler:
             )
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
-            msgspec.structs.replace(c, max_steps=min(c.max_steps, c.desired_horizon))
-            if w[k] < self._config.cut_at_horizon
+            msgspec.structs.replace(
+                c, hold_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon))
+            )
+            if w[k] < self._config.held_endings
             else c
             for k, c in enumerate(commands)
         ]

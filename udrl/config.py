@@ -52,11 +52,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             (:mod:`udrl.strategies`).
         dataset: a Minari dataset whose episodes take the place of the warm-up's; None: none.
         dataset_sha256: digest of these; empty: whatever they are when the run is created.
-        cut_at_horizon: share of exploratory episodes that are cut when their desired horizon has
-            run out; 0 is the paper's.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
+        held_endings: share of exploratory episodes that end with one random action, held from a
+            random step on, whatever the network says; 0 is the paper's.
         horizon_scale: factor on the desired horizon at the network's input.
         horizon_spread: how far desired horizons of exploratory commands are spread around the mean
             length of the best episodes, as a part of it; 0 is the paper's.
@@ -107,8 +107,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
-    cut_at_horizon: Annotated[float, Meta(ge=0, le=1)] = 0.0
     desired_horizon: Literal["mean", "return"] = "mean"
+    held_endings: Annotated[float, Meta(ge=0, le=1)] = 0.0
     horizon_scale: Scale = 0.01
     horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
     last_few: PositiveInt = 75

@@ -58,6 +58,7 @@ class Rollout:
         self._cap = policy.spec.max_return if command.kind == "evaluate" else None
         self._stream = Stream(command.stream_key)
         self._uniforms: deque[float] = deque()
+        self._held: float | None = None
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.frame_stack
@@ -89,7 +90,13 @@ class Rollout:
         assert not self.over
         if not self._uniforms:
             self._uniforms.extend(self._stream.uniforms(_AT_A_TIME).tolist())
-        self.action = action = choose(self._logits(), self.temperature, self._uniforms.popleft())
+        uniform = self._uniforms.popleft()
+        if self.command.hold_from is not None and self.steps >= self.command.hold_from:
+            self._held = uniform if self._held is None else self._held
+            action = int(self._held * self._policy.spec.n_actions)
+        else:
+            action = choose(self._logits(), self.temperature, uniform)
+        self.action = action
         observation, reward, self.terminated, self.truncated, _ = self._carefully(
             "step", lambda: self._env.step(action)
         )

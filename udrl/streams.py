@@ -45,6 +45,10 @@ class Stream:
         raw = self._philox.random_raw(n)
         return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
+    def number(self, index: int) -> float:
+        """Return the number of an index, counted from the next one; those up to it are used up."""
+        return float(self.uniforms(index + 1)[index])
+
     def integers(self, n: int, low: int, high: int) -> npt.NDArray[np.int64]:
         """Return the next ``n`` numbers as integers, uniform in [low, high)."""
         return low + (self.uniforms(n) * (high - low)).astype(np.int64)

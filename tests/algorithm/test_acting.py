@@ -82,9 +82,14 @@ def algorithm2(
                 logits = behavior(states, commands)[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
         number = float(stream.uniforms(1)[0])
-        if command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
+        holds = command.hold_from is not None and len(episode) >= command.hold_from
+        if holds and len(episode) > (command.hold_from or 0):
+            pass  # the same number again
+        elif command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
             u = number
-        if command.temperature == 0:
+        if holds:
+            a = int(u * spec.n_actions)
+        elif command.temperature == 0:
             a = logits.index(max(logits))
         else:
             weights = np.exp((np.array(logits) - max(logits)) / command.temperature).tolist()

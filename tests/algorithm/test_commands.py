@@ -242,20 +242,20 @@ def test_iteration_and_index_are_read_from_the_id() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_a_share_of_exploratory_episodes_is_cut_at_its_horizon(share: float) -> None:
+def test_a_share_of_exploratory_episodes_ends_with_one_action(share: float) -> None:
     config = {
-        "cut_at_horizon": share, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1,
+        "held_endings": share, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1,
         "n_episodes_per_iter": 1000,
     }  # fmt: skip
     buffer = buffer_of([1.0, 2.0], [20, 50])
     explored = sampler(**config).explore(3, buffer)
-    asked = sampler(**config | {"cut_at_horizon": 0.0}).explore(3, buffer)
-    assert [(c.desired_return, c.desired_horizon) for c in explored] == [
-        (c.desired_return, c.desired_horizon) for c in asked
-    ]
-    short = [c for c in explored if c.desired_horizon < 60]
-    cut = [c for c in short if c.max_steps == c.desired_horizon]
-    assert {c.max_steps for c in explored if c not in cut} <= {60}
-    assert abs(len(cut) - share * len(short)) < 5 * sqrt(1000 * share * (1 - share)) + 1
-    assert {c.max_steps for c in sampler(**config).warm_up()} == {60}
-    assert {c.max_steps for c in sampler(**config).evaluate(3, buffer)} == {500}
+    others = sampler(**config | {"held_endings": 0.0}).explore(3, buffer)
+    assert [msgspec.structs.replace(c, hold_from=None) for c in explored] == others
+    held = [c for c in explored if c.hold_from is not None]
+    assert abs(len(held) - 1000 * share) <= 5 * sqrt(1000 * share * (1 - share))
+    where = [(c.hold_from or 0) / min(60, c.desired_horizon) for c in held]
+    assert all(0 <= part < 1 for part in where)
+    if held:
+        assert abs(sum(where) / len(where) - 0.5) < 0.1
+    for command in [*sampler(**config).warm_up(), *sampler(**config).evaluate(3, buffer)]:
+        assert command.hold_from is None

@@ -45,6 +45,8 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
         ({"temperature": 0.0}, {}),
         ({"temperature": 0.4}, {"max_return": 20.0}),
         ({"max_steps": 12}, {"frame_stack": 4}),
+        ({"hold_from": 5}, {}),
+        ({"hold_from": 0, "temperature": 0.0}, {}),
         ({"desired_return": 40.7}, {"desired_horizon": "return"}),
         ({"kind": "explore", "desired_return": 500.0}, {"max_return": 20.0}),
     ],

@@ -38,6 +38,7 @@ SMALL: dict[str, Any] = {
     "max_age": 6,
     "recent_size": 15,
     "last_few": 10,
+    "held_endings": 0.3,
     "horizon_spread": 0.25,
     "return_scale": 0.02,
     "horizon_scale": 0.02,

@@ -96,7 +96,11 @@ def run_episode(
             scaled = config["return_scale"] * desired, config["horizon_scale"] * max(horizon, 1.0)
             c[0] = torch.tensor(scaled, dtype=torch.float64)
             row = logits(weights, config, s, c)[0].tolist()
-        action = choose(row, u[len(actions)], command["temperature"])
+        held = command["hold_from"]
+        if held is not None and len(actions) >= held:
+            action = int(u[held] * spec["n_actions"])
+        else:
+            action = choose(row, u[len(actions)], command["temperature"])
         observations.append(np.asarray(observation, np.float32))
         actions.append(action)
         observation, reward, terminated, truncated, _ = env.step(action)
@@ -171,6 +175,7 @@ def numerics_class(hello: dict[str, Any]) -> str:
         "environment_seed": 1_000_000,
         "stream_key": stream_key(0, "probe", 1, 0),
         "temperature": 1.0,
+        "hold_from": None,
     }
     episode = run_episode(command, hello, weights)
     digests = arrays_digest({"logits": found.numpy()}) + episode_digest(0, episode)

@@ -66,11 +66,14 @@ def test_probe_has_the_same_digest(activation: Any, initialisation: Any) -> None
 
 
 @pytest.mark.parametrize(
-    ("kind", "version", "temperature"),
-    [("warm_up", 0, 1.0), ("explore", 1, 1.0), ("evaluate", 1, 0.3), ("evaluate", 1, 0.0)],
-)
+    ("kind", "version", "temperature", "hold_from"),
+    [
+        ("warm_up", 0, 1.0, None), ("explore", 1, 1.0, None), ("explore", 1, 1.0, 4),
+        ("evaluate", 1, 0.3, None), ("evaluate", 1, 0.0, None),
+    ],
+)  # fmt: skip
 def test_episode_has_the_same_bytes(
-    kind: Kind, version: int, temperature: float, generator: EpisodeGenerator
+    kind: Kind, version: int, temperature: float, hold_from: int | None, generator: EpisodeGenerator
 ) -> None:
     commands = [
         Command(
@@ -83,6 +86,7 @@ def test_episode_has_the_same_bytes(
             weights_version=version,
             max_steps=25,
             temperature=temperature,
+            hold_from=hold_from,
         )
         for index in range(5)
     ]
