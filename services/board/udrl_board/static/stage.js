@@ -69,6 +69,7 @@ export class Command {
   choose() {
     if (!this.contents) return;
     const { desired_return: r, desired_horizon: h } = this.command();
+    if (this.follows) for (const id of ["desired-horizon", "desired-horizon-slider"]) $(id).value = h;
     const [xs, ys] = spans(this.contents, [[r, h], [0, 1]]);
     this.map.begin(xs, ys);
     const seen = new Seen(this.contents, xs, ys);
