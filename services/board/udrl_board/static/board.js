@@ -112,7 +112,8 @@ function showHistory() {
   });
   speed.show(xs, [pace]);
   loss.show(xs, [rows.map((r) => r.loss ?? undefined)]);
-  admitted.show(xs, [rows.map((r) => r.admitted)]);
+  const trained = rows.filter((r) => r.iteration > 0); // all of the warm-up's are the best so far
+  admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)]);
   const last = rows.at(-1), best = evaluations.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
   $("curve-said").textContent = `After ${number(last.env_steps)} env steps: explored ${number(last.explored_return)}` +
     (last.commanded_min == null ? "" : `, asked for ${number(last.commanded_min)} to ${number(last.commanded_max)}`) +
