@@ -51,7 +51,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
         card: the text of README.md.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: it cannot be written, or holds what is no such policy.
     """
     assert policy.desired_return is not None
     assert policy.desired_horizon is not None
@@ -62,6 +62,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
         desired_return=policy.desired_return,
         desired_horizon=policy.desired_horizon,
     )
+    _refuse_others(folder)
     described = msgspec.json.format(msgspec.json.encode(description), indent=2)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -107,6 +108,18 @@ def load(folder: str | Path) -> Policy:
         desired_return=description.desired_return,
         desired_horizon=description.desired_horizon,
     )
+
+
+def _refuse_others(folder: Path) -> None:
+    """Raise unless a folder is empty, or holds a policy that may be written again."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    try:
+        msgspec.json.decode(_read(folder / _DESCRIPTION), type=Description)
+    except (msgspec.DecodeError, UdrlError) as error:
+        raise ConfigError(
+            f"{folder} holds something else than an exported agent; name a new folder"
+        ) from error
 
 
 def _read(path: Path) -> bytes:

@@ -83,6 +83,11 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
 
 
 def _episode(number: int, data: Any, name: str, spec: EnvironmentSpec) -> Episode:
+    if not (isinstance(data.observations, np.ndarray) and isinstance(data.actions, np.ndarray)):
+        raise ConfigError(
+            f"dataset {name!r} has observations or actions of several parts; supported are those "
+            f"that are one array"
+        )
     rewards = np.asarray(data.rewards, np.float32)
     actions = np.asarray(data.actions)
     observations = np.asarray(data.observations)[: len(rewards)]

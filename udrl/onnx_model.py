@@ -75,7 +75,6 @@ def export_onnx(policy: Policy, path: Path) -> None:
     # Two tensors: of one that comes twice the exporter would make one input.
     desired = [torch.ones(rows, dtype=torch.float64) for _ in range(2)]
     batch = {0: torch.export.Dim("batch")}
-    path.parent.mkdir(parents=True, exist_ok=True)
     # It prints what it does, and warns of its own future.
     with (
         warnings.catch_warnings(),
@@ -95,6 +94,7 @@ def export_onnx(policy: Policy, path: Path) -> None:
         )
     assert program is not None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         program.save(str(path))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; name a file you may write") from error

@@ -100,3 +100,12 @@ def test_no_folder(tmp_path: Path, policy: Policy) -> None:
 def test_the_package_offers_nothing_else() -> None:
     with pytest.raises(AttributeError, match="'udrl' has no attribute 'loads'"):
         udrl.loads  # noqa: B018
+
+
+def test_a_folder_of_others_is_left_alone(policy: Policy, written: Path, tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("precious")
+    with pytest.raises(ConfigError, match="holds something else than an exported agent"):
+        folder.save(tmp_path, policy, "")
+    assert (tmp_path / "README.md").read_text() == "precious"
+    folder.save(written, policy, "# Another card\n")
+    assert (written / "README.md").read_text() == "# Another card\n"

@@ -64,7 +64,7 @@ class Told:
         self._ask("status")
         # Only this is read of it here; tests of the whole system have whole ones.
         fields: dict[str, Any] = dict.fromkeys(Status.__struct_fields__)
-        return Status(**fields | {"iteration": self.iterations - 1})
+        return Status(**fields | {"iteration": self.iterations - 1, "run_id": "run"})
 
     def history(self, after: int) -> History:
         self._ask("history")
@@ -128,12 +128,12 @@ def test_a_page_that_knows_something_is_told_the_rest(feed: Feed, run: Told, clo
     feed.news()
     run.iterations = 8
     clock.now += FRESH_S
-    news = feed.news(after=4)
+    news = feed.news(4, "run")
     assert [i.iteration for i in news.iterations] == [5, 6, 7]
     assert [e.iteration for e in news.evaluations] == [5, 7]
     assert news.hello is None
     assert news.contents is not None
-    again = feed.news(after=7)
+    again = feed.news(7, "run")
     assert (again.iterations, again.evaluations, again.contents) == ([], [], None)
 
 
@@ -145,7 +145,7 @@ def test_however_many_look_the_run_is_asked_once_a_second(
     assert run.asked == {"hello": 1, "status": 1, "history": 1, "contents": 1}
     clock.now += FRESH_S
     for _ in range(10):
-        feed.news(after=4)
+        feed.news(4, "run")
     # The buffer has not changed since.
     assert run.asked == {"hello": 1, "status": 2, "history": 2, "contents": 1}
 
@@ -161,19 +161,21 @@ def test_when_nobody_answers_the_page_keeps_what_it_knows(
     feed.news()
     run.is_gone = True
     clock.now += FRESH_S
-    news = feed.news(after=4)
+    news = feed.news(4, "run")
     assert (news.status, news.iterations, news.problem) == (None, [], "nobody answers")
     assert len(feed.news().iterations) == 5
     run.is_gone, run.iterations = False, 6
     clock.now += FRESH_S
-    news = feed.news(after=4)
+    news = feed.news(4, "run")
     assert (news.problem, [i.iteration for i in news.iterations]) == ("", [5])
 
 
-def test_a_page_of_another_run_is_told_everything(feed: Feed) -> None:
-    news = feed.news(after=77)
+@pytest.mark.parametrize(("after", "run_id"), [(77, "run"), (2, "another"), (2, "")])
+def test_a_page_of_another_run_is_told_everything(feed: Feed, after: int, run_id: str) -> None:
+    news = feed.news(after, run_id)
     assert news.hello == HELLO
     assert len(news.iterations) == 5
+    assert news.contents is not None
 
 
 def test_a_run_that_came_back_from_a_backup_is_told_anew(
@@ -182,6 +184,6 @@ def test_a_run_that_came_back_from_a_backup_is_told_anew(
     feed.news()
     run.iterations = 3
     clock.now += FRESH_S
-    news = feed.news(after=4)
+    news = feed.news(4, "run")
     assert news.hello == HELLO
     assert [i.iteration for i in news.iterations] == [0, 1, 2]

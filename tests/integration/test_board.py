@@ -58,7 +58,8 @@ def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
     assert [i["iteration"] for i in news["iterations"]] == list(range(status.iteration + 1))
     assert news["evaluations"]
     assert len(news["contents"]["returns"]) >= status.buffer.episodes
-    assert client.get("/news", params={"after": status.iteration}).json()["iterations"] == []
+    known: dict[str, str | int] = {"after": status.iteration, "run": status.run_id}
+    assert client.get("/news", params=known).json()["iterations"] == []
 
 
 @pytest.mark.parametrize("after", ["x", "1.5", "--1", "9" * 40])
@@ -106,6 +107,23 @@ def test_a_board_has_a_name(ended_run: Path) -> None:
         assert client.get("/news", headers={"host": "localhost:80"}).status_code == 200
 
 
+@pytest.mark.parametrize("bad", [{"host": "["}, {"origin": "http://["}])
+def test_headers_that_cannot_be_read(client: TestClient, bad: dict[str, str]) -> None:
+    assert client.get("/", headers=bad).status_code == 400
+
+
+def test_boards_do_not_take_each_others_cookies(ended_run: Path) -> None:
+    jar: dict[str, str] = {}
+    with page(ended_run, token="one") as one, page(ended_run, token="two") as two:
+        for client, token in ((one, "one"), (two, "two")):
+            answer = client.get("/", params={"token": token}, follow_redirects=False)
+            name, _, value = answer.headers["set-cookie"].split(";")[0].partition("=")
+            jar[name] = value
+            client.cookies.clear()
+        both = {"cookie": "; ".join(f"{name}={value}" for name, value in jar.items())}
+        assert [c.get("/news", headers=both).status_code for c in (one, two)] == [200, 200]
+
+
 def test_pages_of_elsewhere_may_not_use_it(client: TestClient) -> None:
     assert client.get("/news", headers={"origin": "http://evil.example"}).status_code == 403
     assert client.get("/news", headers={"origin": "http://127.0.0.1"}).status_code == 200
@@ -129,7 +147,8 @@ def test_a_token_is_asked_for_and_becomes_a_cookie(ended_run: Path) -> None:
         assert "HttpOnly" in let_in.headers["set-cookie"]
         assert "SameSite=strict" in let_in.headers["set-cookie"]
         assert client.get("/").status_code == 200
-        known = {"cookie": "udrl_board=open-sesame"}
+        (cookie,) = let_in.headers["set-cookie"].split(";")[:1]
+        known = {"cookie": cookie}
         with client.websocket_connect("/stage", headers=known) as socket:
             socket.send_text("{}")
             assert "not an order" in socket.receive_json()["problem"]
@@ -242,6 +261,41 @@ def test_orders_before_an_episode_has_begun_do_nothing(client: TestClient) -> No
         assert next(moments(socket))["step"] == 0
 
 
+def test_who_leaves_amid_a_flood_of_orders_leaves_the_board_free(client: TestClient) -> None:
+    with client.websocket_connect("/stage") as socket:
+        for _ in range(300):
+            socket.send_json(begin())
+    assert client.get("/news").status_code == 200
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(begin(paused=True))
+        assert next(moments(socket))["step"] == 0
+
+
+def test_a_refused_order_does_not_end_the_episode(client: TestClient) -> None:
+    with client.websocket_connect("/stage") as socket:
+        seen = moments(socket)
+        socket.send_json(begin(paused=True))
+        next(seen)
+        socket.send_json({"do": "tell", "desired_return": 1e12, "desired_horizon": 1})
+        assert next(seen)["is_over"] is False
+        socket.send_json({"do": "step"})
+        assert next(seen)["step"] == 1
+
+
+def test_whatever_a_picture_raises_is_told(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(rollout: object) -> None:
+        raise ZeroDivisionError("no light")
+
+    monkeypatch.setattr("udrl.rollout.Rollout.picture", broken)
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(begin())
+        trouble = next(moments(socket))
+        assert "no light" in trouble["problem"]
+        assert trouble["is_over"]
+
+
 def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board, "MOST_STAGES", 1)
     with client.websocket_connect("/stage") as first:
@@ -282,8 +336,11 @@ def test_the_command_refuses_what_cannot_be(tmp_path: Path, ended_run: Path) -> 
         call(tmp_path)
     with pytest.raises(Unreachable):
         call("--connect", f"tcp/127.0.0.1:{free_port()}")
-    with pytest.raises(ConfigError, match="name an address of this machine"):
-        call(ended_run, "--host", "203.0.113.7")
+    for host in ("203.0.113.7", "a..b"):
+        with pytest.raises(ConfigError, match="name an address of this machine"):
+            call(ended_run, "--host", host)
+    with pytest.raises(ConfigError, match="letters, digits"):
+        call(ended_run, "--token", "a+b&c")
 
 
 def test_beyond_loopback_a_token_is_made(cli: Callable[..., Cli], ended_run: Path) -> None:

@@ -91,10 +91,14 @@ def test_a_model_for_onnx(ended_run: Path, tmp_path: Path) -> None:
     assert [i.name for i in inputs] == ["observation", "desired_return", "desired_horizon"]
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nothing to export"):
         export(ended_run)
     with pytest.raises(ConfigError, match="is the directory of a run"):
         export(ended_run, "--folder", ended_run)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="name a file you may write"):
+        export(ended_run, "--onnx", tmp_path / "file" / "agent.onnx")
     with pytest.raises(UdrlError, match="not kept"):
         export(ended_run, "--folder", tmp_path / "x", "--weights", "1")

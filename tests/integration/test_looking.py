@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import click
 import imageio_ffmpeg
 import pytest
 from click.testing import CliRunner
@@ -88,6 +89,21 @@ def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, s
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device here")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # their pipes
+def test_a_full_disk_ends_a_film(ended_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").symlink_to("/dev/full")
+    with pytest.raises(ConfigError, match="is the disk full"):
+        call("play", ended_run, "--episodes", 1, "--video", tmp_path / "film.mp4")
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "much"])
+def test_a_desired_return_is_a_finite_number(ended_run: Path, number: str) -> None:
+    for command in ("play", "evaluate"):
+        with pytest.raises(click.BadParameter, match="is not a finite number"):
+            call(command, ended_run, "--desired-return", number)
+
+
 def test_play_needs_a_run(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds no run"):
         call("play", tmp_path)
@@ -144,7 +160,7 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
 def test_nothing_to_plot(ended_run: Path, tmp_path: Path) -> None:
     head = (ended_run / "metrics.csv").read_text().splitlines()[0]
     (tmp_path / "metrics.csv").write_text(head + "\n")
-    with pytest.raises(StoreError, match="no evaluation yet"):
+    with pytest.raises(StoreError, match=r"no evaluation in metrics.csv yet"):
         compare([tmp_path], tmp_path / "picture.png")
 
 

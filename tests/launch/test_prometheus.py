@@ -14,6 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.launch.test_display import STATUS
 from udrl.errors import ConfigError
 from udrl_launch.prometheus import Exporter
+from udrl_launch.training import Watchers
 from udrl_proto.messages import ActorStatus, Quarantined, Status
 
 ROOT = Path(__file__).parents[2]
@@ -91,3 +92,13 @@ def test_a_port_that_is_taken() -> None:
         pytest.raises(ConfigError, match=f"port {first.port}: .*a port that is free"),
     ):
         Exporter(lambda: None, "127.0.0.1", first.port)
+
+
+def test_a_status_that_is_old_says_nothing_of_now() -> None:
+    now = [0.0]
+    watchers = Watchers(clock=lambda: now[0])
+    assert watchers.latest() is None
+    watchers.show(STATUS)
+    assert watchers.latest() == STATUS
+    now[0] += 60
+    assert watchers.latest() is None

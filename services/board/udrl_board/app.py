@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import hashlib
 import hmac
 import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import CancelledError
 from http.cookies import SimpleCookie
 from importlib import resources
 from pathlib import Path
@@ -34,7 +36,6 @@ MOST_BYTES = 4096
 #: Seconds that a picture may take to be sent; who is slower is not there any more.
 _SEND_S = 20.0
 
-_COOKIE = "udrl_board"
 
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -81,6 +82,8 @@ class _Guard:
         self._app = app
         self._hosts = hosts
         self._token = token
+        # Of its own: browsers keep one jar for all ports of a host.
+        self._cookie = f"udrl_board_{hashlib.sha256(token.encode()).hexdigest()[:16]}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -110,11 +113,15 @@ class _Guard:
 
     def _refusal(self, connection: HTTPConnection) -> Response | None:
         host = connection.headers.get("host", "")
-        name = urlsplit(f"//{host}").hostname or ""
+        origin = connection.headers.get("origin")
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+            page = urlsplit(origin).netloc if origin is not None else host
+        except ValueError:
+            return PlainTextResponse("Neither Host nor Origin can be read.", 400)
         if self._hosts and name not in self._hosts:
             return PlainTextResponse(f"This board is not called {name!r}.", 421)
-        origin = connection.headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if page != host:
             return PlainTextResponse("Another page may not use this board.", 403)
         if self._token and not self._knows(connection):
             return PlainTextResponse(
@@ -124,7 +131,7 @@ class _Guard:
         return None
 
     def _knows(self, connection: HTTPConnection) -> bool:
-        cookie = SimpleCookie(connection.headers.get("cookie", "")).get(_COOKIE)
+        cookie = SimpleCookie(connection.headers.get("cookie", "")).get(self._cookie)
         shown = [cookie.value if cookie else "", *self._shown(connection)]
         return any(hmac.compare_digest(one.encode(), self._token.encode()) for one in shown)
 
@@ -136,7 +143,7 @@ class _Guard:
         if not self._token or not self._shown(connection):
             return None
         response = RedirectResponse("/", 303)
-        response.set_cookie(_COOKIE, self._token, httponly=True, samesite="strict")
+        response.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
         return response
 
 
@@ -152,7 +159,8 @@ class _Board:
         text = request.query_params.get("after", "-1")
         if not re.fullmatch(r"-?\d{1,18}", text):
             return PlainTextResponse(f"after={text[:40]!r}: expected an iteration", 400)
-        news = await run_in_threadpool(self._feed.news, int(text))
+        run_id = request.query_params.get("run", "")
+        news = await run_in_threadpool(self._feed.news, int(text), run_id)
         return Response(msgspec.json.encode(news), media_type="application/json")
 
     async def stage(self, socket: WebSocket) -> None:
@@ -206,7 +214,7 @@ def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
         sending: Awaitable[None] = asyncio.wait_for(send(news, picture), _SEND_S)
         try:
             asyncio.run_coroutine_threadsafe(sending, loop).result(_SEND_S + 1)  # type: ignore[arg-type]
-        except (RuntimeError, WebSocketDisconnect, TimeoutError, asyncio.CancelledError) as error:
+        except (RuntimeError, WebSocketDisconnect, TimeoutError, CancelledError) as error:
             raise ConnectionError(f"nobody watches: {error}") from error
 
     return show

@@ -2,11 +2,11 @@
 
 import ipaddress
 import logging
+import re
 import secrets
 import socket
 import threading
 import webbrowser
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,15 +78,16 @@ def board(
     is_local = _is_loopback(host)
     if not is_local:
         token = token or secrets.token_urlsafe(18)
+    if token is not None and not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
+        raise ConfigError(
+            "--token: expected letters, digits and . _ ~ - only, since it stands in an address"
+        )
     use_one_thread()
     log_to_stderr(logging.WARNING)
-    app = make_app(Feed(source), hosts=_LOOPBACK if is_local else (), token=token or "")
+    app = make_app(Feed(source), hosts=(*_LOOPBACK, host) if is_local else (), token=token or "")
     with _listening(host, port) as listener:
         shown = f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{listener.getsockname()[1]}/"
-        click.echo(f"board: {address}{f'?token={token}' if token else ''}")
-        if opens:
-            webbrowser.open(f"{address}{f'?token={token}' if token else ''}")
+        address = f"http://{shown}:{listener.getsockname()[1]}/{f'?token={token}' if token else ''}"
         server = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -97,7 +98,14 @@ def board(
                 server_header=False,
             )
         )
-        return run_service(partial(_serve, server, listener))
+
+        def service(stop: threading.Event) -> None:
+            click.echo(f"board: {address}")
+            if opens:
+                webbrowser.open(address)
+            _serve(server, listener, stop)
+
+        return run_service(service)
 
 
 def _serve(server: "uvicorn.Server", listener: socket.socket, stop: threading.Event) -> None:
@@ -127,11 +135,11 @@ def _listening(host: str, port: int) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen()
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         if listener is not None:
             listener.close()
         raise ConfigError(
-            f"--host {host} --port {port}: {error.strerror}; name an address of this machine and a "
+            f"--host {host} --port {port}: {error}; name an address of this machine and a "
             f"port that is free, or 0"
         ) from error
     return listener

@@ -62,15 +62,21 @@ class Feed:
         self._evaluations: list[EvaluationStatus] = []
         self._problem = ""
 
-    def news(self, after: int = -1) -> News:
-        """Return what is new for a page that knows all iterations up to ``after``; -1: nothing."""
+    def news(self, after: int = -1, run_id: str = "") -> News:
+        """Return what is new for a page.
+
+        Args:
+            after: the last iteration that it knows; -1: none.
+            run_id: of the run that it knows.
+        """
         with self._lock:
             if self._clock() - self._asked_at >= FRESH_S:
                 self._ask()
                 self._asked_at = self._clock()
             known = self._iterations
             # The page may be older than this board, and know of another run.
-            first = after + 1 if after < len(known) else 0
+            same = self._hello is not None and run_id == self._hello.run_id
+            first = after + 1 if same and after < len(known) else 0
             contents = self._contents
             return News(
                 software=udrl.__version__,
@@ -78,15 +84,19 @@ class Feed:
                 status=self._status,
                 iterations=known[first:],
                 evaluations=[e for e in self._evaluations if e.iteration >= first],
-                contents=contents if contents and contents.iteration > after else None,
+                contents=contents
+                if contents and (not first or contents.iteration > after)
+                else None,
                 problem=self._problem,
             )
 
     def _ask(self) -> None:
         self._problem = ""
         try:
-            self._hello = self._hello or self.source.hello()
             self._status = self.source.status()
+            if self._hello is None or self._hello.run_id != self._status.run_id:
+                self._hello, self._contents = self.source.hello(), None
+                self._iterations, self._evaluations = [], []
             if self._iterations and self._status.iteration < self._iterations[-1].iteration:
                 self._iterations, self._evaluations = [], []  # the run came back from a backup
             for _ in range(_PAGES):

@@ -5,7 +5,9 @@ environment's own speed, and takes orders meanwhile. With the same seed, command
 the episode that ``udrl play --seed`` shows.
 """
 
+import contextlib
 import io
+import logging
 import queue
 import threading
 import time
@@ -28,6 +30,8 @@ from udrl_board.source import Source, Wanted
 from udrl_launch.film import Picture
 from udrl_launch.playing import filmed, fps_of
 from udrl_proto.messages import Hello
+
+log = logging.getLogger("udrl")
 
 Return = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Horizon = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
@@ -110,9 +114,15 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Trouble(msgspec.Struct, frozen=True, kw_only=True):
-    """An order could not be obeyed."""
+    """An order could not be obeyed.
+
+    Attributes:
+        problem: why not.
+        is_over: whether the episode has ended with that.
+    """
 
     problem: str
+    is_over: bool = False
 
 
 Show = Callable[[Moment | Trouble, bytes | None], None]
@@ -142,6 +152,7 @@ class Stage(threading.Thread):
         self._is_paused = False
         self._was_told = False
         self._due = 0.0
+        self._closed = threading.Event()
 
     def order(self, order: Order) -> bool:
         """Take an order; return False if too many wait."""
@@ -152,8 +163,10 @@ class Stage(threading.Thread):
         return True
 
     def close(self) -> None:
-        """End, and close the environment."""
-        self._orders.put(None)
+        """End, and close the environment; returns at once."""
+        self._closed.set()
+        with contextlib.suppress(queue.Full):  # then there is something to wake up for
+            self._orders.put_nowait(None)
 
     def run(self) -> None:
         """Obey, step and show, until closed or nobody watches."""
@@ -165,16 +178,32 @@ class Stage(threading.Thread):
                     else:
                         self._obey(order)
                 except UdrlError as error:
-                    self._rollout = None
-                    self._show(Trouble(problem=str(error)), None)
+                    self._give_up(str(error))
         except ConnectionError:
             pass  # nobody watches any more
+        except Exception as error:
+            log.exception("a stage failed")
+            with contextlib.suppress(ConnectionError):
+                self._give_up(f"{type(error).__name__}: {error}")
         finally:
-            if self._env is not None:
-                self._env.close()
+            self._forget_environment()
+
+    def _give_up(self, problem: str) -> None:
+        """End the episode, and distrust its environment."""
+        self._rollout = None
+        self._forget_environment()
+        self._show(Trouble(problem=problem, is_over=True), None)
+
+    def _forget_environment(self) -> None:
+        env, self._env = self._env, None
+        if env is not None:
+            with contextlib.suppress(Exception):  # it may be broken
+                env.close()
 
     def _next(self) -> Order | Literal["go on"] | None:
         """Return the next order; or to go on, if there is none; None: the end."""
+        if self._closed.is_set():
+            return None
         goes_on = self._rollout is not None and not self._rollout.over and not self._is_paused
         if not goes_on:
             return self._orders.get()
@@ -202,7 +231,10 @@ class Stage(threading.Thread):
 
     def _begin(self, order: Begin) -> None:
         self._rollout, self._was_told, self._is_paused = None, False, order.paused
-        self._hello = self._hello or self._source.hello()
+        hello = self._source.hello()
+        if hello != self._hello:
+            self._policies, self._hello = {}, hello
+            self._forget_environment()
         policy = self._policy(self._hello, order.version)
         if self._env is None:
             self._env, self._draws = _make(self._hello)
@@ -285,5 +317,5 @@ def _make(hello: Hello) -> tuple[Environment, bool]:
 
 def _jpeg(picture: Picture) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=_QUALITY)
+    Image.fromarray(picture).convert("RGB").save(file, "JPEG", quality=_QUALITY)
     return file.getvalue()

@@ -64,7 +64,10 @@ def compare(
     evaluated = {run_dir: [r for r in _read(run_dir) if r["eval_mean"]] for run_dir in run_dirs}
     if not any(evaluated.values()):
         names = ", ".join(map(str, run_dirs))
-        raise StoreError(f"nothing to draw: {names}: no evaluation yet; wait for the first")
+        raise StoreError(
+            f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "
+            f"eval_every env steps"
+        )
     figure, axes = _empty()
     for rank, (label, rows) in enumerate(zip(_labels(run_dirs), evaluated.values(), strict=True)):
         _evaluations(axes, rows, x, label, rank)

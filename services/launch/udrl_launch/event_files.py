@@ -59,6 +59,7 @@ class EventFiles:
         self._columns: list[str] = []
         self._file: os.stat_result | None = None
         self._began = 0.0
+        self._begin()
 
     def show(self, status: Status) -> None:
         """Write what has come to ``metrics.csv`` since the last time."""
@@ -85,10 +86,15 @@ class EventFiles:
 
     def _begin_if_new(self, found: os.stat_result, status: Status) -> None:
         """Begin again if this is another file, or it has been begun anew."""
-        held = self._file
-        self._file = found
-        if held is not None and held.st_ino == found.st_ino and found.st_size >= self._read:
-            return
+        held, self._file = self._file, found
+        if held is None or held.st_ino != found.st_ino or found.st_size < self._read:
+            if held is not None:
+                self._begin()
+            self._read, self._columns = 0, []
+            self._began = time.time() - status.wall_s
+
+    def _begin(self) -> None:
+        """Open a file of events in the place of those that are there."""
         self.close()
         try:
             for old in self._folder.glob("events.out.tfevents.*"):
@@ -98,8 +104,6 @@ class EventFiles:
             raise ConfigError(
                 f"{self._folder}: {error.strerror}; make it a folder that you may write"
             ) from error
-        self._read, self._columns = 0, []
-        self._began = time.time() - status.wall_s
 
     def _write(self, row: dict[str, str]) -> None:
         at = self._began + float(row["wall_s"])

@@ -1,6 +1,7 @@
 """Films of episodes: MP4 or GIF, a caption under every picture."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -69,7 +70,8 @@ class Film:
         frame = self.frame(picture, caption)
         if self._writer is None:
             self._writer = self._open(frame)
-        self._writer.send(np.ascontiguousarray(frame))
+        with self._told():
+            self._writer.send(np.ascontiguousarray(frame))
 
     def frame(self, picture: Picture, caption: str) -> Picture:
         """Return a picture with its caption below it, both sides even, as H.264 wants them."""
@@ -83,9 +85,22 @@ class Film:
 
     def close(self) -> None:
         """Finish the file; a film without pictures leaves none."""
-        if self._writer is not None:
-            self._writer.close()
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with self._told():
+                writer.close()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Tell what ffmpeg cannot do, without its page of other affairs."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
             self._writer = None
+            raise ConfigError(
+                f"--video {self._path}: ffmpeg cannot write it ({type(error).__name__}); is the "
+                f"disk full?"
+            ) from error
 
     def _open(self, frame: Picture) -> Generator[None, Any, None]:
         height, width, _ = frame.shape
@@ -106,5 +121,6 @@ class Film:
         writer: Generator[None, Any, None] = self._ffmpeg.write_frames(
             str(self._path), (width, height), fps=self._fps, ffmpeg_log_level="error", **kind
         )
-        next(writer)
+        with self._told():
+            next(writer)
         return writer

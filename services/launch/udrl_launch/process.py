@@ -75,15 +75,17 @@ def run_service(service: Callable[[threading.Event], None]) -> int:
     received: list[int] = []
 
     def on_signal(number: int, frame: object) -> None:
+        # Nothing that takes a lock: the next signal may come in the middle of this one.
         received.append(number)
-        stop.set()
 
     previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
     thread = threading.Thread(target=target, name="service", daemon=True)
     thread.start()
     try:
-        while thread.is_alive() and not stop.is_set():
+        while thread.is_alive() and not received and not stop.is_set():
             thread.join(0.2)
+        if received:
+            stop.set()
         thread.join(GRACE_S)
     finally:
         for number, handler in previous.items():
@@ -91,7 +93,7 @@ def run_service(service: Callable[[threading.Event], None]) -> int:
     if thread.is_alive():
         log.warning("the service did not end in %.0f s and is abandoned", GRACE_S)
         sys.stderr.flush()
-        os._exit(128 + received[0])
+        os._exit(128 + received[0] if received else 1)
     error = outcome[0]
     if received and (error is None or isinstance(error, Interrupted)):
         log.warning("%s", error or "stopped")

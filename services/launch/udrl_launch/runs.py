@@ -56,13 +56,13 @@ def find(folder: Path) -> list[Summary]:
 
 def _places(folder: Path) -> Iterator[Path]:
     """Yield the directories of runs; what is below one is its own affair."""
-    if (folder / FILE).exists():
-        yield folder
-        return
     try:
+        if (folder / FILE).exists():
+            yield folder
+            return
         below = sorted(f for f in folder.iterdir() if f.is_dir() and not f.is_symlink())
-    except PermissionError:
-        return  # other people's
+    except OSError:
+        return  # other people's, or gone meanwhile
     for one in below:
         yield from _places(one)
 
@@ -70,8 +70,7 @@ def _places(folder: Path) -> Iterator[Path]:
 def summarise(run_dir: Path) -> Summary:
     """Return a run in one line, whatever state it is in."""
     # Not the third file that SQLite has there, which readers write too.
-    files = (run_dir / FILE, run_dir / f"{FILE}-wal")
-    changed = max(f.stat().st_mtime for f in files if f.exists())
+    changed = max(map(_changed, (run_dir / FILE, run_dir / f"{FILE}-wal")))
     try:
         with closing(Store(run_dir, read_only=True)) as store:
             config = store.fact("hello", Hello).config
@@ -97,3 +96,11 @@ def summarise(run_dir: Path) -> Summary:
         return Summary(
             run_dir=str(run_dir), state="unreadable", changed=changed, problem=str(error)
         )
+
+
+def _changed(path: Path) -> float:
+    """Return when a file was last written; 0 if it is not there."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

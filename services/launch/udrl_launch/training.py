@@ -3,6 +3,8 @@
 import logging
 import socket
 import threading
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
@@ -34,11 +36,17 @@ class Watcher(Protocol):
 
 
 class Watchers:
-    """Several watchers, and the last status that they were shown."""
+    """Several watchers, and the last status that they were shown.
 
-    def __init__(self) -> None:
+    Args:
+        clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._watchers: list[Watcher] = []
         self._latest: Status | None = None
+        self._shown_at = 0.0
 
     def add(self, watcher: Watcher) -> None:
         """Let one more watch."""
@@ -46,15 +54,17 @@ class Watchers:
 
     def show(self, status: Status) -> None:
         """Show all of them a status."""
-        self._latest = status
+        self._latest, self._shown_at = status, self._clock()
         for watcher in self._watchers:
             watcher.show(status)
 
     def latest(self) -> Status | None:
-        """Return the last status that was shown; None: none yet."""
-        return self._latest
+        """Return the last status that was shown; None: none, or not for some seconds."""
+        return self._latest if self._clock() - self._shown_at < _STALE_S else None
 
 
+#: Seconds after which a status says nothing of now.
+_STALE_S = 10.0
 #: Seconds between two looks at the services.
 _POLL_S = 0.5
 #: Seconds that freshly started services get until the replay service answers.

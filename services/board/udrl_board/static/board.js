@@ -140,7 +140,8 @@ function showContents(contents) {
 
 async function ask() {
   const after = known.iterations.at(-1)?.iteration ?? -1;
-  const response = await fetch(`news?after=${after}`, { signal: AbortSignal.timeout(10_000) });
+  const run = encodeURIComponent(known.hello?.run_id ?? "");
+  const response = await fetch(`news?after=${after}&run=${run}`, { signal: AbortSignal.timeout(10_000) });
   if (!response.ok) throw new Error(await response.text());
   const news = await response.json();
   if (news.hello) Object.assign(known, { hello: news.hello, iterations: [], evaluations: [] });

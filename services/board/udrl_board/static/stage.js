@@ -120,7 +120,7 @@ export class Command {
   said(message) {
     if (message.problem !== undefined) {
       $("outcome").textContent = message.problem;
-      this.moment = null;
+      if (message.is_over) this.moment = null;
       this.buttons();
       return;
     }

@@ -9,7 +9,7 @@ import msgspec
 from udrl.errors import ConfigError, EnvironmentFault
 from udrl_launch import agents, inspection
 from udrl_launch.address import Address
-from udrl_launch.commands.options import KEYS, RUN, RUN_DIR, WEIGHTS, version
+from udrl_launch.commands.options import FINITE, KEYS, RUN, RUN_DIR, WEIGHTS, version
 from udrl_launch.display import panel
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
@@ -23,7 +23,7 @@ from udrl_proto.session import check_endpoint
               help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip
 @click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
-@click.option("--desired-return", type=float, help="Default: as in section 2.3.6.")
+@click.option("--desired-return", type=FINITE, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @WEIGHTS
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")

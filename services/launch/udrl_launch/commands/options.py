@@ -1,7 +1,8 @@
 """Options that several commands have."""
 
+import math
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
 
@@ -31,6 +32,26 @@ WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
     help="Which of the versions that the run keeps.",
 )  # fmt: skip
+
+
+class _Finite(click.ParamType):  # type: ignore[type-arg]
+    """A number that is neither infinite nor not a number."""
+
+    name = "float"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return number
+
+
+FINITE = _Finite()
 
 
 def version(text: str) -> int | Literal["latest", "best"]:

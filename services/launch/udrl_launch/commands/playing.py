@@ -8,7 +8,7 @@ import msgspec
 
 from udrl.numerics import use_one_thread
 from udrl_launch.agents import evaluation_commands, load_agent
-from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
+from udrl_launch.commands.options import FINITE, RUN_DIR, WEIGHTS, version
 from udrl_launch.playing import filmed, fps_of, with_seed
 from udrl_launch.playing import play as play_episodes
 from udrl_launch.window import KEYS_HELP, Window
@@ -16,7 +16,7 @@ from udrl_launch.window import KEYS_HELP, Window
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
-@click.option("--desired-return", type=float, metavar="R", help="Default: as in section 2.3.6.")
+@click.option("--desired-return", type=FINITE, metavar="R", help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), metavar="H",
               help="In how many steps. Default: likewise.")  # fmt: skip
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
