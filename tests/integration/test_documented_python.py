@@ -1,0 +1,56 @@
+"""The Python of the documentation runs, as it stands there."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from udrl import folder
+from udrl.behavior import initialise
+from udrl.config import Config, build, preset
+from udrl.environments import make_environment, specify
+from udrl.policy import Policy
+
+ROOT = Path(__file__).parents[2]
+BLOCKS = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "watching.md").read_text(encoding="utf-8"), re.DOTALL
+)
+
+
+@pytest.fixture
+def agent(tmp_path: Path) -> Path:
+    """Make the folder that the examples load: an agent that nobody has trained."""
+    settings = {k: v for k, v in preset("LunarLander-v3").items() if k != "max_env_steps"}
+    config = build(Config, settings)
+    env = make_environment(config)
+    spec = specify(env, config)
+    env.close()
+    policy = Policy(
+        initialise(config, spec), config, spec, desired_return=200.0, desired_horizon=300
+    )
+    folder.save(tmp_path / "my-agent", policy, "")
+    return tmp_path
+
+
+def test_there_is_python_to_run() -> None:
+    assert [("udrl.train" in block, "udrl.load" in block) for block in BLOCKS] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=["train", "load"])
+def test_examples_run(agent: Path, block: str) -> None:
+    # As written, but for the length of the training.
+    code = block.replace("max_env_steps=100_000", "max_env_steps=1_000")
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=agent, env=os.environ, capture_output=True, text=True,
+        timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    if "udrl.train" in block:
+        assert "EvaluationStatus(" in done.stdout
+        assert (agent / "runs").is_dir()
