@@ -22,7 +22,9 @@ from whole_run import assert_conserved, digests, free_port, live_status, small, 
 def test_environment_that_raises_now_and_then_changes_nothing(run: Callable[..., Status]) -> None:
     flaky_environments.Flaky.raised_for.clear()
     flaky = run(small(environment="flaky_environments:Flaky-v0"), 2000, actors=2)
-    assert flaky.env_failures == len(flaky_environments.Flaky.raised_for) > 10
+    # What fails after the run's end, under commands that are cancelled, nobody counts.
+    raised = len(flaky_environments.Flaky.raised_for)
+    assert 10 < raised - flaky.commands.cancelled <= flaky.env_failures <= raised
     assert digests(flaky) == digests(run(small(), 2000))
 
 
