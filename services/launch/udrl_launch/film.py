@@ -3,8 +3,7 @@
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,17 +49,6 @@ class Film:
         self._fps = fps / self._every
         self._seen = 0
         self._writer: Generator[None, Any, None] | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def add(self, picture: Picture, caption: str) -> None:
         """Append a picture, uint8 [height, width, 3]; the first says how large the film is."""

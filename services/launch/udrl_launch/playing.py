@@ -86,7 +86,7 @@ def play(
     with ExitStack() as stack:
         make = filmed if looks else make_environment
         env = stack.enter_context(closing(make(agent.config)))
-        film = stack.enter_context(Film(video, fps_of(env))) if video is not None else None
+        film = stack.enter_context(closing(Film(video, fps_of(env)))) if video is not None else None
         for command in commands:
             rollout = Rollout(policy, env, command)
             if not _watch(rollout, film, screen):

@@ -229,10 +229,11 @@ def _evaluated(row: EvaluationRow) -> EvaluationStatus:
 
 def history(store: Store, after: int) -> History:
     """Return what came of the iterations after one, a page of them."""
-    rows = store.history(after, HISTORY_PAGE + 1)
-    names = IterationStatus.__struct_fields__
+    rows = store.metrics(after, HISTORY_PAGE + 1)
+    lines = [dict(zip(COLUMNS, row, strict=True)) for row in rows[:HISTORY_PAGE]]
     page = tuple(
-        IterationStatus(**dict(zip(names, row, strict=True))) for row in rows[:HISTORY_PAGE]
+        IterationStatus(**{name: line[name] for name in IterationStatus.__struct_fields__})
+        for line in lines
     )
     evaluations = store.evaluations(after, page[-1].iteration) if page else []
     return History(

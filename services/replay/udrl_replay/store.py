@@ -374,21 +374,6 @@ class Store:
         ((best,),) = self._rows("SELECT max(mean) FROM evaluations")
         return None if best is None else float(best)
 
-    def history(self, after: int, limit: int) -> list[tuple[Any, ...]]:
-        """Return what there is of at most ``limit`` iterations after one, in their order.
-
-        Returns:
-            Values in the order of :class:`~udrl_proto.messages.IterationStatus`.
-        """
-        return self._rows(
-            "SELECT i.iteration, i.env_steps, round(i.wall_s, 3), i.return_min, i.return_mean, "
-            "i.return_max, i.explored_return, i.commanded_min, i.commanded_max, i.admitted, "
-            "i.weights_version, v.loss "
-            "FROM iterations i LEFT JOIN versions v ON v.version = i.weights_version "
-            "WHERE i.iteration > ? ORDER BY i.iteration LIMIT ?",
-            (after, limit),
-        )
-
     def evaluations(self, after: int, until: int) -> list[EvaluationRow]:
         """Return the evaluations of iterations after one, up to another; no closing ones."""
         rows = self._rows(
@@ -398,8 +383,8 @@ class Store:
         )
         return [_evaluation(row) for row in rows]
 
-    def metrics(self, after: int) -> list[tuple[Any, ...]]:
-        """Return the rows of ``metrics.csv`` of iterations after ``after``."""
+    def metrics(self, after: int, limit: int = -1) -> list[tuple[Any, ...]]:
+        """Return the rows of ``metrics.csv`` of iterations after ``after``; -1: all of them."""
         return self._rows(
             "SELECT i.iteration, i.env_steps, i.eval_env_steps, round(i.wall_s, 3), "
             "e.env_steps, e.mean, e.std, e.ci95_low, e.ci95_high, v.loss, i.weights_version, "
@@ -408,8 +393,8 @@ class Store:
             "FROM iterations i "
             "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.closing = 0 "
             "LEFT JOIN versions v ON v.version = i.weights_version "
-            "WHERE i.iteration > ? ORDER BY i.iteration",
-            (after,),
+            "WHERE i.iteration > ? ORDER BY i.iteration LIMIT ?",
+            (after, limit),
         )
 
     # Weights versions: digest and loss of all, blobs of those that somebody may need.

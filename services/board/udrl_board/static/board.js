@@ -1,10 +1,10 @@
 // Asks the board's server what is new, once a second, and shows it.
 import { Chart, merge, short, thin } from "./charts.js";
 import { Plane, spans } from "./map.js";
+import { $, facts, number } from "./page.js";
 import { Command } from "./stage.js";
 
 const EVERY_MS = 1000;
-const $ = (id) => document.getElementById(id);
 
 const known = { hello: null, status: null, iterations: [], evaluations: [], contents: null };
 
@@ -27,20 +27,7 @@ const time = (s) => {
   const two = (n) => String(n).padStart(2, "0");
   return minutes >= 60 ? `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(whole % 60)}` : `${minutes}:${two(whole % 60)}`;
 };
-const number = (x, digits = 1) => (x == null ? "–" : x.toLocaleString("en", { maximumFractionDigits: digits }));
 const evaluated = (e) => (e ? `${number(e.mean)} ± ${number((e.ci95_high - e.ci95_low) / 2)}` : "none yet");
-
-export function facts(list, entries) {
-  list.replaceChildren(
-    ...entries.map(([name, value]) => {
-      const pair = document.createElement("div"), term = document.createElement("dt"), said = document.createElement("dd");
-      term.textContent = name;
-      said.textContent = value;
-      pair.append(term, said);
-      return pair;
-    }),
-  );
-}
 
 function showStatus(status) {
   const { hello } = known;

@@ -3,7 +3,7 @@ const SVG = "http://www.w3.org/2000/svg";
 const WIDTH = 520, HEIGHT = 300, LEFT = 52, BOTTOM = 34, TOP = 8, RIGHT = 10;
 const CELLS = 36;
 
-export function element(name, attributes = {}, text = "") {
+function element(name, attributes = {}, text = "") {
   const made = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   if (text) made.textContent = text;

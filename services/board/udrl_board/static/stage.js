@@ -1,8 +1,7 @@
 // Commanding the agent: what to ask for, the episode as it goes on, and what came of each.
 import { Plane, Seen, spans } from "./map.js";
+import { $, facts, number } from "./page.js";
 
-const $ = (id) => document.getElementById(id);
-const number = (x, digits = 1) => (x == null ? "–" : x.toLocaleString("en", { maximumFractionDigits: digits }));
 
 const round = (x) => Math.round(x * 100) / 100;
 
@@ -131,19 +130,14 @@ export class Command {
       $("no-picture").hidden = false;
       $("no-picture").textContent = "This environment draws no pictures.";
     }
-    const entries = [
+    facts($("moment"), [
       ["step", number(message.step)],
       ["obtained", number(message.obtained)],
       ["still desired", number(message.desired_return)],
       ["within", `${number(Math.max(message.desired_horizon, 1))} steps`],
       ["last action", message.action ?? "–"],
       ["next action", message.probabilities.map((p) => p.toFixed(2)).join(" ") || "–"],
-    ];
-    $("moment").replaceChildren(...entries.map(([name, value]) => {
-      const pair = document.createElement("div");
-      pair.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: value }));
-      return pair;
-    }));
+    ]);
     if (fresh) this.end(message);
     this.buttons();
   }

@@ -1,8 +1,8 @@
 """``udrl metrics``."""
 
 import threading
-import time
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import click
@@ -16,9 +16,6 @@ from udrl_launch.prometheus import Exporter
 from udrl_proto.credentials import load
 from udrl_proto.messages import Status
 from udrl_proto.session import check_endpoint
-
-#: Seconds that a status is good for.
-_FRESH_S = 1.0
 
 
 @click.command()
@@ -47,19 +44,12 @@ def metrics(
     if keys is not None:
         load(keys, "observer")
     endpoint = check_endpoint(connect, secure=keys is not None) if connect else ""
-    lock = threading.Lock()
-    held: list[tuple[float, Status | None]] = []
-
-    def status() -> Status | None:
-        with lock:
-            if not held or time.monotonic() - held[0][0] > _FRESH_S:
-                held[:] = [(time.monotonic(), _ask(run_dir, endpoint, run_id, keys))]
-            return held[0][1]
-
     log_to_stderr()
 
     def service(stop: threading.Event) -> None:
-        with closing(Exporter(status, host, port)) as exporter:
+        with closing(
+            Exporter(partial(_ask, run_dir, endpoint, run_id, keys), host, port)
+        ) as exporter:
             click.echo(f"metrics: http://{host}:{exporter.port}/metrics")
             stop.wait()
 
