@@ -1,6 +1,6 @@
 """``udrl play``: episodes to look at, in a window or a film, one step at a time."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Protocol
@@ -25,6 +25,10 @@ class Screen(Protocol):
 
     def show(self, rollout: Rollout, picture: Picture, caption: str) -> bool:
         """Show a moment of an episode; return whether whoever watches wants to go on."""
+        ...
+
+    def close(self) -> None:
+        """Show nothing any more."""
         ...
 
 
@@ -66,7 +70,7 @@ def play(
     commands: list[Command],
     *,
     video: Path | None = None,
-    screen: Screen | None = None,
+    open_screen: Callable[[float], Screen] | None = None,
 ) -> Iterator[Rollout]:
     """Carry out commands one after another and yield each episode when it is over.
 
@@ -74,19 +78,21 @@ def play(
         agent: who acts.
         commands: what it is told.
         video: a film of all episodes.
-        screen: shows them meanwhile, at its own speed, and may end everything.
+        open_screen: opens what shows them meanwhile, so many pictures a second, and may end
+            everything.
 
     Raises:
         ConfigError: the film cannot be made.
         EnvironmentFault: the environment raised an exception.
         UnsupportedEnvironment: there is nothing to look at.
     """
-    looks = video is not None or screen is not None
+    looks = video is not None or open_screen is not None
     policy = agent.policy
     with ExitStack() as stack:
         make = filmed if looks else make_environment
         env = stack.enter_context(closing(make(agent.config)))
         film = stack.enter_context(closing(Film(video, fps_of(env)))) if video is not None else None
+        screen = stack.enter_context(closing(open_screen(fps_of(env)))) if open_screen else None
         for command in commands:
             rollout = Rollout(policy, env, command)
             if not _watch(rollout, film, screen):

@@ -1,6 +1,5 @@
 """``udrl play``."""
 
-from contextlib import ExitStack, closing
 from pathlib import Path
 
 import click
@@ -9,8 +8,8 @@ import msgspec
 from udrl.numerics import use_one_thread
 from udrl_launch.agents import evaluation_commands, load_agent
 from udrl_launch.commands.options import FINITE, RUN_DIR, WEIGHTS, version
-from udrl_launch.playing import filmed, fps_of, with_seed
 from udrl_launch.playing import play as play_episodes
+from udrl_launch.playing import with_seed
 from udrl_launch.window import KEYS_HELP, Window
 
 
@@ -70,29 +69,25 @@ def play(
             f"asked for a return of {told.desired_return:.1f} within {told.desired_horizon} steps "
             f"(temperature {told.temperature:g}, weights version {agent.version})"
         )
-    with ExitStack() as stack:
-        window = None
-        if opens_window:
-            with closing(filmed(agent.config)) as env:
-                window = stack.enter_context(closing(Window(fps_of(env))))
-        for rollout in play_episodes(agent, commands, video=video, screen=window):
-            if as_json:
-                report = {
-                    "environment_seed": rollout.command.environment_seed,
-                    "desired_return": told.desired_return,
-                    "desired_horizon": told.desired_horizon,
-                    "episode_return": rollout.episode_return,
-                    "length": rollout.steps,
-                    "terminated": rollout.terminated,
-                    "truncated": rollout.truncated,
-                }
-                click.echo(msgspec.json.encode(report).decode())
-            else:
-                ending = "" if rollout.terminated else ", cut by its time limit"
-                click.echo(
-                    f"seed {rollout.command.environment_seed}: obtained "
-                    f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
-                )
+    screen = Window if opens_window else None
+    for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
+        if as_json:
+            report = {
+                "environment_seed": rollout.command.environment_seed,
+                "desired_return": told.desired_return,
+                "desired_horizon": told.desired_horizon,
+                "episode_return": rollout.episode_return,
+                "length": rollout.steps,
+                "terminated": rollout.terminated,
+                "truncated": rollout.truncated,
+            }
+            click.echo(msgspec.json.encode(report).decode())
+        else:
+            ending = "" if rollout.terminated else ", cut by its time limit"
+            click.echo(
+                f"seed {rollout.command.environment_seed}: obtained "
+                f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
+            )
     if video is not None and not as_json:
         click.echo(f"film: {video}")
     return 0
