@@ -14,11 +14,8 @@ import click
 
 from udrl.errors import ConfigError
 from udrl.numerics import use_one_thread
-from udrl_launch.address import Address
-from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
+from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 from udrl_launch.process import GRACE_S, log_to_stderr, run_service
-from udrl_proto.credentials import load
-from udrl_proto.session import check_endpoint
 
 if TYPE_CHECKING:
     import uvicorn
@@ -29,7 +26,7 @@ _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR, required=False)
-@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@CONNECT
 @click.option("--port", type=click.IntRange(0, 65_535), default=0, show_default=True,
               help="Where the page is served; 0: any that is free.")  # fmt: skip
 @click.option("--host", default="127.0.0.1", show_default=True,
@@ -53,8 +50,7 @@ def board(
 
     Example: udrl board runs/mine --open
     """
-    if (run_dir is None) == (connect is None):
-        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+    where = place(run_dir, connect, run_id, keys)
     try:
         import uvicorn
 
@@ -65,16 +61,8 @@ def board(
         raise ConfigError(
             f'the board needs {error.name}; install it with: pip install "udrl[board]"'
         ) from error
-    if keys is not None:
-        load(keys, "observer")
-    source: Source
-    if run_dir is not None:
-        source = Directory(run_dir, keys)
-        source.hello()  # is there a run?
-    else:
-        endpoint = check_endpoint(connect or "", secure=keys is not None)
-        source = Served(Address(endpoint, run_id, keys=keys))
-        source.hello()
+    source: Source = Directory(where, keys) if isinstance(where, Path) else Served(where)
+    source.hello()  # is there a run?
     is_local = _is_loopback(host)
     if not is_local:
         token = token or secrets.token_urlsafe(18)

@@ -37,6 +37,15 @@ def status_at(address: Address) -> Status:
         return asker.ask(keys.STATUS, StatusRequest(), Status)
 
 
+def status_from(where: Path | Address, keys_dir: Path | None = None) -> Status:
+    """Return the status of a run by its directory or its address.
+
+    Raises:
+        UdrlError: as :func:`status_of` and :func:`status_at`.
+    """
+    return status_of(where, keys_dir) if isinstance(where, Path) else status_at(where)
+
+
 def status_of(run_dir: Path, keys_dir: Path | None = None) -> Status:
     """Return the status of a run by its directory, whether somebody works on it or not.
 

@@ -6,13 +6,19 @@ from pathlib import Path
 import click
 import msgspec
 
-from udrl.errors import ConfigError, EnvironmentFault
+from udrl.errors import EnvironmentFault
 from udrl_launch import agents, inspection
-from udrl_launch.address import Address
-from udrl_launch.commands.options import FINITE, KEYS, RUN, RUN_DIR, WEIGHTS, version
+from udrl_launch.commands.options import (
+    CONNECT,
+    FINITE,
+    KEYS,
+    RUN,
+    RUN_DIR,
+    WEIGHTS,
+    place,
+    version,
+)
 from udrl_launch.display import panel
-from udrl_proto.credentials import load
-from udrl_proto.session import check_endpoint
 
 
 @click.command()
@@ -88,7 +94,7 @@ def reproduce(run_dir: Path, command_id: int) -> int:
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR, required=False)
-@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@CONNECT
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @KEYS
 @RUN
@@ -99,15 +105,7 @@ def status(
 
     Example: udrl status runs/mine
     """
-    if (run_dir is None) == (connect is None):
-        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
-    if keys is not None:
-        load(keys, "observer")
-    if run_dir is not None:
-        found = inspection.status_of(run_dir, keys)
-    else:
-        endpoint = check_endpoint(connect or "", secure=keys is not None)
-        found = inspection.status_at(Address(endpoint, run_id, keys=keys))
+    found = inspection.status_from(place(run_dir, connect, run_id, keys), keys)
     if as_json:
         click.echo(msgspec.json.encode(found).decode())
     else:

@@ -7,20 +7,18 @@ from pathlib import Path
 
 import click
 
-from udrl.errors import ConfigError, UdrlError
+from udrl.errors import UdrlError
 from udrl_launch.address import Address
-from udrl_launch.commands.options import KEYS, RUN, RUN_DIR
-from udrl_launch.inspection import status_at, status_of
+from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
+from udrl_launch.inspection import status_from
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.prometheus import Exporter
-from udrl_proto.credentials import load
 from udrl_proto.messages import Status
-from udrl_proto.session import check_endpoint
 
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR, required=False)
-@click.option("--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")
+@CONNECT
 @click.option("--port", type=click.IntRange(0, 65_535), default=9464, show_default=True,
               help="Where Prometheus asks; 0: any that is free.")  # fmt: skip
 @click.option("--host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
@@ -39,29 +37,19 @@ def metrics(
 
     Example: udrl metrics --connect tcp/127.0.0.1:7447 --port 9464
     """
-    if (run_dir is None) == (connect is None):
-        raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
-    if keys is not None:
-        load(keys, "observer")
-    endpoint = check_endpoint(connect, secure=keys is not None) if connect else ""
+    where = place(run_dir, connect, run_id, keys)
     log_to_stderr()
 
     def service(stop: threading.Event) -> None:
-        with closing(
-            Exporter(partial(_ask, run_dir, endpoint, run_id, keys), host, port)
-        ) as exporter:
+        with closing(Exporter(partial(_ask, where, keys), host, port)) as exporter:
             click.echo(f"metrics: http://{host}:{exporter.port}/metrics")
             stop.wait()
 
     return run_service(service)
 
 
-def _ask(
-    run_dir: Path | None, endpoint: str, run_id: str | None, keys: Path | None
-) -> Status | None:
+def _ask(where: Path | Address, keys: Path | None) -> Status | None:
     try:
-        if run_dir is not None:
-            return status_of(run_dir, keys)
-        return status_at(Address(endpoint, run_id, keys=keys))
+        return status_from(where, keys)
     except UdrlError:
         return None  # Prometheus is told that the run does not answer

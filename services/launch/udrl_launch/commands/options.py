@@ -7,6 +7,9 @@ from typing import Any, Literal
 import click
 
 from udrl.errors import ConfigError
+from udrl_launch.address import Address
+from udrl_proto.credentials import load
+from udrl_proto.session import check_endpoint
 
 RUN_DIR = click.Path(path_type=Path, file_okay=False)
 PARENT = click.option("--parent", type=int, hidden=True)
@@ -28,6 +31,28 @@ METRICS_HOST = click.option(
     "--metrics-host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
     help="Where Prometheus may ask; everybody who reaches it may read.",
 )  # fmt: skip
+
+
+def place(
+    run_dir: Path | None, connect: str | None, run_id: str | None, keys: Path | None
+) -> Path | Address:
+    """Return where a run is that a command looks at: its directory, or an address.
+
+    Raises:
+        ConfigError: neither or both are given, or the endpoint or the keys cannot be used.
+    """
+    if keys is not None:
+        load(keys, "observer")
+    if run_dir is not None and connect is None:
+        return run_dir
+    if connect is not None and run_dir is None:
+        return Address(check_endpoint(connect, secure=keys is not None), run_id, keys=keys)
+    raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
+
+
+CONNECT = click.option(
+    "--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447."
+)
 WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
     help="Which of the versions that the run keeps.",
