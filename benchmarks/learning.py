@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-from udrl_launch.agents import evaluate, load_agent
+from udrl_launch.agents import evaluate, evaluation_commands, load_agent
 from udrl_launch.inspection import read_status
 from udrl_proto.messages import Status
 
@@ -62,7 +62,8 @@ def train(env: str, seed: int, run_dir: Path) -> Trained:
         rows = [r for r in csv.DictReader(file) if r["eval_mean"]]
     kept = run_dir / "greedy.json"
     if not kept.exists():
-        result = evaluate(load_agent(run_dir), episodes=100, temperature=0.0)
+        agent = load_agent(run_dir)
+        result = evaluate(agent, evaluation_commands(agent, episodes=100, temperature=0.0))
         kept.write_text(json.dumps(result.evaluation._asdict()), encoding="utf-8")
     return Trained(seed, read_status(run_dir), rows, json.loads(kept.read_text(encoding="utf-8")))
 

@@ -10,7 +10,7 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained, read, write
 from udrl_experiments.study import Place, Study
-from udrl_launch.agents import Agent, evaluate, load_agent
+from udrl_launch.agents import Agent, evaluate, evaluation_commands, load_agent
 from udrl_launch.inspection import read_status
 
 #: Episodes a point.
@@ -64,7 +64,8 @@ def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
 
 
 def _obtained(agent: Agent, env_steps: int, desired_return: float, episodes: int) -> Obtained:
-    result = evaluate(agent, episodes=episodes, desired_return=desired_return)
+    commands = evaluation_commands(agent, episodes=episodes, desired_return=desired_return)
+    result = evaluate(agent, commands)
     return Obtained(
         environment=agent.config.environment,
         seed=agent.config.seed,

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from PIL import Image, ImageSequence
 
 from udrl.errors import ConfigError, StoreError, UdrlError
-from udrl_launch.agents import evaluate, load_agent
+from udrl_launch.agents import evaluate, evaluation_commands, load_agent
 from udrl_launch.cli import cli
 from udrl_launch.curve import compare
 from udrl_launch.inspection import read_status
@@ -36,9 +36,11 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
-    counted = evaluate(
-        load_agent(ended_run), episodes=4, temperature=0.5, desired_return=60, desired_horizon=50
+    agent = load_agent(ended_run)
+    commands = evaluation_commands(
+        agent, episodes=4, temperature=0.5, desired_return=60, desired_horizon=50
     )
+    counted = evaluate(agent, commands)
     played = lines(
         call("play", ended_run, "--episodes", 4, "--temperature", 0.5, "--desired-return", 60,
              "--desired-horizon", 50, "--json")

@@ -8,7 +8,7 @@ import pytest
 
 from udrl.config import Config, build, preset
 from udrl.errors import ConfigError
-from udrl_launch.agents import evaluate, load_agent
+from udrl_launch.agents import evaluate, evaluation_commands, load_agent
 from udrl_proto.messages import Status
 from whole_run import Cli, arguments, assert_conserved, digests, kill_at, reference
 
@@ -61,9 +61,10 @@ def test_services_equal_the_reference(run: Runner, tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     assert digests(run(settings(), BUDGET, actors=2, envs=3, run_dir=run_dir)) == digests(expected)
     agent = load_agent(run_dir)
-    assert evaluate(agent, episodes=2, desired_return=50.7).desired_horizon == 50
+    commands = evaluation_commands(agent, episodes=2, desired_return=50.7)
+    assert evaluate(agent, commands).desired_horizon == 50
     with pytest.raises(ConfigError, match="desired horizon 30: in this run it is the desired"):
-        evaluate(agent, episodes=2, desired_horizon=30)
+        evaluation_commands(agent, episodes=2, desired_horizon=30)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Agents of runs: loaded, evaluated, and told one command again."""
 
 import faulthandler
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -149,29 +150,11 @@ def evaluation_commands(
     ]
 
 
-def evaluate(
-    agent: Agent,
-    *,
-    episodes: int,
-    temperature: float | None = None,
-    desired_return: float | None = None,
-    desired_horizon: int | None = None,
-    environments: int = 16,
-) -> Result:
-    """Evaluate an agent; without a command of its own, by that of section 2.3.6.
+def evaluate(agent: Agent, commands: Sequence[Command], environments: int = 16) -> Result:
+    """Evaluate an agent by the commands of an evaluation (:func:`evaluation_commands`).
 
-    With the run's own settings this repeats its closing evaluation exactly.
-
-    Raises:
-        ConfigError: a horizon is given, and the run's horizons follow from the returns.
+    With those of the run's own settings this repeats its closing evaluation exactly.
     """
-    commands = evaluation_commands(
-        agent,
-        episodes=episodes,
-        temperature=temperature,
-        desired_return=desired_return,
-        desired_horizon=desired_horizon,
-    )
     use_one_thread()
     generator = EpisodeGenerator(agent.config, environments)
     done = generate_episodes(generator, commands, agent.behavior)

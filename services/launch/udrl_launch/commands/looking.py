@@ -48,11 +48,11 @@ def evaluate(
     Example: udrl evaluate runs/mine --greedy --desired-return 200 --desired-horizon 300
     """
     agent = agents.load_agent(run_dir, version(weights))
-    result = agents.evaluate(
+    commands = agents.evaluation_commands(
         agent, episodes=episodes, temperature=0.0 if greedy else temperature,
-        desired_return=desired_return,
-        desired_horizon=desired_horizon,
+        desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
+    result = agents.evaluate(agent, commands)
     if as_json:
         report = {
             "run_dir": str(run_dir), "weights_version": agent.version,
