@@ -151,6 +151,8 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
     picture = tmp_path / "pictures" / "both.svg"
     assert str(picture) in call("plot", ended_run, twin, "--output", picture, "--x", "wall_s")
     drawn = ElementTree.fromstring(picture.read_text())
+    # The interval of a closing evaluation: the twin has no store, so nobody knows of its.
+    assert picture.read_text().count('id="LineCollection_') == 1
     assert "cart" in picture.read_text()
     assert drawn.tag.endswith("svg")
     with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):

@@ -1,17 +1,25 @@
-"""Pictures of learning curves, drawn from ``metrics.csv`` alone."""
+"""Pictures of learning curves, drawn from ``metrics.csv``.
+
+The closing evaluation comes from the store; a directory without one is drawn too.
+"""
 
 import csv
+import logging
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from udrl.errors import ConfigError, StoreError
 from udrl_launch.styles import line_style
+from udrl_replay.store import EvaluationRow, Store
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+log = logging.getLogger("udrl")
 
 Row = Mapping[str, str]
 
@@ -37,6 +45,7 @@ def draw(run_dir: Path, title: str) -> Path:
         returns = [float(r[name] or "nan") for r in rows]
         axes.plot(steps, returns, style, color="0.6", label=label, lw=1)
     _evaluations(axes, rows, "env_steps", "evaluation, mean and 95 % interval", rank=1)
+    _closing(axes, run_dir, rows, "env_steps", rank=1, label="closing evaluation")
     axes.set(xlabel="env steps", ylabel="return", title=title)
     axes.legend(fontsize="small")
     picture = run_dir / "learning_curve.png"
@@ -61,16 +70,17 @@ def compare(
     """
     if picture.suffix not in _KINDS:
         raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
-    evaluated = {run_dir: [r for r in _read(run_dir) if r["eval_mean"]] for run_dir in run_dirs}
-    if not any(evaluated.values()):
+    runs = {run_dir: _read(run_dir) for run_dir in run_dirs}
+    if not any(r["eval_mean"] for rows in runs.values() for r in rows):
         names = ", ".join(map(str, run_dirs))
         raise StoreError(
             f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "
             f"eval_every env steps"
         )
     figure, axes = _empty()
-    for rank, (label, rows) in enumerate(zip(_labels(run_dirs), evaluated.values(), strict=True)):
-        _evaluations(axes, rows, x, label, rank)
+    for rank, (label, run_dir) in enumerate(zip(_labels(list(runs)), runs, strict=True)):
+        _evaluations(axes, runs[run_dir], x, label, rank)
+        _closing(axes, run_dir, runs[run_dir], x, rank)
     axes.set(xlabel=_X[x][0], ylabel="mean return of an evaluation, 95 % interval")
     axes.legend(fontsize="small", handlelength=3.5)
     _save(figure, picture)
@@ -120,6 +130,38 @@ def _evaluations(axes: "Axes", rows: Sequence[Row], x: str, label: str, rank: in
     style = line_style(rank)
     axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
     axes.plot(at, mean, label=label, markevery=max(1, len(at) // 10), **style)
+
+
+def _closing(
+    axes: "Axes",
+    run_dir: Path,
+    rows: Sequence[Row],
+    x: str,
+    rank: int,
+    label: str = "",
+) -> None:
+    """Draw the evaluation that closed a run, large and hollow, if there is one."""
+    row = _closing_evaluation(run_dir)
+    if row is None or not rows:
+        return
+    at = row.env_steps if x == "env_steps" else float(rows[-1][x]) / _X[x][1]
+    found = row.evaluation
+    style = line_style(rank)
+    axes.errorbar(
+        [at], [found.mean],
+        [[found.mean - found.ci95_low], [found.ci95_high - found.mean]],
+        color=style["color"], marker=style["marker"], markersize=9, markerfacecolor="none",
+        capsize=3, linestyle="none", label=label or "_",
+    )  # fmt: skip
+
+
+def _closing_evaluation(run_dir: Path) -> EvaluationRow | None:
+    try:
+        with closing(Store(run_dir, read_only=True)) as store:
+            return store.last_evaluation(closing=True)
+    except StoreError as error:
+        log.debug("no closing evaluation of %s: %s", run_dir, error)
+        return None
 
 
 def _save(figure: "Figure", picture: Path) -> None:
