@@ -15,7 +15,7 @@ import udrl.environments  # noqa: F401 - registers environments
 from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
 from udrl.config import Budget, Config, parse_assignment
 from udrl.errors import UdrlError
-from udrl_experiments.protocol import TASKS, Plan, parse_seeds, parse_steps
+from udrl_experiments.protocol import TASKS, Plan, parse_seeds
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, gather
 from udrl_proto.session import check_endpoint
@@ -92,7 +92,7 @@ def check_udrl(words: list[str]) -> None:
         Plan(
             given["scale"],
             parse_seeds(given["seeds"] or "1"),
-            parse_steps(given["max_env_steps"] or "1"),
+            given["max_env_steps"],
             given["assignments"],
         ).config(TASKS["lander"], 1)
     elif "assignments" in given:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import click
 
 from udrl_experiments.comparison import comparison
-from udrl_experiments.protocol import TASKS, Algorithm, Plan, Scale, parse_seeds, parse_steps, tasks
+from udrl_experiments.protocol import TASKS, Algorithm, Plan, Scale, parse_seeds, tasks
 from udrl_experiments.search import search as make_search
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
@@ -18,6 +18,7 @@ from udrl_experiments.study import Study, conduct
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
 from udrl_experiments.variants import segments as make_segments
+from udrl_launch.commands.options import STEPS
 from udrl_launch.process import log_to_stderr, run_service
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -40,7 +41,7 @@ def _options(command: Command) -> Command:
                      show_default=True, help="Seeds and steps for an evening on two cores, or the "
                      "paper's."),
         click.option("--seeds", metavar="SEEDS", help="E.g. 1-20 or 1,2,7-9."),
-        click.option("--max-env-steps", metavar="STEPS", help="Of each run, e.g. 500K or 10M."),
+        click.option("--max-env-steps", type=STEPS, help="Of each run, e.g. 500K or 10M."),
         click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
                      help="Change a setting of all UDRL runs; may be repeated."),
         click.option("--folder", type=click.Path(path_type=Path, file_okay=False),
@@ -76,7 +77,7 @@ def _conduct(
     *,
     scale: Scale,
     seeds: str | None,
-    max_env_steps: str | None,
+    max_env_steps: int | None,
     assignments: tuple[str, ...],
     folder: Path,
     side_by_side: int | None,
@@ -86,7 +87,7 @@ def _conduct(
     plan = Plan(
         scale,
         None if seeds is None else parse_seeds(seeds),
-        None if max_env_steps is None else parse_steps(max_env_steps),
+        max_env_steps,
         assignments,
     )
     planned = make(plan)

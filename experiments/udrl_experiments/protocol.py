@@ -149,23 +149,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(seeds))
 
 
-def parse_steps(text: str) -> int:
-    """Return the env steps that ``3M``, ``500K`` or ``1000000`` names.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKmM]?)", text.replace("_", "").replace(",", ""))
-    steps = 0 if found is None else round(
-        float(found[1]) * {"": 1, "k": 1_000, "m": 1_000_000}[found[2].lower()]
-    )  # fmt: skip
-    if not 1 <= steps <= 2**53:
-        raise ConfigError(
-            f"--max-env-steps {text}: expected a number of steps, e.g. 500K, 10M or 250000"
-        )
-    return steps
-
-
 def tasks(names: Iterable[str]) -> list[Task]:
     """Return tasks by name.
 

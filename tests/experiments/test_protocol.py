@@ -1,10 +1,8 @@
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from udrl.config import preset
 from udrl.errors import ConfigError
-from udrl_experiments.protocol import TASKS, Plan, parse_seeds, parse_steps, tasks
+from udrl_experiments.protocol import TASKS, Plan, parse_seeds, tasks
 
 
 @pytest.mark.parametrize(
@@ -19,25 +17,6 @@ def test_seeds_are_numbers_and_ranges(text: str, seeds: tuple[int, ...]) -> None
 def test_other_seeds_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="--seeds"):
         parse_seeds(text)
-
-
-@pytest.mark.parametrize(
-    ("text", "steps"),
-    [("10M", 10_000_000), ("500k", 500_000), ("1.5M", 1_500_000), ("250_000", 250_000), ("7", 7)],
-)
-def test_steps_have_suffixes(text: str, steps: int) -> None:
-    assert parse_steps(text) == steps
-
-
-@pytest.mark.parametrize("text", ["", "0", "10G", "M", "-5", "1e6", "9" * 30])
-def test_other_steps_are_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="--max-env-steps"):
-        parse_steps(text)
-
-
-@given(st.integers(1, 2**53))
-def test_every_number_of_steps_is_read_as_it_is_written(steps: int) -> None:
-    assert parse_steps(str(steps)) == steps
 
 
 def test_the_papers_scale_is_the_papers() -> None:

@@ -1,6 +1,8 @@
 """Options that several commands have."""
 
 import math
+import re
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,6 +79,26 @@ class _Finite(click.ParamType):  # type: ignore[type-arg]
 
 
 FINITE = _Finite()
+
+
+class _Steps(click.ParamType):  # type: ignore[type-arg]
+    """A number of env steps: ``250000``, ``500K`` or ``1.5M``."""
+
+    name = "steps"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        digits = str(value).replace("_", "").replace(",", "")
+        found = re.fullmatch(r"([0-9]{1,16}(?:\.[0-9]{1,16})?)([kKmM]?)", digits)
+        steps = 0
+        if found is not None:
+            factor = {"": 1, "k": 1_000, "m": 1_000_000}[found[2].lower()]
+            steps = round(Decimal(found[1]) * factor)
+        if not 1 <= steps <= 2**53:
+            self.fail(f"{value!r} is not a number of steps, e.g. 500K, 10M or 250000", param, ctx)
+        return steps
+
+
+STEPS = _Steps()
 
 
 def version(text: str) -> int | Literal["latest", "best"]:

@@ -8,6 +8,7 @@ import click
 
 from udrl.config import preset_names
 from udrl_launch import inspection
+from udrl_launch.commands.options import STEPS
 from udrl_launch.settings import Settings, gather
 from udrl_replay.creation import directory_name, exists
 
@@ -28,10 +29,10 @@ def settings_options(command: Command) -> Command:
                      help="Begin with the episodes of a Minari dataset, not with random ones."),
         click.option("--seed", type=int, help="Seed of the run."),
         click.option("--lead", type=int, help="Iterations that acting may run ahead of training."),
-        click.option("--max-env-steps", type=int, help="Budget in env steps."),
+        click.option("--max-env-steps", type=STEPS, help="Budget in env steps, e.g. 3M."),
         click.option("--stop-return", type=float,
                      help="End when an evaluation reaches this mean return."),
-        click.option("--eval-every", type=int, help="Env steps between evaluations."),
+        click.option("--eval-every", type=STEPS, help="Env steps between evaluations."),
         click.option("--eval-episodes", type=int, help="Episodes in an evaluation."),
     )  # fmt: skip
     for option in reversed(options):

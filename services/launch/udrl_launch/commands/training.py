@@ -67,7 +67,7 @@ def train(
 ) -> int:
     """Train an agent on this machine: replay, learner and actors.
 
-    Example: udrl train LunarLander-v3 --max-env-steps 2000000 --seed 7
+    Example: udrl train LunarLander-v3 --max-env-steps 2M --seed 7
     """
     if resume and run_dir is None:
         raise ConfigError("--resume needs --run-dir: the directory of the run to go on with")

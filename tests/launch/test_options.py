@@ -1,0 +1,27 @@
+"""What options accept."""
+
+import click
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl_launch.commands.options import STEPS
+
+
+@pytest.mark.parametrize(
+    ("text", "steps"),
+    [("10M", 10_000_000), ("500k", 500_000), ("1.5M", 1_500_000), ("250_000", 250_000), ("7", 7)],
+)
+def test_steps_have_suffixes(text: str, steps: int) -> None:
+    assert STEPS.convert(text, None, None) == steps
+
+
+@pytest.mark.parametrize("text", ["", "0", "10G", "M", "-5", "1e6", "0.1", "9" * 16, "9" * 30])
+def test_other_steps_are_refused(text: str) -> None:
+    with pytest.raises(click.BadParameter, match="500K"):
+        STEPS.convert(text, None, None)
+
+
+@given(st.integers(1, 2**53))
+def test_every_number_of_steps_is_read_as_it_is_written(steps: int) -> None:
+    assert STEPS.convert(str(steps), None, None) == steps
