@@ -142,6 +142,8 @@ ACTOR = ActorStatus(
     weights_version=4,
     weights_lag=1,
     running=12,
+    reruns=2,
+    failures=1,
     last_seen_s=0.125,
 )
 AUDIT = AuditStatus(rate=0.125, agreed=11, open=2, disputed=0)

@@ -305,6 +305,8 @@ class ActorStatus(Message, frozen=True, kw_only=True):
     weights_version: int
     weights_lag: int
     running: int
+    reruns: Number
+    failures: Number
     last_seen_s: float
 
 

@@ -22,7 +22,8 @@ FULL = msgspec.structs.replace(
     STATUS,
     actors=(
         ActorStatus(id="actor-1", host="here", environments=16, env_steps_per_s=500.5,
-                    weights_version=5, weights_lag=1, running=3, last_seen_s=0.5),
+                    weights_version=5, weights_lag=1, running=3, reruns=2, failures=1,
+                    last_seen_s=0.5),
     ),
     quarantined=(Quarantined(id="liar", why="lied"),),
     closing_evaluation=STATUS.evaluation,
@@ -56,6 +57,8 @@ def test_every_number_of_the_status_is_told() -> None:
     assert told["udrl_commands", (("state", "issued"),)] == 1
     actor = (("actor", "actor-1"), ("host", "here"))
     assert told["udrl_actor_env_steps_per_second", actor] == 500.5
+    assert told["udrl_actor_reruns_total", actor] == 2
+    assert told["udrl_actor_failures_total", actor] == 1
     assert told["udrl_waiting_seconds", (("for", "actors"), ("who", "learner l"))] == 2.5
     assert told["udrl_quarantined_actors", ()] == 1
 

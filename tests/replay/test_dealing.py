@@ -138,6 +138,26 @@ def test_running_command_that_is_not_outstanding_is_ignored(dealer: Dealer) -> N
     assert ask(dealer, "a", running=[*ids(99), 3]) == ids(0, 1, 2)
 
 
+def test_reruns_and_failures_are_counted_by_actor(dealer: Dealer) -> None:
+    ask(dealer, "a")
+    dealer.fail(command(0).id, "a")
+    assert ask(dealer, "b") == ids(0, 3, 4)
+    assert (dealer.actors["a"].reruns, dealer.actors["a"].failures) == (0, 1)
+    assert (dealer.actors["b"].reruns, dealer.actors["b"].failures) == (1, 0)
+    dealer.leave("a")
+    assert ask(dealer, "b", running=ids(0, 3, 4)) == ids(1, 2, 5)
+    assert dealer.actors["b"].reruns == 3
+    dealer.join(join("a"), 0.0)
+    assert (dealer.actors["a"].reruns, dealer.actors["a"].failures) == (0, 0)
+
+
+def test_command_that_ran_before_a_restart_is_a_rerun_elsewhere(dealer: Dealer) -> None:
+    ask(dealer, "a", wanted=0, running=ids(0))
+    dealer.leave("a")
+    assert command(0).id in ask(dealer, "b")
+    assert dealer.actors["b"].reruns == 1
+
+
 def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     ask(dealer, "b", wanted=0, now=SILENCE_S)

@@ -46,9 +46,16 @@ class StatusCollector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         def labelled(
-            name: str, about: str, labels: list[str], rows: list[tuple[list[str], float | None]]
+            name: str,
+            about: str,
+            labels: list[str],
+            rows: list[tuple[list[str], float | None]],
+            *,
+            grows: bool = False,
         ) -> Any:
-            family = GaugeMetricFamily(name, about, labels=labels)
+            family = (CounterMetricFamily if grows else GaugeMetricFamily)(
+                name, about, labels=labels
+            )
             for values, number in rows:
                 if number is not None:
                     family.add_metric(values, number)
@@ -93,14 +100,17 @@ class StatusCollector:
             )  # fmt: skip
         actors = status.actors
         yield GaugeMetricFamily("udrl_actors", "Actors that are here.", value=len(actors))
-        for name, attribute, about in (
-            ("udrl_actor_env_steps_per_second", "env_steps_per_s", "As the actor says."),
-            ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind the newest."),
-            ("udrl_actor_last_seen_seconds", "last_seen_s", "Since its last message."),
+        for name, attribute, about, grows in (
+            ("udrl_actor_env_steps_per_second", "env_steps_per_s", "As the actor says.", False),
+            ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
+            ("udrl_actor_reruns", "reruns", "Commands dealt that had been dealt before.", True),
+            ("udrl_actor_failures", "failures", "Commands that it could not carry out.", True),
+            ("udrl_actor_last_seen_seconds", "last_seen_s", "Since its last message.", False),
         ):
             yield labelled(
                 name, about, ["actor", "host"],
                 [([a.id, a.host], float(getattr(a, attribute))) for a in actors],
+                grows=grows,
             )  # fmt: skip
         yield labelled(
             "udrl_waiting_seconds", "Who waits for whom, and for how long.", ["who", "for"],

@@ -37,6 +37,7 @@ class Outstanding:
 
     Attributes:
         holders: actors that it was dealt to, and when.
+        was_dealt: whether it was ever dealt to one.
         failures: the actors that could not carry it out, one entry a failure.
         vanished: actors that were gone while they held it, and whether that was while it was
             carried out alone.
@@ -44,6 +45,7 @@ class Outstanding:
 
     command: Command
     holders: dict[str, float] = field(default_factory=dict)
+    was_dealt: bool = False
     failures: list[str] = field(default_factory=list)
     vanished: dict[str, bool] = field(default_factory=dict)
 
@@ -55,12 +57,20 @@ class Outstanding:
 
 @dataclass
 class Actor:
-    """An actor as its last request described it."""
+    """An actor as its last request described it.
+
+    Attributes:
+        holds: ids of the commands that were dealt to it.
+        reruns: commands dealt to it that had been dealt before, to it or another.
+        failures: commands that it could not carry out.
+    """
 
     join: JoinRequest
     last_seen: float
     request: CommandsRequest
     holds: set[int] = field(default_factory=set)
+    reruns: int = 0
+    failures: int = 0
 
 
 class Dealer:
@@ -146,6 +156,7 @@ class Dealer:
             self._put_back(lost, request.actor)
         for known in running - actor.holds:
             self.outstanding[known].holders.setdefault(request.actor, now)
+            self.outstanding[known].was_dealt = True
             self.outstanding[known].vanished.pop(request.actor, None)  # it was only cut off
         actor.holds = running
         if any(self.outstanding[i].is_suspect for i in running):
@@ -176,6 +187,8 @@ class Dealer:
         return next(ready, None)
 
     def _give(self, item: Outstanding, actor: Actor, now: float) -> Command:
+        actor.reruns += item.was_dealt
+        item.was_dealt = True
         item.holders[actor.join.id] = now
         actor.holds.add(item.command.id)
         return item.command
@@ -208,6 +221,7 @@ class Dealer:
         item.failures.append(name)
         if name in self.actors:
             self.actors[name].holds.discard(command_id)
+            self.actors[name].failures += 1
         self._put_back(command_id, name)
 
     def retry_after_s(self) -> float:

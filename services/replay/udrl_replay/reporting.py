@@ -155,6 +155,8 @@ def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: fl
             weights_version=actor.request.weights_version,
             weights_lag=max(0, progress.latest_version - actor.request.weights_version),
             running=len(actor.holds),
+            reruns=actor.reruns,
+            failures=actor.failures,
             last_seen_s=round(now - actor.last_seen, 3),
         )
         for name, actor in sorted(dealer.actors.items())

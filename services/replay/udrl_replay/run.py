@@ -246,10 +246,12 @@ class Run:
 
     def deal(self, request: CommandsRequest, now: float) -> list[Command]:
         """Return commands for an actor that has joined; those to be checked come first."""
-        join = self.dealer.actors[request.actor].join
+        actor = self.dealer.actors[request.actor]
         again = self.auditor.assign(
-            join.id, join.numerics_class, request.running, min(request.wanted, MAX_DEALT)
-        )
+            actor.join.id, actor.join.numerics_class, request.running,
+            min(request.wanted, MAX_DEALT),
+        )  # fmt: skip
+        actor.reruns += len(again)
         rest = msgspec.structs.replace(request, wanted=request.wanted - len(again))
         return again + self.dealer.deal(rest, self.progress.latest_version, now)
 

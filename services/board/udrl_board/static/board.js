@@ -64,7 +64,7 @@ function showActors(status) {
   $("actor-table").tBodies[0].replaceChildren(
     ...status.actors.map((a) => {
       const row = document.createElement("tr");
-      for (const value of [a.id, a.host, a.environments, number(a.env_steps_per_s, 0), a.weights_version, a.weights_lag, a.running, `${number(a.last_seen_s)} s ago`])
+      for (const value of [a.id, a.host, a.environments, number(a.env_steps_per_s, 0), a.weights_version, a.weights_lag, a.running, a.reruns, a.failures, `${number(a.last_seen_s)} s ago`])
         row.insertCell().textContent = value;
       return row;
     }),
