@@ -4,78 +4,127 @@
 
     .venv/bin/python benchmarks/board.py
 
-Runs with and without take turns. A client asks the board for news once a second, as a page does.
+Runs with and without take turns; all are equal, so the same iterations are compared. A client asks
+the board for news once a second, as a page does. The board starts while the run goes on: what it
+costs is told with and without its start.
 """
 
 import argparse
+import csv
 import json
+import os
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import urllib.request
 from pathlib import Path
+from typing import NamedTuple
 
 UDRL = [sys.executable, "-m", "udrl_launch"]
 
 
-def train(run_dir: Path, env_steps: int, *, watched: bool) -> tuple[float, int]:
-    """Train, and return env steps per second and how often the board was asked."""
+class Run(NamedTuple):
+    """What a run came to.
+
+    Attributes:
+        speed: env steps per second, of the whole run.
+        later: of its second half, when the board has started.
+        asked: how often the board was asked.
+        cpu_s: seconds that the board computed, its start included.
+        start_s: its start alone.
+    """
+
+    speed: float
+    later: float
+    asked: int = 0
+    cpu_s: float = 0.0
+    start_s: float = 0.0
+
+
+def train(folder: Path, env_steps: int, *, watched: bool) -> Run:
+    """Train, and return how fast it was."""
+    run_dir = folder / "run"
     training = subprocess.Popen(
         [*UDRL, "train", "LunarLander-v3", "--run-dir", str(run_dir), "--json",
          "--max-env-steps", str(env_steps)],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    done, asked = threading.Event(), [0]
-    watcher = threading.Thread(target=_watch, args=(run_dir, done, asked))
-    if watched:
-        watcher.start()
-    out, _ = training.communicate()
-    done.set()
-    if watched:
-        watcher.join()
-    status = json.loads(out.strip().splitlines()[-1])
-    return status["env_steps"] / status["wall_s"], asked[0]
+    found = _watch(run_dir, training) if watched else (0, 0.0, 0.0)
+    if training.wait():
+        raise SystemExit(f"the run failed with exit code {training.returncode}")
+    with (run_dir / "metrics.csv").open() as file:
+        rows = [(int(r["env_steps"]), float(r["wall_s"])) for r in csv.DictReader(file)]
+    middle = next(row for row in rows if row[0] >= env_steps / 2)
+    last = rows[-1]
+    later = (last[0] - middle[0]) / (last[1] - middle[1])
+    return Run(last[0] / last[1], later, *found)
 
 
-def _watch(run_dir: Path, done: threading.Event, asked: list[int]) -> None:
+def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float, float]:
+    """Look at a board until the training ends; return how often, and what it computed."""
     while not (run_dir / "run.sqlite").exists():
         time.sleep(0.1)
     board = subprocess.Popen([*UDRL, "board", str(run_dir)], stdout=subprocess.PIPE, text=True)
     assert board.stdout is not None
     address = board.stdout.readline().split()[1]
-    after = -1
-    while not done.wait(1.0):
-        with urllib.request.urlopen(f"{address}news?after={after}", timeout=20) as answer:  # noqa: S310 - our own
+    start_s = _cpu_s(board.pid)
+    asked, after, run_id = 0, -1, ""
+    while _goes_on(training, 1.0):
+        url = f"{address}news?after={after}&run={run_id}"
+        with urllib.request.urlopen(url, timeout=20) as answer:  # noqa: S310 - our own
             news = json.load(answer)
-        asked[0] += 1
-        if news["iterations"]:
-            after = news["iterations"][-1]["iteration"]
+        asked += 1
+        run_id = news["hello"]["run_id"] if news["hello"] else run_id
+        after = news["iterations"][-1]["iteration"] if news["iterations"] else after
+    cpu_s = _cpu_s(board.pid)
     board.terminate()
     board.wait(20)
+    return asked, cpu_s, start_s
+
+
+def _goes_on(training: subprocess.Popen[bytes], seconds: float) -> bool:
+    """Wait, and say whether the training still goes on."""
+    try:
+        training.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return True
+    return False
+
+
+def _cpu_s(pid: int) -> float:
+    """Return the seconds that a process has computed (Linux)."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env-steps", type=int, default=300_000)
-    parser.add_argument("--times", type=int, default=3)
+    parser.add_argument("--env-steps", type=int, default=600_000)
+    parser.add_argument("--times", type=int, default=5)
     options = parser.parse_args()
-    speeds: dict[bool, list[float]] = {False: [], True: []}
+    runs: dict[bool, list[Run]] = {False: [], True: []}
     for number in range(options.times):
         for watched in (False, True):
             with tempfile.TemporaryDirectory() as folder:
-                speed, asked = train(Path(folder) / "run", options.env_steps, watched=watched)
-            speeds[watched].append(speed)
-            what = f"with a board, asked {asked} times" if watched else "without"
-            print(f"{number + 1}: {what}: {speed:,.0f} env steps/s", flush=True)
-    for watched, found in speeds.items():
-        print(
-            f"{'with' if watched else 'without'}: median {statistics.median(found):,.0f}, "
-            f"{min(found):,.0f} to {max(found):,.0f} env steps/s"
-        )
+                run = train(Path(folder), options.env_steps, watched=watched)
+            runs[watched].append(run)
+            said = f"{run.speed:,.0f} env steps/s, of the second half {run.later:,.0f}"
+            if watched:
+                said += (
+                    f"; a board asked {run.asked} times computed {run.cpu_s:.1f} s, "
+                    f"{run.start_s:.1f} s of them to start"
+                )
+            print(f"{number + 1}: {'with' if watched else 'without'}: {said}", flush=True)
+    for watched, found in runs.items():
+        for name in ("speed", "later"):
+            speeds = [getattr(run, name) for run in found]
+            print(
+                f"{'with' if watched else 'without'}, {name}: median "
+                f"{statistics.median(speeds):,.0f}, {min(speeds):,.0f} to {max(speeds):,.0f}"
+            )
 
 
 if __name__ == "__main__":
