@@ -117,10 +117,16 @@ class Rollout:
                 ``rgb_array``, or has none.
         """
         picture = self._carefully("render", self._env.render)
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3:
+        if (
+            not isinstance(picture, np.ndarray)
+            or picture.dtype != np.uint8
+            or picture.ndim != 3
+            or picture.shape[2] != 3
+        ):
             raise UnsupportedEnvironment(
-                f"environment {self._policy.config.environment!r} shows no picture; it has to be "
-                f"made with render_mode='rgb_array', and to support that"
+                f"environment {self._policy.config.environment!r} shows no picture of bytes, "
+                f"height x width x 3; it has to be made with render_mode='rgb_array', and to "
+                f"support that"
             )
         return picture
 

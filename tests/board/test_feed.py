@@ -10,6 +10,7 @@ from udrl.config import Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import Unreachable
 from udrl_board.feed import FRESH_S, Feed
+from udrl_board.source import Place
 from udrl_proto.messages import (
     Contents,
     EvaluationStatus,
@@ -50,11 +51,18 @@ class Told:
         self.page = 1000
         self.asked: Counter[str] = Counter()
         self.is_gone = False
+        self.is_doubtful = False
 
     def _ask(self, what: str) -> None:
         self.asked[what] += 1
         if self.is_gone:
             raise Unreachable("nobody answers")
+
+    def place(self) -> Place:
+        return Place("runs/mine", "tcp/127.0.0.1:7447")
+
+    def doubt(self) -> str:
+        return "of an earlier moment" if self.is_doubtful else ""
 
     def hello(self) -> Hello:
         self._ask("hello")
@@ -168,6 +176,17 @@ def test_when_nobody_answers_the_page_keeps_what_it_knows(
     clock.now += FRESH_S
     news = feed.news(4, "run")
     assert (news.problem, [i.iteration for i in news.iterations]) == ("", [5])
+
+
+def test_the_page_is_told_where_the_run_is_and_what_to_doubt(
+    feed: Feed, run: Told, clock: Clock
+) -> None:
+    assert feed.news().place == Place("runs/mine", "tcp/127.0.0.1:7447")
+    run.is_doubtful = True
+    clock.now += FRESH_S
+    news = feed.news(4, "run")
+    assert news.status is not None
+    assert news.problem == "of an earlier moment"
 
 
 @pytest.mark.parametrize(("after", "run_id"), [(77, "run"), (2, "another"), (2, "")])

@@ -1,7 +1,9 @@
 """The board's server on real runs: what it tells, what it refuses, and how its stage obeys."""
 
 import json
+import os
 import signal
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -15,6 +17,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from udrl.errors import ConfigError, StoreError, Unreachable
 from udrl_board import app as board
+from udrl_board import source
 from udrl_board.app import make_app
 from udrl_board.command import board as command
 from udrl_board.feed import Feed
@@ -23,6 +26,7 @@ from udrl_launch.address import Address
 from udrl_launch.agents import load_agent
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import read_status
+from udrl_launch.roles import ENDPOINT_FILE
 from udrl_proto.messages import Status
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 
@@ -96,6 +100,34 @@ def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_pat
         assert directory.weights("latest") == stored.weights("latest")
 
 
+def test_a_service_that_hangs_is_not_waited_for_again_and_again(
+    cli: Callable[..., Cli], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = tmp_path / "run"
+    cli(*arguments(TOY, 10_000_000, run_dir), "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 3, "some iterations")
+    service = json.loads((run_dir / ENDPOINT_FILE).read_text())["pid"]
+    with closing(Directory(run_dir)) as directory:
+        assert directory.place().endpoint.startswith("tcp/127.0.0.1:")
+        assert directory.status().actors
+        assert directory.doubt() == ""
+        os.kill(service, signal.SIGSTOP)
+        try:
+            assert directory.status().actors == ()
+            assert "does not answer this board; what is shown is what its file" in directory.doubt()
+
+            def ask(*_: object) -> None:
+                raise AssertionError("it is asked again at once")
+
+            with monkeypatch.context() as patch:
+                patch.setattr(Served, "_ask", ask)
+                assert directory.status().actors == ()
+        finally:
+            os.kill(service, signal.SIGCONT)
+        monkeypatch.setattr(source, "_SILENT_S", 0.0)
+        wait_for(lambda: directory.status().actors and not directory.doubt(), "an answer")
+
+
 # Who may look.
 
 
@@ -122,6 +154,19 @@ def test_boards_do_not_take_each_others_cookies(ended_run: Path) -> None:
             client.cookies.clear()
         both = {"cookie": "; ".join(f"{name}={value}" for name, value in jar.items())}
         assert [c.get("/news", headers=both).status_code for c in (one, two)] == [200, 200]
+
+
+@pytest.mark.parametrize(
+    "strange", ['prefs={"theme":"dark"}', "a b c", "a/b=1", "a@b=1", "[x]=1", "=", "x=é"]
+)
+def test_cookies_of_other_programs_do_no_harm(ended_run: Path, strange: str) -> None:
+    with page(ended_run, token="secret") as client:
+        client.get("/", params={"token": "secret"})
+        ((name, value),) = client.cookies.items()
+        for jar in (f"{strange}; {name}={value}", f"{name}={value}; {strange}"):
+            headers = {"cookie": jar.encode("utf-8")}
+            client.cookies.clear()
+            assert client.get("/news", headers=headers).status_code == 200  # type: ignore[arg-type]
 
 
 def test_pages_of_elsewhere_may_not_use_it(client: TestClient) -> None:
@@ -296,6 +341,43 @@ def test_whatever_a_picture_raises_is_told(
         assert trouble["is_over"]
 
 
+def test_after_a_failure_an_episode_can_begin(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with client.websocket_connect("/stage") as socket:
+        with monkeypatch.context() as patch:
+            patch.setattr("udrl.rollout.Rollout.picture", lambda rollout: 1 / 0)
+            socket.send_json(begin())
+            assert next(moments(socket))["is_over"]
+        socket.send_json(begin())
+        assert ending(socket)["over"]
+
+
+def test_what_an_order_does_not_name_stays_as_it_is(client: TestClient) -> None:
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(begin(paused=True, desired_return=33.0, desired_horizon=44))
+        next(moments(socket))
+        socket.send_json({"do": "tell", "temperature": 0.0})
+        told = next(moments(socket))
+        asked = ("desired_return", "desired_horizon", "temperature")
+        assert [told[name] for name in asked] == [33.0, 44, 0.0]
+        assert told["was_told"]
+
+
+def test_who_gives_no_orders_leaves_the_stage_to_others(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(begin(paused=True))
+        next(moments(socket))
+        monkeypatch.setattr(board, "IDLE_S", 0.05)
+        socket.send_json({"do": "step"})
+        next(moments(socket))
+        with pytest.raises(WebSocketDisconnect) as left:
+            socket.receive_json()
+        assert "Nobody gave an order" in left.value.reason
+
+
 def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board, "MOST_STAGES", 1)
     with client.websocket_connect("/stage") as first:
@@ -347,7 +429,8 @@ def test_beyond_loopback_a_token_is_made(cli: Callable[..., Cli], ended_run: Pat
     process = cli("board", str(ended_run), "--host", "0.0.0.0").process
     assert process.stdout is not None
     said = process.stdout.readline()
-    assert said.startswith("board: http://0.0.0.0:")
+    # By a name that other machines may know it by, which 0.0.0.0 is not.
+    assert said.startswith(f"board: http://{socket.gethostname()}:")
     assert len(said.split("?token=")[1].strip()) >= 20
     process.terminate()
     assert process.wait(20) == 128 + signal.SIGTERM

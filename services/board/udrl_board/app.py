@@ -8,7 +8,6 @@ import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import CancelledError
-from http.cookies import SimpleCookie
 from importlib import resources
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -33,6 +32,8 @@ log = logging.getLogger("udrl")
 MOST_STAGES = 8
 #: Bytes of an order; the server is told.
 MOST_BYTES = 4096
+#: Seconds without an order after which a stage on which nobody acts is for others.
+IDLE_S = 300.0
 #: Seconds that a picture may take to be sent; who is slower is not there any more.
 _SEND_S = 20.0
 
@@ -131,8 +132,8 @@ class _Guard:
         return None
 
     def _knows(self, connection: HTTPConnection) -> bool:
-        cookie = SimpleCookie(connection.headers.get("cookie", "")).get(self._cookie)
-        shown = [cookie.value if cookie else "", *self._shown(connection)]
+        # Starlette's reading is the browsers': a strange cookie of another program hides no other.
+        shown = [connection.cookies.get(self._cookie, ""), *self._shown(connection)]
         return any(hmac.compare_digest(one.encode(), self._token.encode()) for one in shown)
 
     def _shown(self, connection: HTTPConnection) -> list[str]:
@@ -178,15 +179,20 @@ class _Board:
             await _listen(socket, stage)
         finally:
             stage.close()
+            self._stages -= 1  # first: the server may cancel what waits
             await run_in_threadpool(stage.join)
-            self._stages -= 1
 
 
 async def _listen(socket: WebSocket, stage: Stage) -> None:
     """Pass on orders until whoever gives them leaves."""
     while True:
         try:
-            text = await socket.receive_text()
+            text = await asyncio.wait_for(socket.receive_text(), IDLE_S)
+        except TimeoutError:
+            if stage.is_acting:
+                continue
+            await socket.close(1001, f"Nobody gave an order for {IDLE_S:.0f} seconds")
+            return
         except (WebSocketDisconnect, KeyError):  # a binary message has no text
             return
         problem = ""

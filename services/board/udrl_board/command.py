@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Names of this machine that no other can have.
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
+#: No address of any machine: what is shown instead is this one's name.
+_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
 
 
 @click.command()
@@ -74,7 +76,8 @@ def board(
     log_to_stderr(logging.WARNING)
     app = make_app(Feed(source), hosts=(*_LOOPBACK, host) if is_local else (), token=token or "")
     with _listening(host, port) as listener:
-        shown = f"[{host}]" if ":" in host else host
+        shown = socket.gethostname() if host in _EVERYWHERE else host
+        shown = f"[{shown}]" if ":" in shown else shown
         address = f"http://{shown}:{listener.getsockname()[1]}/{f'?token={token}' if token else ''}"
         server = uvicorn.Server(
             uvicorn.Config(

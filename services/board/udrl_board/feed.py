@@ -9,7 +9,7 @@ import msgspec
 
 import udrl
 from udrl.errors import UdrlError
-from udrl_board.source import Source
+from udrl_board.source import Place, Source
 from udrl_proto.messages import Contents, EvaluationStatus, Hello, IterationStatus, Status
 
 #: Seconds that an answer is good for.
@@ -25,15 +25,18 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         software: version of udrl that the board is of.
+        place: where the run is.
         hello: the run's specification; None: the page has it.
         status: how the run is doing; None: nobody can say now.
         iterations: completed after the one that the page named.
         evaluations: made in these.
         contents: the replay buffer; None: the page has it.
-        problem: why something cannot be said now; empty: nothing is wrong.
+        problem: why something cannot be said now, or may be of an earlier moment; empty: nothing
+            is wrong.
     """
 
     software: str
+    place: Place
     hello: Hello | None
     status: Status | None
     iterations: list[IterationStatus]
@@ -60,6 +63,7 @@ class Feed:
         self._contents: Contents | None = None
         self._iterations: list[IterationStatus] = []
         self._evaluations: list[EvaluationStatus] = []
+        self._place = source.place()
         self._problem = ""
 
     def news(self, after: int = -1, run_id: str = "") -> News:
@@ -80,6 +84,7 @@ class Feed:
             contents = self._contents
             return News(
                 software=udrl.__version__,
+                place=self._place,
                 hello=self._hello if first == 0 else None,
                 status=self._status,
                 iterations=known[first:],
@@ -108,6 +113,7 @@ class Feed:
             known = self._contents
             if known is None or not known.returns or known.iteration < self._status.iteration:
                 self._contents = self.source.contents()
+            self._place, self._problem = self.source.place(), self.source.doubt()
         except UdrlError as error:
             self._status = None
             self._problem = str(error)

@@ -2,10 +2,13 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Literal, Protocol, TypeVar
+
+import msgspec
 
 from udrl.errors import PeerError, Unreachable
 from udrl_launch.address import Address, connected
@@ -35,10 +38,34 @@ Wanted = int | Literal["latest", "best"]
 
 #: Seconds that an answer may take; who looks at a page does not wait for longer.
 _ANSWER_S = 3.0
+#: Seconds for which a service that did not answer is not asked again.
+_SILENT_S = 10.0
+
+
+class Place(msgspec.Struct, frozen=True):
+    """Where a run is, for the commands that the page names; empty: unknown.
+
+    Attributes:
+        run_dir: its directory on the board's machine.
+        endpoint: that services of the run connect to.
+        needs_keys: whether they have to prove their roles.
+    """
+
+    run_dir: str = ""
+    endpoint: str = ""
+    needs_keys: bool = False
 
 
 class Source(Protocol):
     """What can be asked about a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
+
+    def place(self) -> Place:
+        """Return where the run is."""
+        ...
+
+    def doubt(self) -> str:
+        """Return why answers may be of an earlier moment; empty: they are of now."""
+        ...
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -74,6 +101,14 @@ class Stored:
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
+
+    def place(self) -> Place:
+        """Return its directory."""
+        return Place(str(self._run_dir))
+
+    def doubt(self) -> str:
+        """Return nothing: there is no other moment."""
+        return ""
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -115,6 +150,14 @@ class Served:
         self._stack = ExitStack()
         self._line: tuple[Asker, Hello] | None = None
         self._lock = threading.Lock()
+
+    def place(self) -> Place:
+        """Return its endpoint."""
+        return Place("", self._address.endpoint, self._address.keys is not None)
+
+    def doubt(self) -> str:
+        """Return nothing: who does not answer raises."""
+        return ""
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -177,7 +220,22 @@ class Directory:
         self._keys_dir = keys_dir
         self._stored = Stored(run_dir)
         self._served: tuple[str, Served] | None = None
+        self._silent_since = float("-inf")
         self._lock = threading.Lock()
+
+    def place(self) -> Place:
+        """Return its directory, and its endpoint while it is served."""
+        endpoint = served_at(self._run_dir) or ""
+        return Place(str(self._run_dir), endpoint, self._keys_dir is not None)
+
+    def doubt(self) -> str:
+        """Return that the replay service does not answer, if it is there and does not."""
+        if not self._is_silent() or served_at(self._run_dir) is None:
+            return ""
+        return (
+            f"The replay service of {self._run_dir} does not answer this board; what is shown is "
+            f"what its file says. A run with keys needs --keys DIR of an observer."
+        )
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -207,13 +265,18 @@ class Directory:
                 self._served = None
 
     def _ask(self, question: Callable[[Source], Answer]) -> Answer:
-        served = self._service()
+        served = None if self._is_silent() else self._service()
         if served is not None:
             try:
                 return question(served)
             except PeerError as error:
                 log.debug("%s is read, since it does not answer: %s", self._run_dir, error)
+                if isinstance(error, Unreachable):
+                    self._silent_since = time.monotonic()
         return question(self._stored)
+
+    def _is_silent(self) -> bool:
+        return time.monotonic() - self._silent_since < _SILENT_S
 
     def _service(self) -> Served | None:
         endpoint = served_at(self._run_dir)

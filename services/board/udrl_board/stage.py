@@ -55,11 +55,11 @@ class Begin(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="begi
 
 
 class Tell(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="tell"):
-    """Ask for something else from here on."""
+    """Ask for something else from here on; what is None stays as it is."""
 
-    desired_return: Return
-    desired_horizon: Horizon
-    temperature: Temperature = 1.0
+    desired_return: Return | None = None
+    desired_horizon: Horizon | None = None
+    temperature: Temperature | None = None
 
 
 class Pause(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="pause"):
@@ -154,6 +154,12 @@ class Stage(threading.Thread):
         self._due = 0.0
         self._closed = threading.Event()
 
+    @property
+    def is_acting(self) -> bool:
+        """Whether an episode goes on."""
+        rollout = self._rollout
+        return rollout is not None and not rollout.over and not self._is_paused
+
     def order(self, order: Order) -> bool:
         """Take an order; return False if too many wait."""
         try:
@@ -179,12 +185,13 @@ class Stage(threading.Thread):
                         self._obey(order)
                 except UdrlError as error:
                     self._give_up(str(error))
+                except ConnectionError:
+                    raise
+                except Exception as error:
+                    log.exception("an episode failed")
+                    self._give_up(f"{type(error).__name__}: {error}")
         except ConnectionError:
             pass  # nobody watches any more
-        except Exception as error:
-            log.exception("a stage failed")
-            with contextlib.suppress(ConnectionError):
-                self._give_up(f"{type(error).__name__}: {error}")
         finally:
             self._forget_environment()
 
@@ -204,8 +211,7 @@ class Stage(threading.Thread):
         """Return the next order; or to go on, if there is none; None: the end."""
         if self._closed.is_set():
             return None
-        goes_on = self._rollout is not None and not self._rollout.over and not self._is_paused
-        if not goes_on:
+        if not self.is_acting:
             return self._orders.get()
         try:
             return self._orders.get_nowait()
@@ -218,9 +224,7 @@ class Stage(threading.Thread):
                 self._begin(order)
                 self._present()
             case Tell() if self._rollout is not None:
-                self._rollout.tell(order.desired_return, order.desired_horizon)
-                self._rollout.temperature = order.temperature
-                self._was_told = True
+                self._tell(self._rollout, order)
                 self._present()
             case Pause() if self._rollout is not None:
                 self._is_paused = order.paused
@@ -255,6 +259,16 @@ class Stage(threading.Thread):
             ),
         )
         self._due = time.monotonic()
+
+    def _tell(self, rollout: Rollout, order: Tell) -> None:
+        wanted_return, wanted_horizon = order.desired_return, order.desired_horizon
+        rollout.tell(
+            rollout.desired_return if wanted_return is None else wanted_return,
+            rollout.desired_horizon if wanted_horizon is None else wanted_horizon,
+        )
+        if order.temperature is not None:
+            rollout.temperature = order.temperature
+        self._was_told = True
 
     def _policy(self, hello: Hello, wanted: Wanted) -> Policy:
         """Return the agent of a version; named ones may be another each time."""

@@ -1,24 +1,29 @@
 // Asks the board's server what is new, once a second, and shows it.
-import { Chart, merge, short, thin } from "./charts.js";
+import { Chart, merge, thin } from "./charts.js";
 import { Plane, spans } from "./map.js";
 import { $, facts, number } from "./page.js";
 import { Command } from "./stage.js";
 
 const EVERY_MS = 1000;
 
-const known = { hello: null, status: null, iterations: [], evaluations: [], contents: null };
+const known = { place: {}, hello: null, status: null, iterations: [], evaluations: [], contents: null };
 
-const curve = new Chart($("curve"), [
-  { label: "evaluation", colour: "evaluation", width: 2, points: true },
-  { label: "95 % to", colour: "evaluation", width: 0 },
-  { label: "from", colour: "evaluation", width: 0 },
-  { label: "explored", colour: "explored" },
-  { label: "asked, most", colour: "commanded", dash: [4, 4] },
-  { label: "asked, least", colour: "commanded", dash: [4, 4] },
-], [[1, 2, "evaluation"], [4, 5, "commanded"]]);
-const speed = new Chart($("speed"), [{ label: "env steps/s", colour: "evaluation" }]);
-const loss = new Chart($("loss"), [{ label: "loss", colour: "evaluation" }]);
-const admitted = new Chart($("admitted"), [{ label: "episodes", colour: "evaluation" }]);
+const curve = new Chart($("curve"), $("curve-said"), [
+  { colour: "evaluation", width: 2, points: true },
+  { colour: "evaluation", width: 0 },
+  { colour: "evaluation", width: 0 },
+  { colour: "explored" },
+  { colour: "commanded", dash: [4, 4] },
+  { colour: "commanded", dash: [4, 4] },
+  { colour: "evaluation", hollow: true },
+], {
+  bands: [[1, 2, "evaluation"], [4, 5, "commanded"]],
+  legend: [["evaluations, mean with its 95 % interval", "evaluation", "line"], ["closing evaluation", "evaluation", "dot"],
+    ["exploratory episodes, mean of an iteration", "explored", "line"], ["what these were asked for", "commanded", "band"]],
+});
+const speed = new Chart($("speed"), $("speed-said"), [{ colour: "evaluation" }]);
+const loss = new Chart($("loss"), $("loss-said"), [{ colour: "evaluation" }]);
+const admitted = new Chart($("admitted"), $("admitted-said"), [{ colour: "evaluation" }]);
 const buffer = new Plane($("buffer"), { x: "return", y: "length, steps", label: "Returns and lengths of the replay buffer's episodes" });
 const command = new Command();
 
@@ -28,6 +33,17 @@ const time = (s) => {
   return minutes >= 60 ? `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(whole % 60)}` : `${minutes}:${two(whole % 60)}`;
 };
 const evaluated = (e) => (e ? `${number(e.mean)} ± ${number((e.ci95_high - e.ci95_low) / 2)}` : "none yet");
+
+// Shell commands that go on from here, as far as the board knows what they are called.
+function commands() {
+  const { run_dir, endpoint, needs_keys } = known.place;
+  const keys = needs_keys ? " --keys DIR" : "", env = known.status.environment;
+  const word = (text) => (/^[\w./:-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
+  return {
+    service: (role) => `udrl ${role} --connect ${endpoint || "ENDPOINT"}${keys}`,
+    resume: (more = "") => `udrl train ${word(env)} --run-dir ${run_dir ? word(run_dir) : "RUN_DIR"} --resume${more}${keys}`,
+  };
+}
 
 function showStatus(status) {
   const { hello } = known;
@@ -39,7 +55,7 @@ function showStatus(status) {
   facts($("facts"), [
     ["iteration", number(status.iteration)],
     ["env steps", `${number(status.env_steps)} of ${number(status.max_env_steps)}`],
-    ["env steps/s", number(status.env_steps_per_s, 0)],
+    ...(status.state === "running" || status.state === "closing" ? [["env steps/s", number(status.env_steps_per_s, 0)]] : []),
     ["last evaluation", evaluated(status.evaluation)],
     ...(status.closing_evaluation ? [["closing evaluation", evaluated(status.closing_evaluation)]] : []),
     ["weights", `version ${status.weights_version}`],
@@ -53,25 +69,32 @@ function showStatus(status) {
 }
 
 function showActors(status) {
-  const working = status.state === "running" || status.state === "closing";
-  const none = status.actors.length === 0;
+  const none = status.actors.length === 0, { service, resume } = commands();
+  const why = {
+    running: `No actor is here. Start one: ${service("actor")}`,
+    closing: `No actor is here, and the closing evaluation is missing. Start one: ${service("actor")}`,
+    stopped: `Nobody works on this run. It goes on where it was: ${resume()}`,
+    ended: `The run has ended, and its actors have left. To go on: ${resume(" --max-env-steps MORE")}`,
+    failed: `The run has failed, and its actors have left. When the cause is mended: ${resume()}`,
+  };
   $("no-actors").hidden = !none;
-  if (none)
-    $("no-actors").textContent = working
-      ? "No actor is here. Start one: udrl actor --connect ENDPOINT. If nobody works on the run: udrl train ENV --run-dir RUN_DIR --resume."
-      : "The run has ended, and its actors have left. To go on: udrl train ENV --run-dir RUN_DIR --resume --max-env-steps MORE.";
+  if (none) $("no-actors").textContent = why[status.state];
   $("actor-table").hidden = none;
   $("actor-table").tBodies[0].replaceChildren(
     ...status.actors.map((a) => {
       const row = document.createElement("tr");
-      for (const value of [a.id, a.host, a.environments, number(a.env_steps_per_s, 0), a.weights_version, a.weights_lag, a.running, a.reruns, a.failures, `${number(a.last_seen_s)} s ago`])
+      for (const value of [a.id, a.host, a.environments, number(a.env_steps_per_s, 0), a.weights_version, a.weights_lag, a.running, a.reruns, a.failures, `${number(a.last_seen_s, 1)} s ago`])
         row.insertCell().textContent = value;
       return row;
     }),
   );
   const lines = (list, texts) =>
     list.replaceChildren(...texts.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
-  lines($("waiting"), status.waiting.map((w) => `${w.who} waits for ${w.for}: ${w.why} (${number(w.seconds)} s)`));
+  const missing = status.waiting.some((w) => w.why.includes("no learner is here"));
+  lines($("waiting"), [
+    ...status.waiting.map((w) => `${w.who} waits for ${w.for}: ${w.why} (${number(w.seconds, 1)} s)`),
+    ...(missing ? [`No learner is here. Start one: ${service("learner")}`] : []),
+  ]);
   lines($("quarantined"), status.quarantined.map((q) => `quarantined: ${q.id}: ${q.why}`));
   const { commands: c, episodes: e } = status;
   facts($("ledgers"), [
@@ -84,44 +107,60 @@ function showActors(status) {
 }
 
 function showHistory() {
-  const { iterations, evaluations } = known;
+  const { iterations, evaluations } = known, closing = known.status?.closing_evaluation;
   if (!iterations.length) return;
   const rows = thin(iterations);
-  const table = merge(
+  const { xs, column } = merge(
     [rows, "env_steps", { explored: (r) => r.explored_return, most: (r) => r.commanded_max ?? undefined, least: (r) => r.commanded_min ?? undefined }],
     [evaluations, "env_steps", { mean: (e) => e.mean, high: (e) => e.ci95_high, low: (e) => e.ci95_low }],
+    [closing ? [closing] : [], "env_steps", { closing: (e) => e.mean }],
   );
-  curve.show(table.xs, ["mean", "high", "low", "explored", "most", "least"].map(table.column));
-  const xs = rows.map((r) => r.env_steps);
+  const columns = Object.fromEntries(["mean", "high", "low", "explored", "most", "least", "closing"].map((name) => [name, column(name)]));
+  const last = rows.at(-1), all = closing ? [...evaluations, closing] : evaluations;
+  const best = all.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
+  const asked = (least, most) => (least == null ? "" : `, asked for ${number(least)} to ${number(most)}`);
+  curve.show(xs, Object.values(columns),
+    `After ${number(last.env_steps)} env steps: explored ${number(last.explored_return)}${asked(last.commanded_min, last.commanded_max)}` +
+      (best ? `; best evaluation ${evaluated(best)} after ${number(best.env_steps)}.` : "; no evaluation yet."),
+    (i) => {
+      const at = Object.fromEntries(Object.entries(columns).map(([name, values]) => [name, values[i]]));
+      const parts = [
+        at.mean == null ? "" : `evaluation ${number(at.mean)}, ${number(at.low)} to ${number(at.high)}`,
+        at.closing == null ? "" : `closing evaluation ${number(at.closing)}`,
+        at.explored == null ? "" : `explored ${number(at.explored)}${asked(at.least, at.most)}`,
+      ];
+      return `After ${number(xs[i])} env steps: ${parts.filter(Boolean).join("; ")}.`;
+    });
+  const steps = rows.map((r) => r.env_steps);
   const pace = rows.map((r, i) => {
     const before = rows[Math.max(0, i - 5)];
     return r.wall_s > before.wall_s ? (r.env_steps - before.env_steps) / (r.wall_s - before.wall_s) : undefined;
   });
-  speed.show(xs, [pace]);
-  loss.show(xs, [rows.map((r) => r.loss ?? undefined)]);
+  const after = (text, of) => (i) => `After ${number(of[i].env_steps)} env steps: ${text(i)}.`;
+  speed.show(steps, [pace], `Over the last iterations ${number(pace.at(-1), 0)}, evaluations included.`, after((i) => number(pace[i], 0), rows));
+  loss.show(steps, [rows.map((r) => r.loss ?? undefined)], last.loss == null ? "Nothing is trained yet." : `Now ${number(last.loss)}.`,
+    after((i) => number(rows[i].loss), rows));
   const trained = rows.filter((r) => r.iteration > 0); // all of the warm-up's are the best so far
-  admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)]);
-  const last = rows.at(-1), best = evaluations.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
-  $("curve-said").textContent = `After ${number(last.env_steps)} env steps: explored ${number(last.explored_return)}` +
-    (last.commanded_min == null ? "" : `, asked for ${number(last.commanded_min)} to ${number(last.commanded_max)}`) +
-    (best ? `; best evaluation ${evaluated(best)} after ${number(best.env_steps)}.` : "; no evaluation yet.");
-  $("speed-said").textContent = `Over the last iterations ${number(pace.at(-1), 0)}, evaluations included.`;
-  $("loss-said").textContent = last.loss == null ? "Nothing is trained yet." : `Now ${number(last.loss, 3)}.`;
-  $("admitted-said").textContent = `Of the last iteration: ${last.admitted}.`;
+  admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)], `Of the last iteration: ${last.admitted}.`,
+    after((i) => trained[i].admitted, trained));
 }
 
 function showContents(contents) {
   if (!contents.returns.length) return;
   const asked = contents.desired_returns.map((r, i) => [r, contents.desired_horizons[i]]);
-  buffer.begin(...spans(contents, asked));
   const newest = Math.max(...contents.iterations), oldest = Math.min(...contents.iterations);
-  contents.returns.forEach((r, i) => {
-    const young = newest > oldest ? (contents.iterations[i] - oldest) / (newest - oldest) : 1;
-    buffer.dot(r, contents.lengths[i], { class: "episode", opacity: 0.25 + 0.6 * young });
+  buffer.draw(() => {
+    buffer.axes(...spans(contents, asked));
+    contents.returns.forEach((r, i) => {
+      const young = newest > oldest ? (contents.iterations[i] - oldest) / (newest - oldest) : 1;
+      buffer.dot(r, contents.lengths[i], { class: "episode", opacity: 0.25 + 0.6 * young });
+    });
+    for (const [r, h] of asked) buffer.cross(r, h, "asked");
+    buffer.cross(contents.desired_return, contents.desired_horizon, "told", 7);
   });
-  for (const [r, h] of asked) buffer.cross(r, h, "asked");
-  buffer.cross(contents.desired_return, contents.desired_horizon, "told", 7);
-  $("buffer-said").textContent = `${number(contents.returns.length)} episodes, returns from ${number(contents.returns[0])} to ${number(contents.returns.at(-1))}. ` +
+  const held = known.status?.buffer, recent = known.hello?.config.recent_size;
+  $("buffer-said").textContent = (held ? `The ${number(held.episodes)} best episodes have returns from ${number(held.return_min)} to ${number(held.return_max)}` : "") +
+    (recent ? `; the newest ${number(recent)} are kept and shown besides. ` : ". ") +
     `Evaluations ask for ${number(contents.desired_return)} within ${number(contents.desired_horizon)} steps (M, large cross; S = ${number(contents.return_std)}); ${asked.length} exploratory commands are outstanding.`;
 }
 
@@ -132,16 +171,18 @@ async function ask() {
   if (!response.ok) throw new Error(await response.text());
   const news = await response.json();
   if (news.hello) Object.assign(known, { hello: news.hello, iterations: [], evaluations: [] });
+  known.place = news.place;
   known.iterations.push(...news.iterations);
   known.evaluations.push(...news.evaluations);
+  const ended = news.status?.state !== known.status?.state;
   if (news.status) showStatus((known.status = news.status));
-  if (news.hello || news.iterations.length) showHistory();
+  if (news.hello || news.iterations.length || ended) showHistory();
   if (news.contents) {
     showContents((known.contents = news.contents));
     command.know(known);
   }
   $("about").textContent = `udrl ${news.software}`;
-  problem(news.problem);
+  problem([news.problem, news.status?.problem].filter(Boolean).join(" "));
 }
 
 function problem(text) {

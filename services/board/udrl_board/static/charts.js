@@ -1,12 +1,10 @@
 // Lines against env steps, drawn by uPlot: lines with bands, a cursor that reads them, zoom by dragging.
 import uPlot from "./vendor/uplot/uPlot.esm.js";
+import { labels } from "./page.js";
 
 const MOST_POINTS = 1500;
 
-export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-
-export const short = (x) =>
-  x == null ? "" : Math.abs(x) >= 1e6 ? `${(x / 1e6).toFixed(2)}M` : Math.abs(x) >= 1e4 ? `${Math.round(x / 1e3)}K` : `${Math.round(x * 100) / 100}`;
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 // Every n-th row, the last one always: a chart has a thousand pixels.
 export function thin(rows) {
@@ -28,24 +26,42 @@ export function merge(...tables) {
   return { xs, column: (name) => xs.map((x) => at.get(x)[name]) };
 }
 
-// lines: [{label, colour, width?, dash?, points?}]; bands: [[upper, lower, colour]] by the lines' numbers.
 export class Chart {
-  constructor(place, lines, bands = []) {
-    this.place = place;
-    this.height = place.classList.contains("small") ? 130 : 280;
-    this.lines = lines;
-    this.bands = bands;
+  // lines: [{colour, width?, dash?, points?, hollow?}]; bands: [[upper, lower, colour]] by the lines' numbers;
+  // legend: [[label, colour, "line" | "dot" | "band"]].
+  constructor(place, said, lines, { bands = [], legend = [] } = {}) {
+    Object.assign(this, { place, said, lines, bands });
+    this.height = place.classList.contains("small") ? 150 : 300;
     this.data = [[], ...lines.map(() => [])];
+    if (legend.length) place.before(this.legend(legend));
     new ResizeObserver(() => this.resize()).observe(place);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
   }
 
-  show(xs, columns) {
+  legend(entries) {
+    const list = Object.assign(document.createElement("ul"), { className: "legend" });
+    for (const [label, name, kind] of entries) {
+      const item = Object.assign(document.createElement("li"), { textContent: label });
+      item.prepend(Object.assign(document.createElement("span"), { className: `swatch ${kind} ${name}` }));
+      list.append(item);
+    }
+    return list;
+  }
+
+  // summary: what is said below; read(i): what is said of the i-th place, under the cursor.
+  show(xs, columns, summary, read) {
     this.data = [xs, ...columns];
     this.place.dataset.points = xs.length;
+    Object.assign(this, { summary, read });
     if (!xs.length) return;
     if (this.plot) this.plot.setData(this.data);
     else this.redraw();
+    this.say(this.plot.cursor.idx);
+  }
+
+  say(place) {
+    const text = place == null ? this.summary : this.read(place);
+    if (this.said.textContent !== text) this.said.textContent = text;
   }
 
   resize() {
@@ -55,30 +71,31 @@ export class Chart {
   redraw() {
     if (!this.data[0].length) return;
     this.plot?.destroy();
-    const axis = { stroke: colour("faint"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
+    const axis = {
+      stroke: colour("faint"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") },
+      values: (_, at) => labels(at),
+    };
     this.plot = new uPlot(
       {
         width: this.place.clientWidth,
         height: this.height,
         scales: { x: { time: false } },
-        axes: [
-          { ...axis, values: (_, at) => at.map(short) },
-          { ...axis, size: 56, values: (_, at) => at.map(short) },
-        ],
+        axes: [axis, { ...axis, size: 56, space: 24 }],
         series: [
-          { label: "env steps", value: (_, x) => short(x) },
+          {},
           ...this.lines.map((line) => ({
-            label: line.label,
             stroke: colour(line.colour),
             width: line.width ?? 1,
             dash: line.dash,
             spanGaps: true,
-            points: { show: line.points ?? false, size: 5 },
-            value: (_, y) => short(y),
+            paths: line.hollow ? () => null : undefined,
+            points: { show: line.points ?? line.hollow ?? false, size: line.hollow ? 12 : 5, width: line.hollow ? 2 : 1, fill: colour("card") },
           })),
         ],
         bands: this.bands.map(([upper, lower, name]) => ({ series: [upper + 1, lower + 1], fill: `color-mix(in srgb, ${colour(name)} 22%, transparent)` })),
+        legend: { show: false },
         cursor: { y: false },
+        hooks: { setCursor: [(plot) => this.say(plot.cursor.idx)] },
       },
       this.data,
       this.place,

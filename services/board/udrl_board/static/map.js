@@ -1,6 +1,8 @@
 // The plane of returns and lengths: what the replay buffer has seen, and what somebody asks for.
+import { labels, nice } from "./page.js";
+
 const SVG = "http://www.w3.org/2000/svg";
-const WIDTH = 520, HEIGHT = 300, LEFT = 52, BOTTOM = 34, TOP = 8, RIGHT = 10;
+const LEFT = 52, BOTTOM = 34, TOP = 8, RIGHT = 10;
 const CELLS = 36;
 
 function element(name, attributes = {}, text = "") {
@@ -18,52 +20,70 @@ const span = (numbers, pad) => {
 };
 
 function ticks([low, high]) {
-  const rough = (high - low) / 5, power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
+  const step = nice((high - low) / 5);
   const found = [];
   for (let t = Math.ceil(low / step) * step; t <= high; t += step) found.push(Math.round(t / step) * step);
   return found;
 }
 
+const bounded = (value, [low, high]) => Math.min(high, Math.max(low, value));
+
+// One unit of its picture is one pixel of the page, so that text is as large as elsewhere.
 export class Plane {
   constructor(place, { x, y, label }) {
-    this.names = { x, y };
-    this.svg = element("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": label });
+    Object.assign(this, { place, names: { x, y }, paint: null, marks: new Map() });
+    this.svg = element("svg", { role: "img", "aria-label": label });
     place.append(this.svg);
+    new ResizeObserver(() => {
+      if (this.paint && this.place.clientWidth !== this.seenWidth) this.draw(this.paint);
+    }).observe(place);
   }
 
-  // Draw the axes anew for some spans; what was drawn is gone.
-  begin(xs, ys) {
+  // Draw everything anew, now and whenever the page changes its width: paint() calls axes() and the others.
+  draw(paint) {
+    this.paint = paint;
+    this.seenWidth = this.place.clientWidth;
+    this.width = bounded(this.seenWidth || 520, [260, 640]);
+    this.height = Math.round(bounded(0.58 * this.width, [230, 330]));
+    this.svg.setAttribute("viewBox", `0 0 ${this.width} ${this.height}`);
+    this.svg.replaceChildren();
+    paint();
+    for (const [name, [x, y, size]] of this.marks) this.mark(name, x, y, size);
+  }
+
+  axes(xs, ys) {
     this.xs = xs;
     this.ys = ys;
-    this.svg.replaceChildren();
-    const bottom = HEIGHT - BOTTOM;
-    for (const t of ticks(xs)) {
-      this.svg.append(element("line", { class: "axis", x1: this.x(t), x2: this.x(t), y1: TOP, y2: bottom }));
-      this.svg.append(element("text", { x: this.x(t), y: bottom + 14, "text-anchor": "middle" }, `${+t.toPrecision(6)}`));
-    }
-    for (const t of ticks(ys)) {
-      this.svg.append(element("line", { class: "axis", x1: LEFT, x2: WIDTH - RIGHT, y1: this.y(t), y2: this.y(t) }));
-      this.svg.append(element("text", { x: LEFT - 5, y: this.y(t) + 4, "text-anchor": "end" }, `${+t.toPrecision(6)}`));
-    }
-    this.svg.append(element("text", { x: WIDTH - RIGHT, y: HEIGHT - 4, "text-anchor": "end" }, this.names.x));
+    const bottom = this.height - BOTTOM, right = this.width - RIGHT;
+    const [across, up] = [ticks(xs), ticks(ys)];
+    labels(across).forEach((label, i) => {
+      const x = this.x(across[i]);
+      this.svg.append(element("line", { class: "axis", x1: x, x2: x, y1: TOP, y2: bottom }));
+      this.svg.append(element("text", { x, y: bottom + 14, "text-anchor": "middle" }, label));
+    });
+    labels(up).forEach((label, i) => {
+      const y = this.y(up[i]);
+      this.svg.append(element("line", { class: "axis", x1: LEFT, x2: right, y1: y, y2: y }));
+      this.svg.append(element("text", { x: LEFT - 5, y: y + 4, "text-anchor": "end" }, label));
+    });
+    this.svg.append(element("text", { x: right, y: this.height - 4, "text-anchor": "end" }, this.names.x));
     this.svg.append(element("text", { x: 12, y: TOP, transform: `rotate(-90 12 ${TOP})`, "text-anchor": "end" }, this.names.y));
   }
 
   x(value) {
-    return LEFT + ((value - this.xs[0]) / (this.xs[1] - this.xs[0])) * (WIDTH - LEFT - RIGHT);
+    return LEFT + ((value - this.xs[0]) / (this.xs[1] - this.xs[0])) * (this.width - LEFT - RIGHT);
   }
 
   y(value) {
-    return HEIGHT - BOTTOM - ((value - this.ys[0]) / (this.ys[1] - this.ys[0])) * (HEIGHT - BOTTOM - TOP);
+    return this.height - BOTTOM - ((value - this.ys[0]) / (this.ys[1] - this.ys[0])) * (this.height - BOTTOM - TOP);
   }
 
   // The values at a place of the screen.
   at(event) {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
     return [
-      this.xs[0] + ((point.x - LEFT) / (WIDTH - LEFT - RIGHT)) * (this.xs[1] - this.xs[0]),
-      this.ys[0] + ((HEIGHT - BOTTOM - point.y) / (HEIGHT - BOTTOM - TOP)) * (this.ys[1] - this.ys[0]),
+      this.xs[0] + ((point.x - LEFT) / (this.width - LEFT - RIGHT)) * (this.xs[1] - this.xs[0]),
+      this.ys[0] + ((this.height - BOTTOM - point.y) / (this.height - BOTTOM - TOP)) * (this.ys[1] - this.ys[0]),
     ];
   }
 
@@ -72,8 +92,17 @@ export class Plane {
   }
 
   cross(x, y, name, size = 4) {
-    const [a, b] = [this.x(x), this.y(y)];
-    this.svg.append(element("path", { class: name, d: `M${a - size},${b - size}l${2 * size},${2 * size}m0,${-2 * size}l${-2 * size},${2 * size}` }));
+    const [a, b] = [this.x(bounded(x, this.xs)), this.y(bounded(y, this.ys))];
+    const made = element("path", { class: name, d: `M${a - size},${b - size}l${2 * size},${2 * size}m0,${-2 * size}l${-2 * size},${2 * size}` });
+    this.svg.append(made);
+    return made;
+  }
+
+  // A cross that there is one of, and that moves; what lies beyond the axes is at their ends.
+  mark(name, x, y, size = 8) {
+    this.marks.set(name, [x, y, size]);
+    this.svg.querySelector(`.${name}`)?.remove();
+    if (x != null && this.xs) this.cross(x, y, name, size);
   }
 
   line(x1, y1, x2, y2, name) {
