@@ -2,8 +2,10 @@
 
 import os
 import shutil
+import signal
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -13,9 +15,13 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from udrl.config import Budget, Config, build
+from udrl.errors import RunFailed
+from udrl_launch.inspection import read_status
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
-from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
+from udrl_proto.messages import Status
+from udrl_replay.store import Store
+from whole_run import SMALL, Cli, arguments, free_port, live_status, small, wait_for
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
@@ -118,6 +124,10 @@ def test_a_live_run_appears_and_its_curve_grows(
         expect(one.get_by_role("status").first).to_contain_text("running; exact", timeout=SOON)
         expect(one.locator("#curve canvas")).to_be_visible(timeout=SOON)
         expect(one.locator("#actor-table tbody tr")).to_have_count(1)
+        heads = one.locator("#actor-table th").all_text_contents()
+        cells = one.locator("#actor-table tbody td").all_text_contents()
+        told = dict(zip(heads, cells, strict=True))
+        assert (told["re-runs"], told["failures"], told["environments"]) == ("0", "0", "16")
     for _ in range(3):
         points = page.locator("#curve").get_attribute("data-points")
         grown = page.locator(f'#curve[data-points]:not([data-points="{points}"])')
@@ -196,9 +206,22 @@ def test_an_order_is_changed_on_the_way(
     page.get_by_role("button", name="Change the command now").click()
     expect(page.locator("#moment dd").nth(2)).to_have_text("77")
     expect(page.locator("#picture")).to_be_visible()
+    # Enter in a field tells the episode too, and does not throw it away.
+    page.get_by_label("Desired horizon, steps", exact=True).fill("55")
+    page.keyboard.press("Enter")
+    expect(page.locator("#moment dd").nth(3)).to_have_text("55 steps")
+    expect(page.locator("#map .left")).to_have_count(1)
+    # Nothing is told that is no number, and sampling instead changes nothing else.
+    page.get_by_label("Desired return", exact=True).fill("")
+    page.get_by_role("button", name="Change the command now").click()
+    page.get_by_label("greedy").check()
+    page.get_by_role("button", name="Step").click()
+    expect(step).to_have_text(str(at + 2))
+    expect(page.locator("#moment dd").nth(2)).to_have_text("76")
     page.get_by_role("button", name="Go on").click()
     expect(rows(page)).to_have_count(1, timeout=SOON)
-    expect(rows(page).first).to_contain_text("told anew on the way")
+    expect(rows(page).first).to_contain_text("greedy, told anew on the way")
+    expect(page.locator("#map .left")).to_have_count(0)
 
 
 def test_the_map_is_clicked_and_says_what_was_never_seen(
@@ -240,6 +263,68 @@ def test_the_server_dies_and_comes_back(
     expect(page.get_by_role("alert")).to_be_hidden(timeout=SOON)
     order(page, 1)
     expect(rows(page)).to_have_count(2, timeout=SOON)
+
+
+def test_the_cursor_reads_the_curve(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
+) -> None:
+    page = pages(board(ended_run))
+    said, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
+    closing = read_status(ended_run).closing_evaluation
+    assert closing is not None
+    expect(said).to_contain_text("best evaluation", timeout=SOON)
+    summary = said.inner_text()
+    box = curve.bounding_box()
+    assert box is not None
+    curve.hover(position={"x": box["width"] - 2, "y": 20})
+    expect(said).to_contain_text(f"closing evaluation {closing.mean:,.1f}".removesuffix(".0"))
+    page.mouse.move(0, 0)
+    expect(said).to_have_text(summary)
+
+
+def test_a_run_that_failed_says_why_and_what_helps(
+    board: Callable[..., str], pages: Callable[..., Page], run: Callable[..., Status],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    run_dir = tmp_path / "cursed"
+    with pytest.raises(RunFailed):
+        run(small(environment="flaky_environments:Cursed-v0"), 2000, run_dir=run_dir)
+    page = pages(board(run_dir))
+    expect(page.get_by_role("status").first).to_contain_text("failed", timeout=SOON)
+    expect(page.get_by_role("alert")).to_contain_text("reproduce it with: udrl reproduce")
+    again = f"udrl train flaky_environments:Cursed-v0 --run-dir {run_dir} --resume"
+    expect(page.locator("#no-actors")).to_contain_text(f"When the cause is mended: {again}")
+
+
+def test_a_run_that_was_stopped_says_how_it_goes_on(
+    cli: Callable[..., Cli], board: Callable[..., str], pages: Callable[..., Page], tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    process = cli(*arguments(SMALL, 10_000_000, run_dir), "--actors", "1")
+    wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 2, "some iterations")
+    page = pages(board(run_dir))
+    expect(page.get_by_role("status").first).to_contain_text("running", timeout=SOON)
+    process.process.send_signal(signal.SIGINT)
+    process.finish()
+    expect(page.get_by_role("status").first).to_contain_text("stopped", timeout=SOON)
+    expect(page.locator("#no-actors")).to_have_text(
+        "Nobody works on this run. It goes on where it was: "
+        f"udrl train CartPole-v1 --run-dir {run_dir} --resume"
+    )
+    expect(page.get_by_role("alert")).to_be_hidden()
+
+
+def test_who_lied_is_named(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(ended_run, run_dir)
+    with closing(Store(run_dir)) as store, store.transaction():
+        store.set_fact("quarantined", {"actor-9": "<b>ten invalid episodes</b>"})
+    page = pages(board(run_dir))
+    expect(page.get_by_label("Quarantined actors")).to_have_text(
+        "quarantined: actor-9: <b>ten invalid episodes</b>", timeout=SOON
+    )
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
