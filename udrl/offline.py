@@ -5,6 +5,7 @@ are its warm-up (section 2.3.1). A dataset has one observation more than steps, 
 nobody acted. Episodes here have none, so in what is written the last one is there twice.
 """
 
+import re
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -139,6 +140,11 @@ def write_dataset(
     Raises:
         ConfigError: the name is taken or impossible, or it cannot be written.
     """
+    if not re.fullmatch(r"(?:[\w-]+/)*[\w-]+-v\d+", name, re.ASCII):
+        raise ConfigError(
+            f"dataset {name!r}: expected a name with a version, of letters, digits, _ and -, e.g. "
+            f"{config.environment.split('-')[0].split(':')[-1]}/mine-v0"
+        )
     minari = _minari()
     from gymnasium import spaces
     from minari.data_collector import EpisodeBuffer
@@ -175,6 +181,5 @@ def write_dataset(
             )
     except (OSError, ValueError, AssertionError) as error:
         raise ConfigError(
-            f"dataset {name!r}: {error}; name one that is not there yet, e.g. "
-            f"{config.environment.split('-')[0]}/mine-v0"
+            f"dataset {name!r}: {error}; choose another name, or a version that is not there yet"
         ) from error

@@ -1,5 +1,6 @@
 """A trained agent to act with: an observation and an order in, an action out."""
 
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -91,7 +92,7 @@ class Policy:
 
         Raises:
             InvalidData: the observation has another shape than those it was trained on, or
-                something is not finite.
+                something is not finite, or the temperature less than 0.
         """
         seen = np.asarray(observation)
         stacks = (self.config.frame_stack, *self.spec.observation_shape)
@@ -127,6 +128,7 @@ class Policy:
             desired_horizon: likewise.
             temperature: logits are divided by it; 0: all on the mode.
         """
+        _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
         return probabilities(logits, temperature)
 
@@ -151,8 +153,14 @@ class Policy:
             temperature: logits are divided by it; 0: take the mode.
             deterministic: the same as a temperature of 0.
         """
+        _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
         return choose(logits, 0.0 if deterministic else temperature, self._rng.random())
+
+
+def _check(temperature: float) -> None:
+    if not 0 <= temperature < math.inf:
+        raise InvalidData(f"temperature {temperature}: expected a finite number from 0 on")
 
 
 def probabilities(logits: npt.NDArray[np.float64], temperature: float) -> npt.NDArray[np.float64]:

@@ -348,10 +348,13 @@ class Quarantined(Message, frozen=True, kw_only=True):
 
 
 class Status(Message, frozen=True, kw_only=True):
-    """How a run is doing; every name is explained in ``docs/metrics.md``."""
+    """How a run is doing; every name is explained in ``docs/metrics.md``.
+
+    A replay service never says ``stopped``; who reads the file of a run that nobody works on does.
+    """
 
     run_id: Name
-    state: Literal["running", "closing", "ended", "failed"]
+    state: Literal["running", "closing", "ended", "failed", "stopped"]
     environment: Text
     iteration: Number
     env_steps: Number

@@ -86,6 +86,14 @@ def test_what_it_cannot_be_asked(seen: Any, desired: tuple[float, float], says: 
         policy().predict(seen, *desired)
 
 
+@pytest.mark.parametrize("temperature", [-1.0, math.nan, math.inf])
+def test_a_temperature_is_a_finite_number_from_0_on(temperature: float) -> None:
+    with pytest.raises(InvalidData, match="temperature"):
+        policy().predict(SEEN, 1.0, 1, temperature=temperature)
+    with pytest.raises(InvalidData, match="temperature"):
+        policy().probabilities(SEEN, 1.0, 1, temperature)
+
+
 def test_stacked_observations_may_have_a_dimension_of_their_own() -> None:
     agent = policy(frame_stack=3)
     stack = np.arange(12, dtype=np.float32).reshape(3, 4) / 10

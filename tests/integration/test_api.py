@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import udrl
-from udrl.errors import ConfigError, UdrlError
+from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl_launch.agents import load_agent
 from udrl_proto.messages import Status
 from whole_run import SMALL, digests, small
@@ -43,11 +43,18 @@ def test_a_callback_stops_a_run_that_can_be_resumed(
         "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
         callbacks=[enough, lambda status: others.append(status.iteration)], **SETTINGS,
     )  # fmt: skip
-    assert stopped.status.state == "running"
+    assert stopped.status.state == "stopped"
     assert others
     budget = stopped.status.env_steps + 1000
     ended = udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, max_env_steps=budget)
     assert digests(ended.status) == digests(run(small(), budget))
+
+
+def test_a_run_that_ends_with_its_warm_up_has_no_agent(tmp_path: Path) -> None:
+    trained = udrl.train("CartPole-v1", run_dir=tmp_path / "run", max_env_steps=1, **SETTINGS)
+    assert trained.status.state == "ended"
+    with pytest.raises(StoreError, match="nothing was trained"):
+        _ = trained.policy
 
 
 def test_a_new_directory_is_made_in_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

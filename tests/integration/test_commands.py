@@ -4,12 +4,13 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-import pytest
+import click
 
+from udrl_launch.cli import cli as command_line
 from udrl_proto.messages import Status
 from whole_run import SMALL, TOY, Cli, arguments, digests, free_port, live_status, small, wait_for
 
@@ -124,10 +125,21 @@ def test_light_commands_do_not_load_torch(tmp_path: Path) -> None:
     assert ended.returncode == 0, ended.stderr
 
 
-@pytest.mark.parametrize(
-    "name", ["train", "replay", "learner", "actor", "evaluate", "status", "health", "keys create"]
-)
-def test_help_of_each_command_has_an_example(name: str, cli: Callable[..., Cli]) -> None:
-    code, out, _ = cli(*name.split(), "--help").finish()
-    assert code == 0
-    assert "Example: udrl" in " ".join(out.split())
+def commands(command: click.Command, *names: str) -> Iterator[tuple[str, click.Command]]:
+    """Yield every command of the command line with its words."""
+    if names:
+        yield " ".join(names), command
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            found = command.get_command(context, name)
+            assert found is not None
+            yield from commands(found, *names, name)
+
+
+def test_help_of_each_command_has_an_example() -> None:
+    missing = [
+        name for name, command in commands(command_line)
+        if not command.hidden and "Example: udrl" not in (command.help or "")
+    ]  # fmt: skip
+    assert not missing

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import onnxruntime
@@ -17,7 +18,8 @@ from udrl.errors import ConfigError, UdrlError
 from udrl_launch.agents import load_agent
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import read_status
-from whole_run import Cli
+from udrl_replay.store import Store
+from whole_run import Cli, small
 
 
 def export(*arguments: object) -> str:
@@ -49,12 +51,12 @@ def test_the_folder_holds_the_runs_agent(ended_run: Path, folder: Path) -> None:
 
 def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
     card = ModelCard.load(folder / "README.md")
-    closing = read_status(ended_run).closing_evaluation
-    assert closing is not None
+    last = read_status(ended_run).closing_evaluation
+    assert last is not None
     (result,) = card.data.eval_results
     assert result.dataset_name == "CartPole-v1"
-    assert result.metric_value == f"{closing.mean:.2f} +/- {closing.std:.2f}"
-    assert f"**Mean return {closing.mean:.1f}**" in card.text
+    assert result.metric_value == f"{last.mean:.2f} +/- {last.std:.2f}"
+    assert f"**Mean return {last.mean:.1f}**" in card.text
     assert card.data.library_name == "udrl"
 
 
@@ -74,13 +76,24 @@ def test_the_cards_command_trains_the_same_agent(
     cli(*words, "--run-dir", str(tmp_path / "run"), "--in-process", "--json").status()
     again = (tmp_path / "run" / "weights.safetensors").read_bytes()
     assert again == (folder / "model.safetensors").read_bytes()
+    assert "it gives the same weights, to the bit" in (folder / "README.md").read_text()
 
 
-def test_the_best_weights_have_the_evaluation_that_chose_them(
+def test_earlier_weights_have_the_evaluation_that_was_theirs(
     ended_run: Path, tmp_path: Path
 ) -> None:
-    export(ended_run, "--folder", tmp_path / "best", "--weights", "best")
-    assert "**Mean return" in (tmp_path / "best" / "README.md").read_text()
+    with closing(Store(ended_run, read_only=True)) as store:
+        version = store.evaluations(-1, 10**9)[0].iteration - small().lead
+    export(ended_run, "--folder", tmp_path / "best", "--weights", version)
+    card = (tmp_path / "best" / "README.md").read_text()
+    told = re.search(r"\*\*Mean return.*asked for (\S+) within (\d+) steps", card)
+    assert told is not None
+    loaded = udrl.load(tmp_path / "best")
+    assert f"{loaded.desired_return:.1f}" == told[1]
+    assert str(loaded.desired_horizon) == told[2]
+    # It does not end with these, and does not say so.
+    assert f"its version {version} has the same weights" in card
+    assert "it gives the same weights" not in card
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

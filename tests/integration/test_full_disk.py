@@ -52,7 +52,7 @@ def test_run_whose_disk_is_full_stops_and_goes_on_with_more_space(
     assert "free some disk space" in error
     stopped = live_status(run_dir)
     assert stopped is not None
-    assert stopped.state == "running"
+    assert stopped.state == "stopped"
     assert_conserved(stopped)
 
     code, _, error = cli(*arguments(SMALL, BUDGET, run_dir), "--resume").finish()
@@ -85,7 +85,7 @@ def test_store_that_may_not_grow_keeps_its_ledgers(
         services.end()
     stopped = live_status(run_dir)
     assert stopped is not None
-    assert stopped.state == "running"
+    assert stopped.state == "stopped"
     assert_conserved(stopped)
     resumed = run(small(), BUDGET, run_dir=run_dir, go_on=True)
     assert digests(resumed) == digests(run(small(), BUDGET))

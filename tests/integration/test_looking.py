@@ -99,13 +99,6 @@ def test_a_full_disk_ends_a_film(ended_run: Path, tmp_path: Path) -> None:
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / "film.mp4")
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "much"])
-def test_a_desired_return_is_a_finite_number(ended_run: Path, number: str) -> None:
-    for command in ("play", "evaluate"):
-        with pytest.raises(click.BadParameter, match="is not a finite number"):
-            call(command, ended_run, "--desired-return", number)
-
-
 def test_play_needs_a_run(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds no run"):
         call("play", tmp_path)
@@ -159,6 +152,26 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
         compare([ended_run], tmp_path / "picture.bmp")
     with pytest.raises(StoreError, match="name the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [b"\xff\xfe\x00", b"iteration,loss\n1,2\n", b"HEAD\n1,2\n", b"HEAD\n" + b"x," * 19 + b"x\n"],
+)
+def test_metrics_that_no_run_wrote(ended_run: Path, tmp_path: Path, damaged: bytes) -> None:
+    head = (ended_run / "metrics.csv").read_bytes().splitlines()[0]
+    (tmp_path / "metrics.csv").write_bytes(damaged.replace(b"HEAD", head))
+    with pytest.raises(StoreError, match=r"metrics\.csv is not what a run writes"):
+        compare([tmp_path], tmp_path / "picture.png")
+
+
+@pytest.mark.parametrize("command", ["play", "evaluate"])
+def test_orders_that_contradict_themselves_or_name_no_return(command: str, ended_run: Path) -> None:
+    with pytest.raises(ConfigError, match="give one of them"):
+        call(command, ended_run, "--greedy", "--temperature", "0.5")
+    for words in ("1e300", "nan", "-inf", "much"):
+        with pytest.raises(click.BadParameter, match="is not a number from"):
+            call(command, ended_run, "--desired-return", words)
 
 
 def test_nothing_to_plot(ended_run: Path, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_what_is_written_is_what_is_read_to_the_bit(spec: EnvironmentSpec) -> No
 
 def test_a_name_that_is_taken_or_unknown() -> None:
     write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
-    with pytest.raises(ConfigError, match=r"already exists.*CartPole/mine-v0"):
+    with pytest.raises(ConfigError, match=r"already exists.*another name, or a version"):
         write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"not found locally.*minari list local"):
         read_dataset("some/thing-v0", small(), VECTOR)
@@ -96,6 +96,14 @@ def test_datasets_of_another_environment(spec: EnvironmentSpec, says: str) -> No
     write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=says):
         read_dataset("some/ours-v0", small(), spec)
+
+
+@pytest.mark.parametrize("name", ["../../etc-v0", "bad name-v0", "mine", "", "/x-v0", "é-v0"])
+def test_names_that_minari_has_not(name: str, tmp_path: Path) -> None:
+    found = set(minari.list_local_datasets())
+    with pytest.raises(ConfigError, match=r"a name with a version.*e\.g\. CartPole/mine-v0"):
+        write_dataset(name, some(VECTOR), small(), VECTOR)
+    assert set(minari.list_local_datasets()) == found, "nothing is left behind"
 
 
 @pytest.fixture

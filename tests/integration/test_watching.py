@@ -10,6 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from udrl_launch.event_files import EVALUATION_TAGS, FOLDER, TAGS
+from udrl_launch.inspection import read_status
 from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 
@@ -35,7 +36,12 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
             *arguments(SMALL, budget, run_dir), "--resume", "--tensorboard", "--in-process"
         ).status()
         told, rows = read(run_dir), metrics(run_dir)
-        assert set(told) == {*TAGS, *EVALUATION_TAGS}
+        assert set(told) == {*TAGS, *EVALUATION_TAGS, "time/fps"}
+        assert [step for step, _ in told.pop("time/fps")] == [int(r["env_steps"]) for r in rows]
+        last = read_status(run_dir).closing_evaluation
+        assert last is not None
+        for tag in ("eval/mean_reward", "eval/ci95_low", "eval/ci95_high"):
+            assert told[tag].pop()[0] == last.env_steps
         for tags, steps in ((TAGS, "env_steps"), (EVALUATION_TAGS, "eval_at_env_steps")):
             for tag, column in tags.items():
                 expected = [(int(r[steps]), float(r[column])) for r in rows if r[column]]

@@ -88,6 +88,47 @@ def test_pipe_gets_plain_lines_and_none_twice() -> None:
     assert "\x1b" not in output.getvalue()
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("output", "environment"),
+    [(io.StringIO(), {"FORCE_COLOR": "1"}), (Terminal(), {"TERM": "dumb"})],
+)
+def test_what_cannot_be_drawn_over_gets_plain_lines(
+    output: io.StringIO, environment: dict[str, str]
+) -> None:
+    console = Console(file=output, _environ=environment, no_color=True)
+    assert console.is_terminal
+    with Display(console) as display:
+        display.show(STATUS)
+    assert output.getvalue() == line(STATUS) + "\n"
+
+
+def test_terminal_gets_a_panel() -> None:
+    output = Terminal()
+    with Display(Console(file=output, _environ={"TERM": "xterm"})) as display:
+        display.show(STATUS)
+    assert line(STATUS) not in output.getvalue()
+    assert "\x1b" in output.getvalue()
+
+
+def test_panel_ends_with_the_closing_evaluation_and_takes_names_as_they_are() -> None:
+    assert STATUS.evaluation is not None
+    closed = msgspec.structs.replace(
+        STATUS,
+        closing_evaluation=msgspec.structs.replace(STATUS.evaluation, mean=77.0),
+        waiting=(Waiting(who="actor [/x]", on="learner", why="[bold]", seconds=2.0),),
+    )
+    console = Console(width=100, file=io.StringIO())
+    with console.capture() as capture:
+        console.print(panel(closed))
+    assert "closing     77.0 ± 1.0" in capture.get()
+    assert "actor [/x] for learner: [bold]" in capture.get()
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3661, "1:01:01")])
 def test_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from udrl.errors import ConfigError
 from udrl.rollout import Rollout
 from udrl_launch.window import Window
 
@@ -74,6 +75,13 @@ def test_greedy_and_back(window: Window) -> None:
 
 def test_quit(window: Window) -> None:
     assert not show(window, Episode(), "up, q")
+
+
+def test_without_a_screen_there_is_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigError, match=r"without a screen|no screen here"):
+        Window(fps=1000)
 
 
 def test_a_rollout_is_what_the_episode_here_stands_for() -> None:

@@ -64,6 +64,11 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         named = {"latest": progress.latest_version, "best": progress.best_version}
         wanted = version if isinstance(version, int) else named[version]
         found = store.version(wanted)
+        if progress.latest_version == 0:
+            raise StoreError(
+                f"{run_dir} has no weights: nothing was trained after the warm-up yet; go on with "
+                f"the run, with a larger max_env_steps if that is spent"
+            )
         if found is None or not found.weights:
             raise StoreError(
                 f"weights {version!r} are not kept in {run_dir}; kept are versions "

@@ -11,8 +11,10 @@
 
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from udrl.errors import ConfigError, Interrupted, UdrlError
 from udrl.policy import Policy
@@ -27,18 +29,26 @@ from udrl_replay.creation import directory_name, exists
 Callback = Callable[[Status], bool | None]
 
 
-class Trained(NamedTuple):
+@dataclass(frozen=True)
+class Trained:
     """What came of a training.
 
     Attributes:
         run_dir: the run's directory, for everything that looks at runs.
         status: how it ended, or was when it was stopped (``docs/metrics.md``).
-        policy: the agent.
     """
 
     run_dir: Path
     status: Status
-    policy: Policy
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The agent.
+
+        Raises:
+            StoreError: the run ended before anything was trained.
+        """
+        return load_agent(self.run_dir).policy
 
 
 def train(
@@ -66,8 +76,7 @@ def train(
 
     Raises:
         ConfigError: a setting is unknown or impossible.
-        UdrlError: the run cannot be started, cannot go on, or failed; or it was stopped before
-            there was anything trained.
+        UdrlError: the run cannot be started, cannot go on, or failed.
     """
     if resume and run_dir is None:
         raise ConfigError("resume needs run_dir: the directory of the run to go on with")
@@ -92,7 +101,7 @@ def train(
     watcher.show(status)
     if status.problem:
         raise UdrlError(status.problem)
-    return Trained(folder, status, load_agent(folder).policy)
+    return Trained(folder, status)
 
 
 class _Callbacks:

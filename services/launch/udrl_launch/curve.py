@@ -5,11 +5,12 @@ The closing evaluation comes from the store; a directory without one is drawn to
 
 import csv
 import logging
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TextIO
 
 from udrl.errors import ConfigError, StoreError
 from udrl_launch.styles import line_style
@@ -21,7 +22,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("udrl")
 
-Row = Mapping[str, str]
+#: A line of ``metrics.csv``; what is missing is NaN.
+Row = Mapping[str, float]
+
+_COLUMNS = (
+    "env_steps", "wall_s", "return_mean", "explored_return", "eval_at_env_steps", "eval_mean",
+    "eval_ci95_low", "eval_ci95_high",
+)  # fmt: skip
 
 _X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
 #: What matplotlib can write.
@@ -37,13 +44,12 @@ def draw(run_dir: Path, title: str) -> Path:
     """
     rows = _read(run_dir)
     figure, axes = _empty()
-    steps = [int(r["env_steps"]) for r in rows]
+    steps = [r["env_steps"] for r in rows]
     for name, label, style in (
         ("return_mean", "mean of the replay buffer", "--"),
         ("explored_return", "exploratory episodes, mean of an iteration", ":"),
     ):
-        returns = [float(r[name] or "nan") for r in rows]
-        axes.plot(steps, returns, style, color="0.6", label=label, lw=1)
+        axes.plot(steps, [r[name] for r in rows], style, color="0.6", label=label, lw=1)
     _evaluations(axes, rows, "env_steps", "evaluation, mean and 95 % interval", rank=1)
     _closing(axes, run_dir, rows, "env_steps", rank=1, label="closing evaluation")
     axes.set(xlabel="env steps", ylabel="return", title=title)
@@ -71,7 +77,7 @@ def compare(
     if picture.suffix not in _KINDS:
         raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
     runs = {run_dir: _read(run_dir) for run_dir in run_dirs}
-    if not any(r["eval_mean"] for rows in runs.values() for r in rows):
+    if not any(map(_evaluated, runs.values())):
         names = ", ".join(map(str, run_dirs))
         raise StoreError(
             f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "
@@ -100,9 +106,20 @@ def _read(run_dir: Path) -> list[Row]:
     path = run_dir / "metrics.csv"
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
+            return [{name: float(row[name] or "nan") for name in _COLUMNS} for row in _rows(file)]
     except OSError as error:
         raise StoreError(f"{path}: {error.strerror}; name the directory of a run") from error
+    except (KeyError, ValueError, csv.Error) as error:
+        raise StoreError(
+            f"{path} is not what a run writes ({error}); it is written anew when the run goes on"
+        ) from error
+
+
+def _rows(file: TextIO) -> Iterator[dict[str, str]]:
+    for row in csv.DictReader(file):
+        if None in row.values():
+            raise ValueError("a line is too short")
+        yield row
 
 
 def _empty() -> "tuple[Figure, Axes]":
@@ -118,14 +135,18 @@ def _empty() -> "tuple[Figure, Axes]":
     return figure, axes
 
 
+def _evaluated(rows: Sequence[Row]) -> list[Row]:
+    return [r for r in rows if not math.isnan(r["eval_mean"])]
+
+
 def _evaluations(axes: "Axes", rows: Sequence[Row], x: str, label: str, rank: int) -> None:
     """Draw the mean returns of a run's evaluations with their intervals."""
-    evaluated = [r for r in rows if r["eval_mean"]]
+    evaluated = _evaluated(rows)
     unit = _X[x][1]
     column = "eval_at_env_steps" if x == "env_steps" else x
-    at = [float(r[column]) / unit for r in evaluated]
+    at = [r[column] / unit for r in evaluated]
     low, mean, high = (
-        [float(r[n]) for r in evaluated] for n in ("eval_ci95_low", "eval_mean", "eval_ci95_high")
+        [r[n] for r in evaluated] for n in ("eval_ci95_low", "eval_mean", "eval_ci95_high")
     )
     style = line_style(rank)
     axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
@@ -144,7 +165,7 @@ def _closing(
     row = _closing_evaluation(run_dir)
     if row is None or not rows:
         return
-    at = row.env_steps if x == "env_steps" else float(rows[-1][x]) / _X[x][1]
+    at = row.env_steps if x == "env_steps" else rows[-1][x] / _X[x][1]
     found = row.evaluation
     style = line_style(rank)
     axes.errorbar(

@@ -21,7 +21,7 @@ class Display:
         self._console = console or Console(stderr=True)
         self._live = (
             Live(console=self._console, auto_refresh=False, transient=True)
-            if self._console.is_terminal
+            if _can_be_redrawn(self._console)
             else None
         )
         self._printed_at = -_PLAIN_EVERY_S
@@ -53,6 +53,11 @@ class Display:
             self._console.print(line(status), soft_wrap=True, highlight=False, markup=False)
 
 
+def _can_be_redrawn(console: Console) -> bool:
+    """Say whether a panel can be drawn over; colours that are forced make no terminal of a log."""
+    return console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
+
+
 def line(status: Status) -> str:
     """Return a status in one line."""
     parts = [
@@ -79,6 +84,7 @@ def panel(status: Status) -> Table:
         "env steps": f"{status.env_steps:,} of {status.max_env_steps:,} "
         f"({status.env_steps_per_s:,.0f}/s; evaluation steps {status.eval_env_steps:,})",
         "evaluation": evaluation(status.evaluation),
+        **({"closing": evaluation(status.closing_evaluation)} if status.closing_evaluation else {}),
         "buffer": returns(status),
         "weights": f"version {status.weights_version}, lag {status.weights_lag} versions, "
         f"{status.weights_lag_s:.2f} s"
@@ -100,7 +106,8 @@ def panel(status: Status) -> Table:
     for actor in status.quarantined:
         table.add_row("quarantined", Text(f"{actor.id}: {actor.why}"))
     for wait in _long(status):
-        table.add_row("waiting", f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)")
+        said = f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
+        table.add_row("waiting", Text(said))
     return table
 
 

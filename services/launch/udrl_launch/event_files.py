@@ -59,6 +59,8 @@ class EventFiles:
         self._columns: list[str] = []
         self._file: os.stat_result | None = None
         self._began = 0.0
+        self._before = (0.0, 0.0)
+        self._is_closed = False
         self._begin()
 
     def show(self, status: Status) -> None:
@@ -77,6 +79,15 @@ class EventFiles:
                 self._write(dict(zip(self._columns, row, strict=True)))
             else:
                 self._columns = row
+        if status.closing_evaluation is not None and not self._is_closed:
+            self._is_closed = True
+            found, at = status.closing_evaluation, self._began + status.wall_s
+            for tag, value in (
+                ("eval/mean_reward", found.mean),
+                ("eval/ci95_low", found.ci95_low),
+                ("eval/ci95_high", found.ci95_high),
+            ):
+                self._writer.add_scalar(tag, value, found.env_steps, at)
         self._writer.flush()
 
     def close(self) -> None:
@@ -91,6 +102,7 @@ class EventFiles:
             if held is not None:
                 self._begin()
             self._read, self._columns = 0, []
+            self._before, self._is_closed = (0.0, 0.0), False
             self._began = time.time() - status.wall_s
 
     def _begin(self) -> None:
@@ -111,3 +123,8 @@ class EventFiles:
             for tag, column in tags.items():
                 if row[column] and row[steps]:
                     self._writer.add_scalar(tag, float(row[column]), int(row[steps]), at)
+        now = float(row["env_steps"]), float(row["wall_s"])
+        if now[1] > self._before[1]:
+            speed = (now[0] - self._before[0]) / (now[1] - self._before[1])
+            self._writer.add_scalar("time/fps", speed, int(now[0]), at)
+        self._before = now

@@ -45,7 +45,7 @@ This needs udrl, and what the environment needs.
 ```
 
 udrl {version}, seed {seed}, weights version {weights}. All settings are in `config.toml` beside
-this card. {again}
+this card. About the command: {again}
 """
 
 _INDEX = """\
@@ -95,7 +95,10 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
         found = store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
             agent.version + agent.config.lead, closing=False
         )
-    folders.save(folder, agent.policy, _card(agent, folder, found, progress.inexact_reason))
+    policy = agent.policy
+    if found is not None:  # what the card's results were asked for
+        policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
+    folders.save(folder, policy, _card(agent, folder, found, _again(agent, progress)))
     write_config(folder, agent.config, budget_of(run_dir))
 
 
@@ -120,7 +123,24 @@ def export_buffer(run_dir: Path, name: str) -> int:
     return len(ids)
 
 
-def _card(agent: Agent, folder: Path, found: EvaluationRow | None, inexact: str) -> str:
+def _again(agent: Agent, progress: Progress) -> str:
+    """Return what the card's command gives whoever gives it."""
+    config = agent.config
+    if progress.inexact_reason:
+        said = f"The run was not exact ({progress.inexact_reason}), so it gives other weights."
+    elif progress.state == "ended" and agent.version == progress.latest_version:
+        said = "On the same kind of hardware it gives the same weights, to the bit."
+    else:
+        said = (
+            f"On the same kind of hardware its version {agent.version} has the same weights, to "
+            f"the bit; it goes on from there."
+        )
+    if config.dataset is not None:
+        said += f" It begins with the dataset `{config.dataset}`, which has to be there."
+    return said
+
+
+def _card(agent: Agent, folder: Path, found: EvaluationRow | None, again: str) -> str:
     environment = agent.config.environment
     results, index = "These weights were never evaluated.", ""
     if found is not None:
@@ -141,7 +161,5 @@ def _card(agent: Agent, folder: Path, found: EvaluationRow | None, inexact: str)
         version=udrl.__version__,
         seed=agent.config.seed,
         weights=agent.version,
-        again=f"The run was not exact ({inexact}), so the command gives other weights."
-        if inexact
-        else "On the same kind of hardware the command gives the same weights, to the bit.",
+        again=again,
     )

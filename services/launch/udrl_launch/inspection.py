@@ -76,13 +76,16 @@ def served_at(run_dir: Path) -> str | None:
 
 
 def read_status(run_dir: Path) -> Status:
-    """Return the status of a run as its file says it.
+    """Return the status of a run as its file says it; ``stopped`` if nobody works on it.
 
     Raises:
         StoreError: there is no run, or it is damaged.
     """
     with closing(Store(run_dir, read_only=True)) as store:
-        return status(read_run(run_dir, store), Throughput(), Waits(), 0.0, 0.0)
+        found = status(read_run(run_dir, store), Throughput(), Waits(), 0.0, 0.0)
+    if found.state in ("running", "closing") and served_at(run_dir) is None:
+        return msgspec.structs.replace(found, state="stopped", time_left_s=None)
+    return found
 
 
 def read_run(run_dir: Path, store: Store) -> Run:

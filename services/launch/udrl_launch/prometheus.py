@@ -6,7 +6,7 @@ from typing import Any
 from udrl.errors import ConfigError
 from udrl_proto.messages import EvaluationStatus, Status
 
-STATES = ("running", "closing", "ended", "failed")
+STATES = ("running", "closing", "ended", "failed", "stopped")
 
 #: What a metric is called, what it counts, and whether it only grows.
 _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (

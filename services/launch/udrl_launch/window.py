@@ -1,5 +1,6 @@
 """A window in which an agent can be watched, and told something else on the way."""
 
+import os
 from typing import Any
 
 from udrl.errors import ConfigError
@@ -43,6 +44,12 @@ class Window:
             raise ConfigError(
                 f"a window cannot be opened: {error}; without a screen use --video FILE"
             ) from error
+        driver = pygame.display.get_driver()
+        if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
+            pygame.display.quit()
+            raise ConfigError(
+                "a window cannot be opened: there is no screen here; use --video FILE"
+            )
         pygame.font.init()
         self._font = pygame.font.Font(None, _LINE)
         self._clock = pygame.time.Clock()

@@ -135,8 +135,8 @@ class Store:
             with _lock(run_dir):
                 if path.exists():
                     raise StoreError(
-                        f"{run_dir} holds a run already; add --resume to go on with it, or name "
-                        f"another --run-dir"
+                        f"{run_dir} holds a run already; add --resume (in Python: "
+                        f"resume=True) to go on with it, or name another --run-dir"
                     )
                 # Written aside and renamed, so that a run's file is there as a whole or not at all.
                 unfinished = path.with_suffix(".new")

@@ -11,7 +11,10 @@ from udrl_proto.access import ROLES
 
 @click.group()
 def keys() -> None:
-    """Make the keys that services prove their roles with."""
+    """Make the keys that services prove their roles with.
+
+    Example: udrl keys create keys --host replay.example.org
+    """
 
 
 @keys.command()

@@ -10,11 +10,12 @@ from udrl.errors import EnvironmentFault
 from udrl_launch import agents, inspection
 from udrl_launch.commands.options import (
     CONNECT,
-    FINITE,
     KEYS,
+    RETURN,
     RUN,
     RUN_DIR,
     WEIGHTS,
+    chosen_temperature,
     place,
     version,
 )
@@ -29,7 +30,7 @@ from udrl_launch.display import panel
               help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip
 @click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
-@click.option("--desired-return", type=FINITE, help="Default: as in section 2.3.6.")
+@click.option("--desired-return", type=RETURN, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @WEIGHTS
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -49,7 +50,7 @@ def evaluate(
     """
     agent = agents.load_agent(run_dir, version(weights))
     commands = agents.evaluation_commands(
-        agent, episodes=episodes, temperature=0.0 if greedy else temperature,
+        agent, episodes=episodes, temperature=chosen_temperature(temperature, greedy=greedy),
         desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
     result = agents.evaluate(agent, commands)

@@ -13,6 +13,9 @@ from udrl_launch.address import Address
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 
+#: No return is beyond this.
+_MOST = 1e9
+
 RUN_DIR = click.Path(path_type=Path, file_okay=False)
 PARENT = click.option("--parent", type=int, hidden=True)
 PATIENCE = click.option("--patience", type=click.FloatRange(0), default=3.0, show_default=True,
@@ -61,8 +64,8 @@ WEIGHTS = click.option(
 )  # fmt: skip
 
 
-class _Finite(click.ParamType):  # type: ignore[type-arg]
-    """A number that is neither infinite nor not a number."""
+class _Return(click.ParamType):  # type: ignore[type-arg]
+    """A return that can be asked for."""
 
     name = "float"
 
@@ -73,12 +76,12 @@ class _Finite(click.ParamType):  # type: ignore[type-arg]
             number = float(value)
         except ValueError:
             number = math.nan
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number", param, ctx)
+        if not abs(number) <= _MOST:
+            self.fail(f"{value!r} is not a number from -{_MOST:g} to {_MOST:g}", param, ctx)
         return number
 
 
-FINITE = _Finite()
+RETURN = _Return()
 
 
 class _Steps(click.ParamType):  # type: ignore[type-arg]
@@ -112,3 +115,14 @@ def version(text: str) -> int | Literal["latest", "best"]:
     if text.isdecimal():
         return int(text)
     raise ConfigError(f"--weights {text}: expected latest, best or a version number")
+
+
+def chosen_temperature(temperature: float | None, *, greedy: bool) -> float | None:
+    """Return what ``--temperature`` and ``--greedy`` say.
+
+    Raises:
+        ConfigError: both are given.
+    """
+    if greedy and temperature is not None:
+        raise ConfigError(f"--greedy and --temperature {temperature:g}: give one of them")
+    return 0.0 if greedy else temperature

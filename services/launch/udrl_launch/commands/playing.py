@@ -7,7 +7,13 @@ import msgspec
 
 from udrl.numerics import use_one_thread
 from udrl_launch.agents import evaluation_commands, load_agent
-from udrl_launch.commands.options import FINITE, RUN_DIR, WEIGHTS, version
+from udrl_launch.commands.options import (
+    RETURN,
+    RUN_DIR,
+    WEIGHTS,
+    chosen_temperature,
+    version,
+)
 from udrl_launch.playing import play as play_episodes
 from udrl_launch.playing import with_seed
 from udrl_launch.window import KEYS_HELP, Window
@@ -15,7 +21,7 @@ from udrl_launch.window import KEYS_HELP, Window
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
-@click.option("--desired-return", type=FINITE, metavar="R", help="Default: as in section 2.3.6.")
+@click.option("--desired-return", type=RETURN, metavar="R", help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), metavar="H",
               help="In how many steps. Default: likewise.")  # fmt: skip
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
@@ -56,7 +62,7 @@ def play(
     commands = evaluation_commands(
         agent,
         episodes=episodes,
-        temperature=0.0 if greedy else temperature,
+        temperature=chosen_temperature(temperature, greedy=greedy),
         desired_return=desired_return,
         desired_horizon=desired_horizon,
     )
