@@ -156,7 +156,7 @@ export class Command {
       ["still desired", number(message.desired_return)],
       ["within", `${number(Math.max(message.desired_horizon, 1))} steps`],
       ["last action", message.action ?? "–"],
-      ["next action", message.probabilities.map((p, action) => `${action}: ${Math.round(100 * p)} %`).join(", ") || "–"],
+      ["next action", message.probabilities.map((p, action) => `${action}: ${Math.round(100 * p)}\u00a0%`).join(", ") || "–"],
     ]);
     if (message.over) this.map.mark("left", null);
     else this.map.mark("left", message.desired_return, message.desired_horizon, 5);
