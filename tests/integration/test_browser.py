@@ -14,6 +14,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from test_take_cover import TAKE_COVER
 from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
 from udrl_launch.inspection import read_status
@@ -21,7 +22,7 @@ from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status
 from udrl_replay.store import Store
-from whole_run import SMALL, Cli, arguments, free_port, live_status, small, wait_for
+from whole_run import LANDER, SMALL, Cli, arguments, free_port, live_status, small, wait_for
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
@@ -222,6 +223,32 @@ def test_an_order_is_changed_on_the_way(
     expect(rows(page)).to_have_count(1, timeout=SOON)
     expect(rows(page).first).to_contain_text("greedy, told anew on the way")
     expect(page.locator("#map .left")).to_have_count(0)
+
+
+@pytest.mark.parametrize("settings", [LANDER | {"max_episode_steps": 120}, TAKE_COVER])
+def test_the_agent_is_watched_in_its_world(
+    settings: dict[str, Any], board: Callable[..., str], pages: Callable[..., Page],
+    run: Callable[..., Status], tmp_path: Path,
+) -> None:  # fmt: skip
+    run(build(Config, settings), 3000, run_dir=tmp_path / "run")
+    page = pages(board(tmp_path / "run"))
+    returns = page.get_by_label("Desired return", exact=True)
+    expect(returns).not_to_be_empty(timeout=SOON)
+    horizon = page.get_by_label("Desired horizon, steps", exact=True)
+    follows = settings.get("desired_horizon") == "return"
+    returns.fill("60.5")
+    if follows:  # TakeCover's horizon is its return
+        expect(horizon).to_be_disabled()
+        expect(horizon).to_have_value("60")
+    else:
+        horizon.fill("60")
+    page.get_by_role("button", name="Begin an episode").click()
+    picture = page.locator("#picture")
+    expect(picture).to_be_visible(timeout=SOON)
+    expect(rows(page)).to_have_count(1, timeout=60_000)
+    width, height = picture.evaluate("image => [image.naturalWidth, image.naturalHeight]")
+    assert width > 100
+    assert height > 100
 
 
 def test_the_map_is_clicked_and_says_what_was_never_seen(
