@@ -114,7 +114,7 @@ def test_a_service_that_hangs_is_not_waited_for_again_and_again(
         os.kill(service, signal.SIGSTOP)
         try:
             assert directory.status().actors == ()
-            assert "does not answer this board; what is shown is what its file" in directory.doubt()
+            assert "what the run's file says, not what its service does: " in directory.doubt()
 
             def ask(*_: object) -> None:
                 raise AssertionError("it is asked again at once")

@@ -1,6 +1,7 @@
 """Runs with keys give what runs without give, and show nobody a key."""
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from click.testing import CliRunner
 
 from test_commands import toml
 from udrl.errors import ConfigError, UdrlError
+from udrl_board.source import Directory
 from udrl_launch.agents import load_agent
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import status_of
@@ -117,6 +119,13 @@ def test_status_of_a_live_run_needs_an_observers_key(
     assert status_of(run_dir).actors == ()  # without a key it is what the store says
     status = cli("status", "--connect", endpoint, "--keys", str(keys_dir), "--json").status()
     assert status.state == "running"
+    with closing(Directory(run_dir, keys_dir / "observer")) as board:
+        assert board.status().actors
+        assert board.doubt() == ""
+    with closing(Directory(run_dir)) as board:
+        assert board.status().actors == ()
+        assert "add --keys DIR" in board.doubt()
+        assert board.history(-1).iterations
     for keys, remedy in [
         ((), "add --keys DIR"),
         (("--keys", str(foreign_keys_dir)), "same `udrl keys create`"),

@@ -10,7 +10,7 @@ from typing import Literal, Protocol, TypeVar
 
 import msgspec
 
-from udrl.errors import PeerError, Unreachable
+from udrl.errors import ConfigError, PeerError, Refused, Unreachable
 from udrl_launch.address import Address, connected
 from udrl_launch.agents import load_agent
 from udrl_launch.inspection import read_run, read_status, served_at
@@ -48,12 +48,10 @@ class Place(msgspec.Struct, frozen=True):
     Attributes:
         run_dir: its directory on the board's machine.
         endpoint: that services of the run connect to.
-        needs_keys: whether they have to prove their roles.
     """
 
     run_dir: str = ""
     endpoint: str = ""
-    needs_keys: bool = False
 
 
 class Source(Protocol):
@@ -153,7 +151,7 @@ class Served:
 
     def place(self) -> Place:
         """Return its endpoint."""
-        return Place("", self._address.endpoint, self._address.keys is not None)
+        return Place("", self._address.endpoint)
 
     def doubt(self) -> str:
         """Return nothing: who does not answer raises."""
@@ -221,21 +219,18 @@ class Directory:
         self._stored = Stored(run_dir)
         self._served: tuple[str, Served] | None = None
         self._silent_since = float("-inf")
+        self._why = ""
         self._lock = threading.Lock()
 
     def place(self) -> Place:
         """Return its directory, and its endpoint while it is served."""
-        endpoint = served_at(self._run_dir) or ""
-        return Place(str(self._run_dir), endpoint, self._keys_dir is not None)
+        return Place(str(self._run_dir), served_at(self._run_dir) or "")
 
     def doubt(self) -> str:
         """Return that the replay service does not answer, if it is there and does not."""
-        if not self._is_silent() or served_at(self._run_dir) is None:
+        if served_at(self._run_dir) is None or not self._is_silent():
             return ""
-        return (
-            f"The replay service of {self._run_dir} does not answer this board; what is shown is "
-            f"what its file says. A run with keys needs --keys DIR of an observer."
-        )
+        return f"What is shown is what the run's file says, not what its service does: {self._why}"
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -269,10 +264,10 @@ class Directory:
         if served is not None:
             try:
                 return question(served)
-            except PeerError as error:
-                log.debug("%s is read, since it does not answer: %s", self._run_dir, error)
-                if isinstance(error, Unreachable):
-                    self._silent_since = time.monotonic()
+            except Refused as error:
+                log.debug("%s is read, since it refuses: %s", self._run_dir, error)
+            except (PeerError, ConfigError) as error:
+                self._silent_since, self._why = time.monotonic(), str(error)
         return question(self._stored)
 
     def _is_silent(self) -> bool:

@@ -36,8 +36,8 @@ const evaluated = (e) => (e ? `${number(e.mean)} ± ${number((e.ci95_high - e.ci
 
 // Shell commands that go on from here, as far as the board knows what they are called.
 function commands() {
-  const { run_dir, endpoint, needs_keys } = known.place;
-  const keys = needs_keys ? " --keys DIR" : "", env = known.status.environment;
+  const { run_dir, endpoint } = known.place, env = known.status.environment;
+  const keys = endpoint.startsWith("tls/") ? " --keys DIR" : "";
   const word = (text) => (/^[\w./:-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
   return {
     service: (role) => `udrl ${role} --connect ${endpoint || "ENDPOINT"}${keys}`,
