@@ -127,4 +127,4 @@ class EventFiles:
         if now[1] > self._before[1]:
             speed = (now[0] - self._before[0]) / (now[1] - self._before[1])
             self._writer.add_scalar("time/fps", speed, int(now[0]), at)
-        self._before = now
+            self._before = now
