@@ -140,7 +140,7 @@ def write_dataset(
     Raises:
         ConfigError: the name is taken or impossible, or it cannot be written.
     """
-    if not re.fullmatch(r"(?:[\w-]+/)*[\w-]+-v\d+", name, re.ASCII):
+    if not re.fullmatch(r"(?:\w[\w-]*/)*\w[\w-]*-v\d+", name, re.ASCII):
         raise ConfigError(
             f"dataset {name!r}: expected a name with a version, of letters, digits, _ and -, e.g. "
             f"{config.environment.split('-')[0].split(':')[-1]}/mine-v0"

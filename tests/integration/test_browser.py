@@ -137,6 +137,33 @@ def test_a_live_run_appears_and_its_curve_grows(
         assert int(now or 0) > int(points or 0) > 0
     expect(page.locator("#buffer circle").first).to_be_visible()
     expect(page.locator("#buffer .asked").first).to_be_visible()
+    zoomed = read_after_zooming(page)
+    points = page.locator("#curve").get_attribute("data-points")
+    page.mouse.move(0, 0)
+    expect(page.locator(f'#curve:not([data-points="{points}"])')).to_be_visible(timeout=SOON)
+    assert read_at_the_end(page) == zoomed
+
+
+def read_at_the_end(page: Page) -> str:
+    """Return what the cursor reads at the right end of the curve."""
+    box = page.locator("#curve .u-over").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] - 1, box["y"] + 20)
+    return page.locator("#curve-said").inner_text().split(":")[0]
+
+
+def read_after_zooming(page: Page) -> str:
+    """Drag the middle of the curve open; return what the cursor reads at its right end then."""
+    before = read_at_the_end(page)
+    box = page.locator("#curve .u-over").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 50, steps=5)
+    page.mouse.up()
+    after = read_at_the_end(page)
+    assert after != before
+    return after
 
 
 def test_a_command_is_given_and_obeyed(

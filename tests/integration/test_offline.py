@@ -98,7 +98,9 @@ def test_datasets_of_another_environment(spec: EnvironmentSpec, says: str) -> No
         read_dataset("some/ours-v0", small(), spec)
 
 
-@pytest.mark.parametrize("name", ["../../etc-v0", "bad name-v0", "mine", "", "/x-v0", "é-v0"])
+@pytest.mark.parametrize(
+    "name", ["../../etc-v0", "bad name-v0", "mine", "", "/x-v0", "é-v0", "-x-v0"]
+)
 def test_names_that_minari_has_not(name: str, tmp_path: Path) -> None:
     found = set(minari.list_local_datasets())
     with pytest.raises(ConfigError, match=r"a name with a version.*e\.g\. CartPole/mine-v0"):

@@ -10,13 +10,22 @@ from udrl_launch.commands.options import STEPS
 
 @pytest.mark.parametrize(
     ("text", "steps"),
-    [("10M", 10_000_000), ("500k", 500_000), ("1.5M", 1_500_000), ("250_000", 250_000), ("7", 7)],
+    [
+        ("10M", 10_000_000),
+        ("500k", 500_000),
+        ("1.5M", 1_500_000),
+        ("250_000", 250_000),
+        ("7", 7),
+        ("1,000,000", 1_000_000),
+    ],
 )
 def test_steps_have_suffixes(text: str, steps: int) -> None:
     assert STEPS.convert(text, None, None) == steps
 
 
-@pytest.mark.parametrize("text", ["", "0", "10G", "M", "-5", "1e6", "0.1", "9" * 16, "9" * 30])
+@pytest.mark.parametrize(
+    "text", ["", "0", "10G", "M", "-5", "1e6", "0.1", "1,5M", "1,50", "1,", "9" * 16, "9" * 30]
+)
 def test_other_steps_are_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="500K"):
         STEPS.convert(text, None, None)

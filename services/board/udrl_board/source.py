@@ -183,7 +183,8 @@ class Served:
     def close(self) -> None:
         """Leave the run's router."""
         with self._lock:
-            self._disconnect()
+            self._line = None
+            self._stack.close()
 
     def _ask(self, question: Callable[[Asker], Answer]) -> Answer:
         with self._lock:
@@ -201,8 +202,9 @@ class Served:
         return self._line
 
     def _disconnect(self) -> None:
-        self._line = None
-        self._stack.close()
+        """Leave the router; whoever asks does not wait until a service that hangs has noticed."""
+        self._line, stack = None, self._stack.pop_all()
+        threading.Thread(target=stack.close, name="leaving", daemon=True).start()
 
 
 class Directory:

@@ -77,7 +77,7 @@ def compare(
     if picture.suffix not in _KINDS:
         raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
     runs = {run_dir: _read(run_dir) for run_dir in run_dirs}
-    if not any(map(_evaluated, runs.values())):
+    if not any(_evaluated(rows) or _closing_evaluation(d) for d, rows in runs.items()):
         names = ", ".join(map(str, run_dirs))
         raise StoreError(
             f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "

@@ -1,5 +1,6 @@
 """A run's agent as a folder with a model card, and its episodes as a dataset."""
 
+import shlex
 from contextlib import closing
 from pathlib import Path
 
@@ -133,7 +134,7 @@ def _again(agent: Agent, progress: Progress) -> str:
     else:
         said = (
             f"On the same kind of hardware its version {agent.version} has the same weights, to "
-            f"the bit; it goes on from there."
+            f"the bit; it goes on from there, and keeps the versions that it evaluates."
         )
     if config.dataset is not None:
         said += f" It begins with the dataset `{config.dataset}`, which has to be there."
@@ -157,7 +158,9 @@ def _card(agent: Agent, folder: Path, found: EvaluationRow | None, again: str) -
         index=index,
         results=results,
         example=_EXAMPLE.format(folder=folder.name),
-        command=f"udrl train {environment} --preset none --config config.toml",
+        command=shlex.join(
+            ["udrl", "train", environment, "--preset", "none", "--config", "config.toml"]
+        ),
         version=udrl.__version__,
         seed=agent.config.seed,
         weights=agent.version,

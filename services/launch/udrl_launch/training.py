@@ -1,6 +1,7 @@
 """``udrl train``: all services on this machine, from the first episode to the last evaluation."""
 
 import logging
+import shlex
 import socket
 import threading
 import time
@@ -132,7 +133,10 @@ def train(
         services.end()
     if stop.is_set():
         raise Interrupted(
-            f"stopped; go on with: udrl train {config.environment} --run-dir {run_dir} --resume"
+            "stopped; go on with: "
+            + shlex.join(
+                ["udrl", "train", config.environment, "--run-dir", str(run_dir), "--resume"]
+            )
         )
     return read_status(run_dir)
 

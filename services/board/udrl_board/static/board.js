@@ -5,6 +5,8 @@ import { $, facts, number } from "./page.js";
 import { Command } from "./stage.js";
 
 const EVERY_MS = 1000;
+// The board waits for a replay service that hangs, and says so; it must not be given up before.
+const LONGEST_MS = 20_000;
 
 const known = { place: {}, hello: null, status: null, iterations: [], evaluations: [], contents: null };
 
@@ -39,9 +41,11 @@ function commands() {
   const { run_dir, endpoint } = known.place, env = known.status.environment;
   const keys = endpoint.startsWith("tls/") ? " --keys DIR" : "";
   const word = (text) => (/^[\w./:-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
+  const directory = run_dir ? word(run_dir) : "RUN_DIR";
   return {
+    run_dir: directory,
     service: (role) => `udrl ${role} --connect ${endpoint || "ENDPOINT"}${keys}`,
-    resume: (more = "") => `udrl train ${word(env)} --run-dir ${run_dir ? word(run_dir) : "RUN_DIR"} --resume${more}${keys}`,
+    resume: (more = "") => `udrl train ${word(env)} --run-dir ${directory} --resume${more}${keys}`,
   };
 }
 
@@ -60,7 +64,7 @@ function showStatus(status) {
     ...(status.closing_evaluation ? [["closing evaluation", evaluated(status.closing_evaluation)]] : []),
     ["weights", `version ${status.weights_version}`],
     ["weights' age", `${status.weights_lag} versions, ${number(status.weights_lag_s, 2)} s`],
-    ["loss", number(status.loss, 3)],
+    ["loss of these", number(status.loss, 3)],
     ["time", time(status.wall_s)],
     ...left,
     ["seed", String(hello?.config.seed ?? "")],
@@ -115,19 +119,19 @@ function showHistory() {
     [evaluations, "env_steps", { mean: (e) => e.mean, high: (e) => e.ci95_high, low: (e) => e.ci95_low }],
     [closing ? [closing] : [], "env_steps", { closing: (e) => e.mean }],
   );
-  const columns = Object.fromEntries(["mean", "high", "low", "explored", "most", "least", "closing"].map((name) => [name, column(name)]));
+  const columns = ["mean", "high", "low", "explored", "most", "least", "closing"].map(column);
   const last = rows.at(-1), all = closing ? [...evaluations, closing] : evaluations;
   const best = all.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
   const asked = (least, most) => (least == null ? "" : `, asked for ${number(least)} to ${number(most)}`);
-  curve.show(xs, Object.values(columns),
+  curve.show(xs, columns,
     `After ${number(last.env_steps)} env steps: explored ${number(last.explored_return)}${asked(last.commanded_min, last.commanded_max)}` +
       (best ? `; best evaluation ${evaluated(best)} after ${number(best.env_steps)}.` : "; no evaluation yet."),
+    // Evaluations are fewer than iterations: the last one up to there is what the cursor is at.
     (i) => {
-      const at = Object.fromEntries(Object.entries(columns).map(([name, values]) => [name, values[i]]));
+      const row = rows.findLast((r) => r.env_steps <= xs[i]), made = all.findLast((e) => e.env_steps <= xs[i]);
       const parts = [
-        at.mean == null ? "" : `evaluation ${number(at.mean)}, ${number(at.low)} to ${number(at.high)}`,
-        at.closing == null ? "" : `closing evaluation ${number(at.closing)}`,
-        at.explored == null ? "" : `explored ${number(at.explored)}${asked(at.least, at.most)}`,
+        made ? `${made === closing ? "closing evaluation" : "evaluation"} ${evaluated(made)} after ${number(made.env_steps)}` : "",
+        row ? `explored ${number(row.explored_return)}${asked(row.commanded_min, row.commanded_max)}` : "",
       ];
       return `After ${number(xs[i])} env steps: ${parts.filter(Boolean).join("; ")}.`;
     });
@@ -138,7 +142,7 @@ function showHistory() {
   });
   const after = (text, of) => (i) => `After ${number(of[i].env_steps)} env steps: ${text(i)}.`;
   speed.show(steps, [pace], `Over the last iterations ${number(pace.at(-1), 0)}, evaluations included.`, after((i) => number(pace[i], 0), rows));
-  loss.show(steps, [rows.map((r) => r.loss ?? undefined)], last.loss == null ? "Nothing is trained yet." : `Now ${number(last.loss)}.`,
+  loss.show(steps, [rows.map((r) => r.loss ?? undefined)], last.loss == null ? "Nothing is trained yet." : `Of the weights of the last complete iteration: ${number(last.loss)}.`,
     after((i) => number(rows[i].loss), rows));
   const trained = rows.filter((r) => r.iteration > 0); // all of the warm-up's are the best so far
   admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)], `Of the last iteration: ${last.admitted}.`,
@@ -161,13 +165,13 @@ function showContents(contents) {
   const held = known.status?.buffer, recent = known.hello?.config.recent_size;
   $("buffer-said").textContent = (held ? `The ${number(held.episodes)} best episodes have returns from ${number(held.return_min)} to ${number(held.return_max)}` : "") +
     (recent ? `; the newest ${number(recent)} are kept and shown besides. ` : ". ") +
-    `Evaluations ask for ${number(contents.desired_return)} within ${number(contents.desired_horizon)} steps (M, large cross; S = ${number(contents.return_std)}); ${asked.length} exploratory commands are outstanding.`;
+    `Evaluations ask for ${number(contents.desired_return)} within ${number(contents.desired_horizon)} steps (M, large cross; S = ${number(contents.return_std)}); outstanding exploratory commands: ${asked.length}.`;
 }
 
 async function ask() {
   const after = known.iterations.at(-1)?.iteration ?? -1;
   const run = encodeURIComponent(known.hello?.run_id ?? "");
-  const response = await fetch(`news?after=${after}&run=${run}`, { signal: AbortSignal.timeout(10_000) });
+  const response = await fetch(`news?after=${after}&run=${run}`, { signal: AbortSignal.timeout(LONGEST_MS) });
   if (!response.ok) throw new Error(await response.text());
   const news = await response.json();
   if (news.hello) Object.assign(known, { hello: news.hello, iterations: [], evaluations: [] });
@@ -182,7 +186,8 @@ async function ask() {
     command.know(known);
   }
   $("about").textContent = `udrl ${news.software}`;
-  problem([news.problem, news.status?.problem].filter(Boolean).join(" "));
+  const why = news.status?.problem.replace("RUN_DIR", commands().run_dir);
+  problem([news.problem, why].filter(Boolean).join(" "));
 }
 
 function problem(text) {

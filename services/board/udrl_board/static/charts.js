@@ -54,9 +54,17 @@ export class Chart {
     this.place.dataset.points = xs.length;
     Object.assign(this, { summary, read });
     if (!xs.length) return;
-    if (this.plot) this.plot.setData(this.data);
+    if (this.plot) this.update();
     else this.redraw();
     this.say(this.plot.cursor.idx);
+  }
+
+  // A part that somebody dragged open stays open.
+  update() {
+    const { min, max } = this.plot.scales.x, shown = this.plot.data[0];
+    const isWhole = min <= shown[0] && max >= shown.at(-1);
+    this.plot.setData(this.data, isWhole);
+    if (!isWhole) this.plot.setScale("x", { min, max });
   }
 
   say(place) {
@@ -94,7 +102,7 @@ export class Chart {
         ],
         bands: this.bands.map(([upper, lower, name]) => ({ series: [upper + 1, lower + 1], fill: `color-mix(in srgb, ${colour(name)} 22%, transparent)` })),
         legend: { show: false },
-        cursor: { y: false },
+        cursor: { y: false, points: { fill: (_, line) => colour(this.lines[line - 1].colour), size: 7 } },
         hooks: { setCursor: [(plot) => this.say(plot.cursor.idx)] },
       },
       this.data,

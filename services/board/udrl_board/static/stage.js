@@ -139,7 +139,10 @@ export class Command {
   said(message) {
     if (message.problem !== undefined) {
       $("outcome").textContent = message.problem;
-      if (message.is_over) this.moment = null;
+      if (message.is_over) {
+        this.moment = null;
+        this.map.mark("left", null);
+      }
       this.buttons();
       return;
     }

@@ -90,7 +90,7 @@ class _Steps(click.ParamType):  # type: ignore[type-arg]
     name = "steps"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        digits = str(value).replace("_", "").replace(",", "")
+        digits = re.sub(r"(?<=[0-9])[,_](?=[0-9]{3}(?![0-9]))", "", str(value))
         found = re.fullmatch(r"([0-9]{1,16}(?:\.[0-9]{1,16})?)([kKmM]?)", digits)
         steps = 0
         if found is not None:
