@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
+import anyio
 import msgspec
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -205,6 +206,12 @@ async def _listen(socket: WebSocket, stage: Stage) -> None:
             await socket.send_text(msgspec.json.encode(Trouble(problem=problem)).decode())
 
 
+#: What sending raises when the socket, the server's end of it, or the loop is no more.
+_GONE = (
+    RuntimeError, WebSocketDisconnect, TimeoutError, CancelledError,
+    anyio.BrokenResourceError, anyio.ClosedResourceError,
+)  # fmt: skip
+
 Sender = Callable[[Moment | Trouble, bytes | None], None]
 
 
@@ -220,7 +227,7 @@ def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
         sending: Awaitable[None] = asyncio.wait_for(send(news, picture), _SEND_S)
         try:
             asyncio.run_coroutine_threadsafe(sending, loop).result(_SEND_S + 1)  # type: ignore[arg-type]
-        except (RuntimeError, WebSocketDisconnect, TimeoutError, CancelledError) as error:
+        except _GONE as error:
             raise ConnectionError(f"nobody watches: {error}") from error
 
     return show
