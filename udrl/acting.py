@@ -17,7 +17,7 @@ most recent observations (:func:`udrl.episode.recent`).
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -411,8 +411,20 @@ def generate_episodes(
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
     """
+    return sorted(iterate_episodes(generator, commands, behavior), key=lambda e: e.command_id)
+
+
+def iterate_episodes(
+    generator: EpisodeGenerator, commands: Iterable[Command], behavior: BehaviorFunction | None
+) -> Iterator[Episode]:
+    """As :func:`generate_episodes`, but yield each episode when it ends, in any order.
+
+    For many episodes of which only a few numbers are kept: images take much memory.
+
+    Raises:
+        EnvironmentFault: the environment failed three times under the same command.
+    """
     waiting = list(commands)[::-1]
-    episodes: list[Episode] = []
     failures: Counter[int] = Counter()
     while waiting or generator.running:
         outcomes: list[Episode | Failure | None] = []
@@ -421,10 +433,9 @@ def generate_episodes(
         outcomes.extend(generator.step())
         for outcome in outcomes:
             if isinstance(outcome, Episode):
-                episodes.append(outcome)
+                yield outcome
             elif outcome is not None:
                 failures[outcome.command.id] += 1
                 if failures[outcome.command.id] == MAX_FAILURES:
                     raise outcome.error
                 waiting.append(outcome.command)
-    return sorted(episodes, key=lambda e: e.command_id)

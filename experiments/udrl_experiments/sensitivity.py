@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import correlation
 
+from udrl.obedience import correlation
 from udrl_experiments import figures
 from udrl_experiments.comparison import job
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained, read, write
 from udrl_experiments.study import Place, Study
-from udrl_launch.agents import Agent, evaluate, evaluation_commands, load_agent
+from udrl_launch.agents import evaluate_all, evaluation_commands, load_agent
 from udrl_launch.inspection import read_status
 
 #: Episodes a point.
@@ -48,10 +48,9 @@ def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
     for seed in dict.fromkeys(row.seed for row in rows):
         mine = [row for row in rows if row.seed == seed]
         told, got = [row.desired_return for row in mine], [row.mean for row in mine]
-        related = correlation(told, got) if len(set(got)) > 1 else 0.0
         said.append(
             f"{task.title}, seed {seed}: told {min(told):.0f} to {max(told):.0f}, obtained "
-            f"{min(got):.1f} to {max(got):.1f}, correlation {related:.2f}"
+            f"{min(got):.1f} to {max(got):.1f}, correlation {correlation(told, got):.2f}"
         )
     return said
 
@@ -60,22 +59,23 @@ def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
     """Return what the agent of a run obtains; another study may have taken it further."""
     run_dir = run.folder(root) / "run"
     agent, env_steps = load_agent(run_dir), read_status(run_dir).env_steps
-    return [_obtained(agent, env_steps, told, episodes) for told in task.desired_returns]
-
-
-def _obtained(agent: Agent, env_steps: int, desired_return: float, episodes: int) -> Obtained:
-    commands = evaluation_commands(agent, episodes=episodes, desired_return=desired_return)
-    result = evaluate(agent, commands)
-    return Obtained(
-        environment=agent.config.environment,
-        seed=agent.config.seed,
-        env_steps=env_steps,
-        desired_return=result.desired_return,
-        desired_horizon=result.desired_horizon,
-        mean=result.evaluation.mean,
-        std=result.evaluation.std,
-        episodes=result.evaluation.episodes,
-    )
+    commands = [
+        evaluation_commands(agent, episodes=episodes, desired_return=told)
+        for told in task.desired_returns
+    ]
+    return [
+        Obtained(
+            environment=agent.config.environment,
+            seed=agent.config.seed,
+            env_steps=env_steps,
+            desired_return=result.desired_return,
+            desired_horizon=result.desired_horizon,
+            mean=result.evaluation.mean,
+            std=result.evaluation.std,
+            episodes=result.evaluation.episodes,
+        )
+        for result in evaluate_all(agent, commands)
+    ]
 
 
 def draw(table: Path, title: str) -> None:

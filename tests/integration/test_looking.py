@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from PIL import Image, ImageSequence
 
 from udrl.errors import ConfigError, StoreError, UdrlError
-from udrl_launch.agents import evaluate, evaluation_commands, load_agent
+from udrl_launch.agents import evaluate, evaluate_all, evaluation_commands, load_agent
 from udrl_launch.cli import cli
 from udrl_launch.curve import compare
 from udrl_launch.inspection import read_status
@@ -49,6 +49,21 @@ def test_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
     told = {"desired_return": 60.0, "desired_horizon": 50}
     assert all(told.items() <= p.items() for p in played)
     assert all(p["length"] == p["episode_return"] for p in played)  # CartPole: 1 a step
+
+
+def test_evaluations_in_one_go_are_those_one_by_one(ended_run: Path) -> None:
+    agent = load_agent(ended_run)
+    evaluations = [
+        evaluation_commands(agent, episodes=n, temperature=t, desired_return=r)
+        for n, t, r in ((3, None, 20.0), (1, 0.0, 80.0), (4, 0.5, 50.0))
+    ]
+    ended: list[None] = []
+    together = evaluate_all(agent, evaluations, 3, lambda: ended.append(None))
+    assert together == [evaluate(agent, commands) for commands in evaluations]
+    assert [(r.desired_return, r.temperature) for r in together] == [(20, 1), (80, 0), (50, 0.5)]
+    assert all(r.lengths == r.returns for r in together)  # CartPole: 1 a step
+    assert len(ended) == 8
+    assert evaluate_all(agent, []) == []
 
 
 def test_play_says_what_was_asked_for_and_obtained(ended_run: Path) -> None:

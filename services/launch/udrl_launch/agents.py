@@ -1,14 +1,15 @@
 """Agents of runs: loaded, evaluated, and told one command again."""
 
 import faulthandler
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
 
-from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.acting import EpisodeGenerator, generate_episodes, iterate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.checkpoint import decode_weights
 from udrl.commands import Command, CommandSampler
@@ -110,13 +111,23 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
 
 
 class Result(NamedTuple):
-    """What an evaluation was told, and what came of it."""
+    """What an evaluation commanded, and what was obtained.
+
+    Attributes:
+        desired_return: of every episode's command.
+        desired_horizon: likewise, in steps.
+        temperature: likewise.
+        evaluation: of the returns.
+        returns: of the episodes, in the order of their commands.
+        lengths: of the episodes, in steps.
+    """
 
     desired_return: float
     desired_horizon: int
     temperature: float
     evaluation: Evaluation
     returns: list[float]
+    lengths: list[int]
 
 
 def evaluation_commands(
@@ -159,12 +170,54 @@ def evaluate(agent: Agent, commands: Sequence[Command], environments: int = 16) 
     """Evaluate an agent by the commands of an evaluation (:func:`evaluation_commands`).
 
     With those of the run's own settings this repeats its closing evaluation exactly.
+
+    Raises:
+        EnvironmentFault: the environment failed three times under the same command.
+    """
+    (result,) = evaluate_all(agent, [commands], environments)
+    return result
+
+
+def evaluate_all(
+    agent: Agent,
+    evaluations: Sequence[Sequence[Command]],
+    environments: int = 16,
+    ended: Callable[[], object] = lambda: None,
+) -> list[Result]:
+    """Carry out several evaluations in one go, so that all environments stay busy.
+
+    Each result is that of :func:`evaluate`: an episode depends on its command alone.
+
+    Args:
+        agent: who acts.
+        evaluations: for each its commands, at least one.
+        environments: episodes that run at the same time.
+        ended: called whenever an episode has ended.
+
+    Raises:
+        EnvironmentFault: the environment failed three times under the same command.
     """
     use_one_thread()
-    generator = EpisodeGenerator(agent.config, environments)
-    done = generate_episodes(generator, commands, agent.behavior)
-    generator.close()
-    told, returns = commands[0], [e.episode_return for e in done]
-    return Result(
-        told.desired_return, told.desired_horizon, told.temperature, summarise(returns), returns
-    )
+    # Evaluations of the same run have the same ids; episodes are told apart by theirs.
+    first = evaluations[0][0].id if evaluations else 0
+    numbered = [
+        msgspec.structs.replace(command, id=first + k)
+        for k, command in enumerate(chain.from_iterable(evaluations))
+    ]
+    outcomes = [(0.0, 0)] * len(numbered)
+    with closing(EpisodeGenerator(agent.config, environments)) as generator:
+        for episode in iterate_episodes(generator, numbered, agent.behavior):
+            outcomes[episode.command_id - first] = episode.episode_return, episode.length
+            ended()
+    following = iter(outcomes)
+    results = []
+    for commands in evaluations:
+        returns, lengths = zip(*islice(following, len(commands)), strict=True)
+        command = commands[0]
+        results.append(
+            Result(
+                command.desired_return, command.desired_horizon, command.temperature,
+                summarise(returns), list(returns), list(lengths),
+            )
+        )  # fmt: skip
+    return results
