@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from tests.markdown import ROOT, text_of
-from udrl_experiments.records import Evaluated, Obtained, read
+from udrl_experiments.records import Evaluated, Obtained
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
+from udrl_launch.tables import read
 
 RESULTS = ROOT / "docs" / "results"
 STUDIES = sorted(path.parent for path in RESULTS.rglob("evaluations.csv"))

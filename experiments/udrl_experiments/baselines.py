@@ -26,8 +26,9 @@ from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
-from udrl_experiments.records import Evaluated, write
+from udrl_experiments.records import Evaluated
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
+from udrl_launch.tables import write
 
 #: Environments that an evaluation runs in at the same time; its result does not depend on it.
 _ENVIRONMENTS = 16

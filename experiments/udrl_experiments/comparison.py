@@ -8,10 +8,11 @@ from udrl.config import Config, KeywordValue
 from udrl_experiments import figures
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, Algorithm, Plan, Task
-from udrl_experiments.records import Evaluated, read, write
+from udrl_experiments.records import Evaluated
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Place, Study
 from udrl_experiments.tuned import tuned
+from udrl_launch.tables import read, write
 
 _PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
 

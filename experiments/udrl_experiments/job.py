@@ -18,9 +18,10 @@ from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
 from udrl_experiments.jobs import Job, read_job
 from udrl_experiments.provenance import provenance
-from udrl_experiments.records import Evaluated, put, read, write
+from udrl_experiments.records import Evaluated
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
+from udrl_launch.tables import put, read, write
 from udrl_launch.training import train
 from udrl_proto.messages import Status
 

@@ -1,18 +1,6 @@
-"""Tidy tables: a CSV file with a line for each observation, typed and checked when it is read."""
-
-import csv
-import io
-import math
-import os
-from collections.abc import Iterable
-from pathlib import Path
-from typing import TypeVar
+"""The rows of the studies' tables (:mod:`udrl_launch.tables`)."""
 
 import msgspec
-
-from udrl.errors import InvalidData
-
-Row = TypeVar("Row", bound=msgspec.Struct)
 
 
 class Evaluated(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,56 +51,3 @@ class Obtained(msgspec.Struct, frozen=True, kw_only=True):
     mean: float
     std: float
     episodes: int
-
-
-def put(path: Path, content: bytes) -> None:
-    """Write a file; it is there whole or not at all."""
-    aside = path.with_name(path.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, path)
-
-
-def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
-    """Write rows, with the field names as the first line; the file is there whole or not at all."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(kind.__struct_fields__)
-    writer.writerows(msgspec.structs.astuple(row) for row in rows)
-    put(path, text.getvalue().encode())
-
-
-def read(path: Path, kind: type[Row]) -> list[Row]:
-    """Return the rows of a file.
-
-    Raises:
-        InvalidData: it is not such a table.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            table = csv.DictReader(file)
-            rows = list(table)
-        if tuple(table.fieldnames or ()) != kind.__struct_fields__:
-            raise ValueError(f"its columns are {table.fieldnames}")  # noqa: TRY301
-        # The text "" is none where no text is expected.
-        words = {f.name for f in msgspec.structs.fields(kind) if f.type is str}
-        read = [
-            msgspec.convert(
-                {name: value if value or name in words else None for name, value in row.items()},
-                kind,
-                strict=False,
-            )
-            for row in rows
-        ]
-        if not all(
-            math.isfinite(value)
-            for row in read
-            for value in msgspec.structs.astuple(row)
-            if isinstance(value, float)
-        ):
-            raise ValueError("a number is not finite")  # noqa: TRY301
-    except (OSError, ValueError, csv.Error, msgspec.ValidationError) as error:
-        raise InvalidData(
-            f"{path}: {error}; expected a CSV file with {', '.join(kind.__struct_fields__)}; "
-            f"delete it to have it made again"
-        ) from error
-    return read

@@ -8,10 +8,11 @@ from udrl_experiments import figures
 from udrl_experiments.comparison import job
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
-from udrl_experiments.records import Obtained, read, write
+from udrl_experiments.records import Obtained
 from udrl_experiments.study import Place, Study
 from udrl_launch.agents import evaluate_all, evaluation_commands, load_agent
 from udrl_launch.inspection import read_status
+from udrl_launch.tables import read, write
 
 #: Episodes a point.
 EPISODES = 100

@@ -23,8 +23,9 @@ from udrl.errors import ConfigError, InvalidData
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run
-from udrl_experiments.records import Evaluated, read
+from udrl_experiments.records import Evaluated
 from udrl_experiments.tuned import complete, tuned
+from udrl_launch.tables import read
 
 ALGORITHMS = ("DQN", "A2C")
 FAST: dict[str, dict[str, KeywordValue]] = {

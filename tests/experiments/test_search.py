@@ -11,9 +11,10 @@ import pytest
 from udrl.config import Config, build, preset
 from udrl.errors import ConfigError
 from udrl_experiments.protocol import TASKS, Algorithm, Plan
-from udrl_experiments.records import Evaluated, read, write
+from udrl_experiments.records import Evaluated
 from udrl_experiments.search import Scored, draw, search, space
 from udrl_experiments.study import Place
+from udrl_launch.tables import read, write
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
 ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)

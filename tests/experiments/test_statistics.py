@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from udrl.errors import ConfigError
 from udrl.streams import Purpose, Stream, stream_key
-from udrl_experiments.records import Evaluated, read, write
+from udrl_experiments.records import Evaluated
 from udrl_experiments.statistics import (
     CurvePoint,
     Reached,
@@ -22,6 +22,7 @@ from udrl_experiments.statistics import (
     reached,
     score,
 )
+from udrl_launch.tables import read, write
 
 RETURNS = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=12)
 

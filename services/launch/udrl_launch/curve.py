@@ -6,19 +6,18 @@ The closing evaluation comes from the store; a directory without one is drawn to
 import csv
 import logging
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
 
-from udrl.errors import ConfigError, StoreError
+from udrl.errors import StoreError
+from udrl_launch import pictures
 from udrl_launch.styles import line_style
 from udrl_replay.store import EvaluationRow, Store
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 log = logging.getLogger("udrl")
 
@@ -31,8 +30,6 @@ _COLUMNS = (
 )  # fmt: skip
 
 _X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
-#: What matplotlib can write.
-_KINDS = (".png", ".svg", ".pdf")
 
 
 def draw(run_dir: Path, title: str) -> Path:
@@ -43,7 +40,7 @@ def draw(run_dir: Path, title: str) -> Path:
         StoreError: the run has no metrics.
     """
     rows = _read(run_dir)
-    figure, axes = _empty()
+    figure, (axes,) = pictures.empty()
     steps = [r["env_steps"] for r in rows]
     for name, label, style in (
         ("return_mean", "mean of the replay buffer", "--"),
@@ -55,7 +52,7 @@ def draw(run_dir: Path, title: str) -> Path:
     axes.set(xlabel="env steps", ylabel="return", title=title)
     axes.legend(fontsize="small")
     picture = run_dir / "learning_curve.png"
-    _save(figure, picture)
+    pictures.save(figure, picture)
     return picture
 
 
@@ -74,8 +71,7 @@ def compare(
         ConfigError: matplotlib is not installed, or another kind of file.
         StoreError: a run has no metrics, or none has been evaluated.
     """
-    if picture.suffix not in _KINDS:
-        raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
+    pictures.check_name(picture)
     runs = {run_dir: _read(run_dir) for run_dir in run_dirs}
     if not any(_evaluated(rows) or _closing_evaluation(d) for d, rows in runs.items()):
         names = ", ".join(map(str, run_dirs))
@@ -83,13 +79,13 @@ def compare(
             f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "
             f"eval_every env steps"
         )
-    figure, axes = _empty()
+    figure, (axes,) = pictures.empty()
     for rank, (label, run_dir) in enumerate(zip(_labels(list(runs)), runs, strict=True)):
         _evaluations(axes, runs[run_dir], x, label, rank)
         _closing(axes, run_dir, runs[run_dir], x, rank)
     axes.set(xlabel=_X[x][0], ylabel="mean return of an evaluation, 95 % interval")
     axes.legend(fontsize="small", handlelength=3.5)
-    _save(figure, picture)
+    pictures.save(figure, picture)
 
 
 def _labels(run_dirs: Sequence[Path]) -> list[str]:
@@ -120,19 +116,6 @@ def _rows(file: TextIO) -> Iterator[dict[str, str]]:
         if None in row.values():
             raise ValueError("a line is too short")
         yield row
-
-
-def _empty() -> "tuple[Figure, Axes]":
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            'learning curves need matplotlib; install it with: pip install "udrl[plot]"'
-        ) from error
-    figure = Figure(figsize=(7, 4.3), layout="constrained")
-    axes = figure.add_subplot()
-    axes.grid(alpha=0.3)
-    return figure, axes
 
 
 def _evaluated(rows: Sequence[Row]) -> list[Row]:
@@ -183,14 +166,3 @@ def _closing_evaluation(run_dir: Path) -> EvaluationRow | None:
     except StoreError as error:
         log.debug("no closing evaluation of %s: %s", run_dir, error)
         return None
-
-
-def _save(figure: "Figure", picture: Path) -> None:
-    """Write a picture; it is there as a whole or not at all."""
-    aside = picture.with_name(f"{picture.name}.part")
-    try:
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(aside, format=picture.suffix[1:], dpi=130)
-        os.replace(aside, picture)
-    except OSError as error:
-        raise ConfigError(f"{picture}: {error.strerror}; name a file you may write") from error
