@@ -1,7 +1,7 @@
 """Section 3.5: how obtained returns follow commanded ones, and where they do.
 
-What can be commanded is what the episodes of the replay buffer did (:func:`reachable`,
-:func:`evenly`, :func:`mean_of_nearest`); where an agent obeys is judged by the mean return that it
+What can be commanded is what the episodes of the replay buffer did (:func:`spread`,
+:func:`mean_of_nearest`); where an agent obeys is judged by the mean return that it
 obtains for each command (:func:`obeyed`).
 """
 
@@ -64,6 +64,20 @@ def evenly(low: float, high: float, n: int) -> list[float]:
     digits = 1 - math.floor(math.log10((high - low) / (n - 1)))
     # Adding 0 turns -0 into 0.
     return sorted({round(float(value), digits) + 0.0 for value in np.linspace(low, high, n)})
+
+
+def spread(values: npt.ArrayLike, n: int) -> list[float]:
+    """Return what to command, of what episodes did: at most ``n`` values in increasing order.
+
+    Where episodes differ in a few values only, these: nothing between them can be obtained. Else
+    what is :func:`reachable`, spread :func:`evenly`.
+
+    Args:
+        values: returns or lengths of episodes, float [m], at least one.
+        n: at least 2.
+    """
+    distinct = np.unique(np.asarray(values, np.float64))
+    return distinct.tolist() if len(distinct) <= n else evenly(*reachable(values), n)
 
 
 def mean_of_nearest(at: float, where: npt.ArrayLike, values: npt.ArrayLike) -> float:

@@ -16,6 +16,7 @@ from udrl.obedience import (
     mean_of_nearest,
     obeyed,
     reachable,
+    spread,
 )
 
 WHOLE = st.integers(-1000, 1000)
@@ -111,6 +112,15 @@ def test_commands_are_spread_evenly_and_can_be_written_down(low: int, width: flo
         assert value == pytest.approx(low + k * spacing, abs=0.051 * spacing)
         assert len(f"{value:.12g}") <= 13
     assert evenly(low, low, n) == [low]
+
+
+@given(values=st.lists(st.integers(0, 20), min_size=1, max_size=60), n=st.integers(2, 12))
+def test_a_few_values_are_commanded_as_they_are(values: list[int], n: int) -> None:
+    distinct = sorted(set(values))
+    if len(distinct) <= n:
+        assert spread(values, n) == distinct
+    else:
+        assert spread(values, n) == evenly(*reachable(values), n)
 
 
 def test_commands_are_round_where_they_can_be() -> None:

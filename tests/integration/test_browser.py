@@ -22,7 +22,17 @@ from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status
 from udrl_replay.store import Store
-from whole_run import LANDER, SMALL, Cli, arguments, free_port, live_status, small, wait_for
+from whole_run import (
+    LANDER,
+    OBEDIENT,
+    SMALL,
+    Cli,
+    arguments,
+    free_port,
+    live_status,
+    small,
+    wait_for,
+)
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
@@ -33,14 +43,6 @@ _ALONE = [
 ]  # fmt: skip
 #: Milliseconds that a page gets on a slow machine.
 SOON = 20_000
-
-#: An agent for which obeying is trivial: it collects exactly what it is told to, of 0 to 4.
-OBEDIENT: dict[str, Any] = {
-    "environment": "Obedience-v0", "environment_kwargs": {"steps": 4}, "hidden": [32, 32],
-    "n_warm_up_episodes": 300, "replay_size": 400, "recent_size": 400, "last_few": 100,
-    "batch_size": 128, "learning_rate": 0.01, "n_updates_per_iter": 300, "n_episodes_per_iter": 5,
-    "return_scale": 1.0, "horizon_scale": 0.3, "eval_every": 100, "eval_episodes": 5,
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,14 @@ LANDER: dict[str, Any] = SMALL | {
     "eval_every": 5000,
 }
 
+#: An agent for which obeying is trivial: it collects exactly what it is told to, of 0 to 4.
+OBEDIENT: dict[str, Any] = {
+    "environment": "Obedience-v0", "environment_kwargs": {"steps": 4}, "hidden": [32, 32],
+    "n_warm_up_episodes": 300, "replay_size": 400, "recent_size": 400, "last_few": 100,
+    "batch_size": 128, "learning_rate": 0.01, "n_updates_per_iter": 300, "n_episodes_per_iter": 5,
+    "return_scale": 1.0, "horizon_scale": 0.3, "eval_every": 100, "eval_episodes": 5,
+}  # fmt: skip
+
 
 def small(**changes: Any) -> Config:
     return build(Config, SMALL | changes)

@@ -32,6 +32,7 @@ _SHOW_S = 60.0
 class Agent(NamedTuple):
     """A trained behavior function and the run that it comes from."""
 
+    run_id: str
     config: Config
     environment: EnvironmentSpec
     version: int
@@ -77,6 +78,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             )
         held = store.buffer(progress.iteration)
         return Agent(
+            run_id=hello.run_id,
             config=hello.config,
             environment=hello.environment,
             version=wanted,

@@ -17,6 +17,7 @@ _COMMANDS = {
     "learner": "udrl_launch.commands.services",
     "actor": "udrl_launch.commands.services",
     "evaluate": "udrl_launch.commands.looking",
+    "obedience": "udrl_launch.commands.obedience",
     "play": "udrl_launch.commands.playing",
     "export": "udrl_launch.commands.exporting",
     "reproduce": "udrl_launch.commands.looking",

@@ -10,6 +10,8 @@ from udrl.errors import ConfigError, StoreError
 from udrl.offline import write_dataset
 from udrl_launch.agents import Agent
 from udrl_launch.inspection import budget_of
+from udrl_launch.obedience import Obedience, kept_of
+from udrl_launch.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
@@ -32,7 +34,7 @@ given an order, *"get this return within this many steps"*, and acts.
 
 {results}
 
-## Use
+{obedience}## Use
 
 ```python
 {example}```
@@ -47,6 +49,13 @@ This needs udrl, and what the environment needs.
 
 udrl {version}, seed {seed}, weights version {weights}. All settings are in `config.toml` beside
 this card. About the command: {again}
+"""
+
+_OBEDIENCE = """\
+## What it can be asked for
+
+{report}
+
 """
 
 _INDEX = """\
@@ -84,8 +93,11 @@ while not over:
 def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     """Write an agent, its settings and a model card with what its run's evaluations said.
 
+    If these weights were measured by ``udrl obedience``, the card has that report too.
+
     Raises:
         ConfigError: the folder cannot be written, or holds a run.
+        InvalidData: the report is not what was written.
         StoreError: the run cannot be read.
     """
     if (folder / FILE).exists():
@@ -99,7 +111,8 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     policy = agent.policy
     if found is not None:  # what the card's results were asked for
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
-    folders.save(folder, policy, _card(agent, folder, found, _again(agent, progress)))
+    card = _card(agent, folder, found, kept_of(agent, run_dir), _again(agent, progress))
+    folders.save(folder, policy, card)
     write_config(folder, agent.config, budget_of(run_dir))
 
 
@@ -141,7 +154,13 @@ def _again(agent: Agent, progress: Progress) -> str:
     return said
 
 
-def _card(agent: Agent, folder: Path, found: EvaluationRow | None, again: str) -> str:
+def _card(
+    agent: Agent,
+    folder: Path,
+    found: EvaluationRow | None,
+    report: Obedience | None,
+    again: str,
+) -> str:
     environment = agent.config.environment
     results, index = "These weights were never evaluated.", ""
     if found is not None:
@@ -157,6 +176,7 @@ def _card(agent: Agent, folder: Path, found: EvaluationRow | None, again: str) -
         environment=environment,
         index=index,
         results=results,
+        obedience="" if report is None else _OBEDIENCE.format(report=markdown(report)),
         example=_EXAMPLE.format(folder=folder.name),
         command=shlex.join(
             ["udrl", "train", environment, "--preset", "none", "--config", "config.toml"]

@@ -9,6 +9,7 @@ from udrl.onnx_model import export_onnx
 from udrl_launch.agents import load_agent
 from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
 from udrl_launch.exporting import export_buffer, export_folder
+from udrl_launch.obedience import kept_of
 
 
 @click.command()
@@ -44,6 +45,12 @@ def export(
     if folder is not None:
         export_folder(agent, run_dir, folder)
         click.echo(f'folder: {folder}; in Python: udrl.load("{folder}")')
+        if kept_of(agent, run_dir) is None:
+            click.echo(
+                "The model card does not say which returns this agent obtains when commanded. "
+                f"Measure it, and export again: udrl obedience {run_dir} --weights {agent.version}",
+                err=True,
+            )
     if onnx is not None:
         export_onnx(agent.policy, onnx)
         click.echo(f"ONNX model: {onnx}")

@@ -84,6 +84,26 @@ class _Return(click.ParamType):  # type: ignore[type-arg]
 RETURN = _Return()
 
 
+class _Returns(click.ParamType):  # type: ignore[type-arg]
+    """A range of returns that can be asked for: ``-100:250``."""
+
+    name = "range"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        if isinstance(value, tuple):  # converted already
+            return value
+        low, _, high = str(value).partition(":")
+        ends = RETURN.convert(low, param, ctx), RETURN.convert(high, param, ctx)
+        if not ends[0] < ends[1]:
+            self.fail(f"{value!r} is not LOW:HIGH with LOW below HIGH, e.g. -100:250", param, ctx)
+        return ends
+
+
+RETURNS = _Returns()
+
+
 class _Steps(click.ParamType):  # type: ignore[type-arg]
     """A number of env steps: ``250000``, ``500K`` or ``1.5M``."""
 

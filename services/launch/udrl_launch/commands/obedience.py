@@ -1,0 +1,100 @@
+"""``udrl obedience``."""
+
+import sys
+from pathlib import Path
+
+import click
+import msgspec
+
+from udrl.errors import ConfigError, StoreError
+from udrl_launch import obedience as reports
+from udrl_launch import obedience_text, pictures, tables
+from udrl_launch.agents import load_agent
+from udrl_launch.commands.options import (
+    RETURNS,
+    RUN_DIR,
+    WEIGHTS,
+    chosen_temperature,
+    version,
+)
+from udrl_launch.obedience_picture import draw
+
+_NAME = Path(reports.FILE)
+
+
+@click.command()
+@click.argument("run_dir", type=RUN_DIR)
+@click.option("--episodes", type=click.IntRange(2, 100_000), default=100, show_default=True,
+              help="Episodes for each command.")  # fmt: skip
+@click.option("--points", type=click.IntRange(2, 101), default=11, show_default=True,
+              help="Commanded returns, and commanded horizons.")  # fmt: skip
+@click.option("--desired-returns", type=RETURNS, metavar="LOW:HIGH",
+              help="Returns to command. Default: those of the replay buffer's episodes, the "
+              "lowest 5 % left out.")  # fmt: skip
+@click.option("--temperature", type=click.FloatRange(0, 1000),
+              help="Of the action distribution; 0: take its mode. Default: as the run's "
+              "evaluations.")  # fmt: skip
+@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@WEIGHTS
+@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="The picture: .png, .svg or .pdf. Default: obedience.png in RUN_DIR, where "
+              "matplotlib is installed.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the report as one JSON document.")
+def obedience(
+    run_dir: Path,
+    episodes: int,
+    points: int,
+    desired_returns: tuple[float, float] | None,
+    temperature: float | None,
+    greedy: bool,
+    weights: str,
+    output: Path | None,
+    as_json: bool,
+) -> int:
+    """Measure which returns and horizons an agent delivers when they are commanded.
+
+    Example: udrl obedience runs/mine
+    """
+    if output is not None:
+        pictures.check_name(output)
+    agent = load_agent(run_dir, version(weights))
+    plan = reports.plan_commands(
+        agent, points=points, episodes=episodes,
+        temperature=chosen_temperature(temperature, greedy=greedy),
+        desired_returns=desired_returns,
+    )  # fmt: skip
+    if sys.stderr.isatty():
+        with click.progressbar(length=plan.total, label="episodes", file=sys.stderr) as bar:
+            report = reports.measure(agent, plan, lambda: bar.update(1))
+    else:
+        report = reports.measure(agent, plan)
+    if as_json:
+        document = {
+            "run_dir": str(run_dir), "answer": obedience_text.answer(report),
+            **msgspec.to_builtins(report),
+        }  # fmt: skip
+        click.echo(msgspec.json.encode(document).decode())
+    else:
+        click.echo(obedience_text.table(report))
+    if output is not None:
+        draw(report, output)
+    for problem in _keep(run_dir, report, draws=output is None):
+        click.echo(problem, err=True)
+    return 0
+
+
+def _keep(run_dir: Path, report: reports.Obedience, *, draws: bool) -> list[str]:
+    """Write the files in the run's directory, and return what went wrong."""
+    try:
+        reports.keep(run_dir, report)
+        tables.write(
+            run_dir / _NAME.with_suffix(".csv"), obedience_text.Row, obedience_text.rows(report)
+        )
+    except (OSError, StoreError) as error:
+        return [f"the report is not kept in {run_dir}: {error}"]
+    try:
+        if draws:
+            draw(report, run_dir / _NAME.with_suffix(".png"))
+    except ConfigError as error:
+        return [f"no picture: {error}"]
+    return []

@@ -1,0 +1,309 @@
+"""What an agent can be asked for: commanded against obtained, and where the agent obeys.
+
+The report is kept in the run's directory, so that the model card and the board show it without
+measuring again. It is a function of the run: the same commands, with the same seeds, each time.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from udrl.commands import Command
+from udrl.config import Temperature
+from udrl.errors import ConfigError, InvalidData, StoreError
+from udrl.evaluation import summarise
+from udrl.obedience import (
+    Means,
+    correlation,
+    evenly,
+    mean_absolute_error,
+    mean_of_nearest,
+    obeyed,
+    spread,
+)
+from udrl.strategies import nearest
+from udrl_launch.agents import Agent, Result, evaluate_all, evaluation_commands
+from udrl_launch.tables import put
+
+#: Name of the report in a run's directory.
+FILE = "obedience.json"
+#: How far a mean obtained return may be from its command, as a share of the reachable range.
+TOLERANCE = 0.1
+
+_AtLeast0 = Annotated[float, Meta(ge=0)]
+_Count = Annotated[int, Meta(ge=1)]
+
+
+class Point(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What was obtained for one command.
+
+    Attributes:
+        desired_return: commanded.
+        desired_horizon: commanded, in steps.
+        episodes: how many were carried out.
+        return_mean: mean of their returns.
+        return_std: standard deviation of the sample.
+        return_ci95_low: lower end of the 95 % confidence interval of the mean.
+        return_ci95_high: upper end.
+        length_mean: mean of their lengths, in steps.
+        length_std: standard deviation of the sample.
+        length_ci95_low: lower end of the 95 % confidence interval of the mean.
+        length_ci95_high: upper end.
+    """
+
+    desired_return: float
+    desired_horizon: _Count
+    episodes: _Count
+    return_mean: float
+    return_std: _AtLeast0
+    return_ci95_low: float
+    return_ci95_high: float
+    length_mean: float
+    length_std: _AtLeast0
+    length_ci95_low: float
+    length_ci95_high: float
+
+
+class Agreement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How well obtained means follow commands, over a range of commands.
+
+    Attributes:
+        low: least command.
+        high: greatest command.
+        mean_absolute_error: mean over the commands of the distance of what was obtained.
+        correlation: of the commands and the means; 0 where the means do not vary.
+    """
+
+    low: float
+    high: float
+    mean_absolute_error: _AtLeast0
+    correlation: Annotated[float, Meta(ge=-1, le=1)]
+
+
+class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The report on an agent.
+
+    Attributes:
+        format: of the file.
+        run_id: the run that the agent comes from.
+        environment: Gymnasium's id.
+        weights_version: the agent's.
+        temperature: of its actions; 0: the most likely one.
+        episodes: for each command.
+        reachable_low: least return that counts as reachable (:func:`udrl.obedience.spread`).
+        reachable_high: greatest return that counts as reachable.
+        tolerance: how far a mean may be from its command, in units of the return.
+        by_return: commanded returns in increasing order, each with the horizon that belongs to it.
+        by_horizon: commanded horizons in increasing order, all with the return that evaluations
+            command; empty where horizons follow from returns, or all episodes have the same length.
+        all_returns: agreement over all of ``by_return``.
+        obeyed: agreement over the range in which the agent obeys; None: there is none.
+        all_horizons: agreement of commanded horizons and lengths, in steps; None: not measured.
+    """
+
+    format: Literal[1] = 1
+    run_id: str
+    environment: str
+    weights_version: _Count
+    temperature: Temperature
+    episodes: _Count
+    reachable_low: float
+    reachable_high: float
+    tolerance: _AtLeast0
+    by_return: Annotated[list[Point], Meta(min_length=2)]
+    by_horizon: list[Point]
+    all_returns: Agreement
+    obeyed: Agreement | None
+    all_horizons: Agreement | None
+
+    @property
+    def best(self) -> Point:
+        """The command with the highest mean return."""
+        return max(self.by_return, key=lambda point: point.return_mean)
+
+
+class Plan(NamedTuple):
+    """The commands of a report.
+
+    Attributes:
+        by_return: for each commanded return its episodes' commands.
+        by_horizon: likewise for each commanded horizon.
+        reachable: the least and the greatest return that count as reachable.
+    """
+
+    by_return: list[list[Command]]
+    by_horizon: list[list[Command]]
+    reachable: tuple[float, float]
+
+    @property
+    def total(self) -> int:
+        """How many episodes it has."""
+        return sum(map(len, self.by_return + self.by_horizon))
+
+
+def plan_commands(
+    agent: Agent,
+    *,
+    points: int,
+    episodes: int,
+    temperature: float | None = None,
+    desired_returns: tuple[float, float] | None = None,
+) -> Plan:
+    """Return the commands for a report on an agent.
+
+    Args:
+        agent: who is asked.
+        points: commanded returns, and commanded horizons; at least 2.
+        episodes: for each.
+        temperature: None: as in the run's evaluations.
+        desired_returns: the least and the greatest return to command; None: what is reachable.
+
+    Raises:
+        ConfigError: there would be one commanded return only.
+    """
+    returns = [entry.episode_return for entry in agent.buffer]
+    lengths = [entry.length for entry in agent.buffer]
+
+    def commands(desired_return: float | None, desired_horizon: int | None) -> list[Command]:
+        return evaluation_commands(
+            agent, episodes=episodes, temperature=temperature, desired_return=desired_return,
+            desired_horizon=desired_horizon,
+        )  # fmt: skip
+
+    common = spread(returns, points)
+    follows = agent.config.desired_horizon == "return"
+    by_return = [
+        commands(value, None if follows else nearest(mean_of_nearest(value, returns, lengths)))
+        for value in (evenly(*desired_returns, points) if desired_returns else common)
+    ]
+    by_return = list({told[0].desired_return: told for told in by_return}.values())
+    if len(by_return) < 2:
+        only = by_return[0][0].desired_return
+        raise ConfigError(
+            f"all returns that could be commanded are {only:g}, as those of the replay buffer are; "
+            f"name a range to command: --desired-returns LOW:HIGH"
+        )
+    horizons = [] if follows else spread(lengths, points)
+    whole = sorted({max(1, nearest(value)) for value in horizons})
+    by_horizon = [commands(None, value) for value in whole] if len(whole) > 1 else []
+    return Plan(by_return, by_horizon, (common[0], common[-1]))
+
+
+def measure(agent: Agent, plan: Plan, ended: Callable[[], object] = lambda: None) -> Obedience:
+    """Carry out a plan and return the report.
+
+    Args:
+        agent: that the plan was made for.
+        plan: its commands.
+        ended: called whenever an episode has ended.
+
+    Raises:
+        EnvironmentFault: the environment failed three times under the same command.
+    """
+    results = evaluate_all(agent, plan.by_return + plan.by_horizon, ended=ended)
+    by_return = list(map(_point, results[: len(plan.by_return)]))
+    by_horizon = list(map(_point, results[len(plan.by_return) :]))
+    low, high = plan.reachable
+    means = Means(
+        *(
+            np.array([getattr(point, name) for point in by_return])
+            for name in ("desired_return", "return_mean", "return_ci95_low", "return_ci95_high")
+        )
+    )
+    # Of a buffer whose returns are all the same no tolerance follows.
+    tolerance = TOLERANCE * (high - low or float(np.ptp(means.commanded)))
+    where = obeyed(means, tolerance)
+    lengths = [point.length_mean for point in by_horizon]
+    return Obedience(
+        run_id=agent.run_id,
+        environment=agent.config.environment,
+        weights_version=agent.version,
+        temperature=results[0].temperature,
+        episodes=len(results[0].returns),
+        reachable_low=low,
+        reachable_high=high,
+        tolerance=tolerance,
+        by_return=by_return,
+        by_horizon=by_horizon,
+        all_returns=_agreement(means.commanded.tolist(), means.mean.tolist()),
+        obeyed=None
+        if where is None
+        else _agreement(means.commanded[where].tolist(), means.mean[where].tolist()),
+        all_horizons=_agreement([float(point.desired_horizon) for point in by_horizon], lengths)
+        if by_horizon
+        else None,
+    )
+
+
+def _point(result: Result) -> Point:
+    returns, lengths = result.evaluation, summarise(result.lengths)
+    return Point(
+        desired_return=result.desired_return,
+        desired_horizon=result.desired_horizon,
+        episodes=returns.episodes,
+        return_mean=returns.mean,
+        return_std=returns.std,
+        return_ci95_low=returns.ci95_low,
+        return_ci95_high=returns.ci95_high,
+        length_mean=lengths.mean,
+        length_std=lengths.std,
+        length_ci95_low=lengths.ci95_low,
+        length_ci95_high=lengths.ci95_high,
+    )
+
+
+def _agreement(commanded: Sequence[float], obtained: Sequence[float]) -> Agreement:
+    return Agreement(
+        low=commanded[0],
+        high=commanded[-1],
+        mean_absolute_error=mean_absolute_error(commanded, obtained),
+        correlation=correlation(commanded, obtained),
+    )
+
+
+def keep(run_dir: Path, report: Obedience) -> Path:
+    """Write a report into a run's directory, and return the file.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    path = run_dir / FILE
+    try:
+        put(path, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+    except OSError as error:
+        raise StoreError(f"{path}: {error.strerror}; make the directory writable") from error
+    return path
+
+
+def kept_of(agent: Agent, run_dir: Path) -> Obedience | None:
+    """Return the report that a run's directory holds on these very weights; None: there is none.
+
+    Raises:
+        InvalidData: the file is not what :func:`keep` writes.
+    """
+    report = kept(run_dir)
+    if report is None:
+        return None
+    mine = (report.run_id, report.weights_version) == (agent.run_id, agent.version)
+    return report if mine else None
+
+
+def kept(run_dir: Path) -> Obedience | None:
+    """Return the report that a run's directory holds; None: there is none.
+
+    Raises:
+        InvalidData: the file is not what :func:`keep` writes.
+    """
+    path = run_dir / FILE
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Obedience)
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
+        raise InvalidData(
+            f"{path}: {error}; delete it, or measure again: udrl obedience {run_dir}"
+        ) from error

@@ -1,0 +1,189 @@
+"""The report on what an agent can be asked for, as text: sentences, tables, rows of a CSV file."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import msgspec
+
+from udrl_launch.obedience import TOLERANCE, Obedience, Point
+
+#: Correlation from which on means follow their commands, even if they are not what is commanded.
+_FOLLOWS = 0.8
+
+_HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "mean length", ""
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """A line of the CSV file; what it shares with :class:`Point` is described there.
+
+    Attributes:
+        sweep: what was varied.
+        obeyed: whether the command belongs to the range in which the agent obeys.
+    """
+
+    sweep: Literal["return", "horizon"]
+    desired_return: float
+    desired_horizon: int
+    episodes: int
+    return_mean: float
+    return_std: float
+    return_ci95_low: float
+    return_ci95_high: float
+    length_mean: float
+    length_std: float
+    length_ci95_low: float
+    length_ci95_high: float
+    obeyed: bool
+
+
+def rows(report: Obedience) -> Iterator[Row]:
+    """Yield the lines of the CSV file: commanded returns, then commanded horizons."""
+    for point in report.by_return:
+        yield Row(sweep="return", obeyed=is_obeyed(report, point), **_fields(point))
+    for point in report.by_horizon:
+        yield Row(sweep="horizon", obeyed=is_obeyed(report, point), **_fields(point))
+
+
+def _fields(point: Point) -> dict[str, Any]:
+    fields: dict[str, Any] = msgspec.structs.asdict(point)
+    return fields
+
+
+def is_obeyed(report: Obedience, point: Point) -> bool:
+    """Return whether a command belongs to the range in which the agent obeys."""
+    found = report.obeyed
+    return found is not None and found.low <= point.desired_return <= found.high
+
+
+def answer(report: Obedience) -> str:
+    """Return the sentence that says which returns can be commanded."""
+    every, found = report.all_returns, report.obeyed
+    error = _number(report)
+    if found is not None:
+        whole = (found.low, found.high) == (every.low, every.high)
+        outside = (
+            "These are all that were measured."
+            if whole
+            else "Outside this range, do not expect the commanded return."
+        )
+        return (
+            f"Command returns between {_exact(found.low)} and {_exact(found.high)}; mean absolute "
+            f"error {error(found.mean_absolute_error)}, correlation {found.correlation:.2f}. "
+            f"{outside}"
+        )
+    means = [point.return_mean for point in report.by_return]
+    varies = max(means) - min(means)
+    over = f"commands from {_exact(every.low)} to {_exact(every.high)}"
+    if every.correlation >= _FOLLOWS and varies > report.tolerance:
+        return (
+            f"Do not expect the return that you command: over {over} the mean obtained returns "
+            f"rise from {error(means[0])} to {error(means[-1])} (correlation "
+            f"{every.correlation:.2f}), with a mean absolute error of "
+            f"{error(every.mean_absolute_error)}."
+        )
+    return (
+        f"This agent does not follow its command: mean obtained returns vary by {error(varies)} "
+        f"over {over} (correlation {every.correlation:.2f})."
+    )
+
+
+def best(report: Obedience) -> str:
+    """Return the sentence that says what to command for the most."""
+    point, number = report.best, _number(report)
+    return (
+        f"Highest mean return: {number(point.return_mean)} (95 % interval "
+        f"{number(point.return_ci95_low)} to {number(point.return_ci95_high)}), commanded "
+        f"{_exact(point.desired_return)} within {point.desired_horizon} steps."
+    )
+
+
+def horizons(report: Obedience) -> str:
+    """Return the sentence about commanded horizons; empty: none were measured."""
+    found = report.all_horizons
+    if found is None:
+        return ""
+    lengths = [point.length_mean for point in report.by_horizon]
+    return (
+        f"Horizons from {found.low:.0f} to {found.high:.0f} steps, commanded with a return of "
+        f"{_number(report)(report.by_horizon[0].desired_return)}: mean lengths from "
+        f"{min(lengths):.0f} to {max(lengths):.0f} steps, mean absolute error "
+        f"{found.mean_absolute_error:.0f}, correlation {found.correlation:.2f}."
+    )
+
+
+def rule(report: Obedience) -> str:
+    """Return the sentence that says when a command counts as obeyed."""
+    return (
+        f"Obeyed: the mean lies within {_number(report)(report.tolerance)} of the command "
+        f"({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns), and increases "
+        f"with it."
+    )
+
+
+def about(report: Obedience) -> str:
+    """Return the sentence that says how it was measured."""
+    return (
+        f"{report.environment}, weights version {report.weights_version}, temperature "
+        f"{report.temperature:g}, {report.episodes} episodes for each command."
+    )
+
+
+def table(report: Obedience) -> str:
+    """Return the whole report for a terminal; it ends with the answer."""
+    cells = [list(_HEAD), *_cells(report, report.by_return)]
+    if report.by_horizon:
+        cells += [[""], *_cells(report, report.by_horizon)]
+    cells = [row + [""] * (len(_HEAD) - len(row)) for row in cells]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = [
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
+    said = [about(report), rule(report), horizons(report), best(report), answer(report)]
+    return "\n".join([said[0], "", *lines, "", *filter(None, said[1:])])
+
+
+def markdown(report: Obedience) -> str:
+    """Return the report for a model card."""
+    lines = ["| " + " | ".join(_HEAD) + " |", "|" + "---:|" * len(_HEAD)]
+    lines += ["| " + " | ".join(row) + " |" for row in _cells(report, report.by_return)]
+    said = [horizons(report), best(report)]
+    return "\n\n".join(
+        [f"**{answer(report)}**", "\n".join(lines), f"{about(report)} {rule(report)}",
+         " ".join(filter(None, said))]
+    )  # fmt: skip
+
+
+def _cells(report: Obedience, points: Sequence[Point]) -> Iterator[list[str]]:
+    number = _number(report)
+    varied = points is report.by_return
+    for point in points:
+        yield [
+            _exact(point.desired_return) if varied else number(point.desired_return),
+            str(point.desired_horizon),
+            number(point.return_mean),
+            f"{number(point.return_ci95_low)} to {number(point.return_ci95_high)}",
+            f"{point.length_mean:.0f}",
+            "obeyed" if varied and is_obeyed(report, point) else "",
+        ]
+
+
+def _exact(value: float) -> str:
+    """Return a commanded return as it is; they are round (:func:`udrl.obedience.evenly`)."""
+    return f"{value:.10g}"
+
+
+class _Number:
+    """Numbers with as many digits as tell returns of a report apart: a tenth of the tolerance."""
+
+    def __init__(self, report: Obedience) -> None:
+        tolerance = report.tolerance
+        self._digits = max(0, 1 - math.floor(math.log10(tolerance))) if tolerance > 0 else 1
+
+    def __call__(self, value: float) -> str:
+        return f"{round(value, self._digits) + 0.0:.{self._digits}f}"
+
+
+def _number(report: Obedience) -> _Number:
+    return _Number(report)

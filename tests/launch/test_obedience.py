@@ -1,0 +1,166 @@
+"""The report on what an agent can be asked for: what it says, keeps and refuses."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import click
+import msgspec
+import pytest
+
+from udrl.errors import ConfigError, InvalidData, StoreError
+from udrl_launch import tables
+from udrl_launch.commands.options import RETURNS
+from udrl_launch.obedience import FILE, Agreement, Obedience, Point, keep, kept
+from udrl_launch.obedience_picture import draw
+from udrl_launch.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
+
+
+def point(desired_return: float, desired_horizon: int, mean: float, length: float = 50) -> Point:
+    return Point(
+        desired_return=desired_return, desired_horizon=desired_horizon, episodes=10,
+        return_mean=mean, return_std=3.0, return_ci95_low=mean - 2, return_ci95_high=mean + 2,
+        length_mean=length, length_std=1.0, length_ci95_low=length - 1, length_ci95_high=length + 1,
+    )  # fmt: skip
+
+
+def report(
+    obtained: Callable[[float], float] = lambda r: r,
+    obeyed: tuple[float, float] | None = None,
+    correlation: float = 0.5,
+    tolerance: float = 20.0,
+) -> Obedience:
+    commanded = [-20.0, 30.0, 80.0, 130.0]
+    agree = {"mean_absolute_error": 7.25, "correlation": correlation}
+    return Obedience(
+        run_id="run", environment="Some-v0", weights_version=7, temperature=1.0, episodes=10,
+        reachable_low=-20.0, reachable_high=180.0, tolerance=tolerance,
+        by_return=[point(r, 40 + i, obtained(r)) for i, r in enumerate(commanded)],
+        by_horizon=[point(100.0, h, 90.0, h + 5) for h in (10, 20)],
+        all_returns=Agreement(low=-20.0, high=130.0, **agree),
+        obeyed=None if obeyed is None else Agreement(low=obeyed[0], high=obeyed[1], **agree),
+        all_horizons=Agreement(low=10, high=20, mean_absolute_error=5, correlation=1),
+    )  # fmt: skip
+
+
+def test_the_answer_where_an_agent_obeys_in_part() -> None:
+    assert answer(report(obeyed=(30.0, 80.0), correlation=0.97)) == (
+        "Command returns between 30 and 80; mean absolute error 7, correlation 0.97. "
+        "Outside this range, do not expect the commanded return."
+    )
+
+
+def test_the_answer_where_it_obeys_everywhere() -> None:
+    assert answer(report(obeyed=(-20.0, 130.0), tolerance=4.0)) == (
+        "Command returns between -20 and 130; mean absolute error 7.2, correlation 0.50. "
+        "These are all that were measured."
+    )
+
+
+def test_the_answer_where_it_follows_from_afar() -> None:
+    assert answer(report(lambda r: r / 2 - 100, correlation=0.99)) == (
+        "Do not expect the return that you command: over commands from -20 to 130 the mean "
+        "obtained returns rise from -110 to -35 (correlation 0.99), with a mean absolute error "
+        "of 7."
+    )
+
+
+@pytest.mark.parametrize("correlation", [0.1, 0.99])
+def test_the_answer_where_it_does_not_follow(correlation: float) -> None:
+    """A correlation without differences that matter is not following either."""
+    assert answer(report(lambda r: 60 + r / 50, correlation=correlation)) == (
+        "This agent does not follow its command: mean obtained returns vary by 3 over commands "
+        f"from -20 to 130 (correlation {correlation:.2f})."
+    )
+
+
+def test_the_other_sentences() -> None:
+    told = report(lambda r: 100 - abs(r - 80))
+    assert best(told) == (
+        "Highest mean return: 100 (95 % interval 98 to 102), commanded 80 within 42 steps."
+    )
+    assert horizons(told) == (
+        "Horizons from 10 to 20 steps, commanded with a return of 100: mean lengths from 15 to 25 "
+        "steps, mean absolute error 5, correlation 1.00."
+    )
+    assert horizons(msgspec.structs.replace(told, by_horizon=[], all_horizons=None)) == ""
+    assert rule(told).startswith("Obeyed: the mean lies within 20 of the command (10 % of")
+
+
+def test_the_table_ends_with_the_answer() -> None:
+    told = report(obeyed=(30.0, 80.0))
+    lines = table(told).splitlines()
+    assert lines[0].startswith("Some-v0, weights version 7, temperature 1, 10 episodes")
+    assert [line.split() for line in lines[3:5]] == [
+        ["-20", "40", "-20", "-22", "to", "-18", "50"],
+        ["30", "41", "30", "28", "to", "32", "50", "obeyed"],
+    ]
+    assert sum(line.endswith("obeyed") for line in lines) == 2
+    assert lines[-1] == answer(told)
+
+
+def test_a_card_has_the_table_and_begins_with_the_answer() -> None:
+    told = report(obeyed=(30.0, 80.0))
+    text = markdown(told)
+    assert text.startswith(f"**{answer(told)}**\n\n| desired return |")
+    assert "| 30 | 41 | 30 | 28 to 32 | 50 | obeyed |" in text
+    bars = {line.count("|") for line in text.splitlines() if line.startswith("|")}
+    assert bars == {7}
+
+
+def test_the_csv_file_has_every_point(tmp_path: Path) -> None:
+    told = report(obeyed=(30.0, 80.0))
+    tables.write(tmp_path / "obedience.csv", Row, rows(told))
+    with (tmp_path / "obedience.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [row["sweep"] for row in found] == ["return"] * 4 + ["horizon"] * 2
+    assert [row["obeyed"] for row in found] == ["False", "True", "True", "False"] + ["False"] * 2
+    shared = [f.name for f in msgspec.structs.fields(Point)]
+    for row, measured in zip(found, told.by_return + told.by_horizon, strict=True):
+        assert [float(row[name]) for name in shared] == list(msgspec.structs.astuple(measured))
+
+
+@pytest.mark.parametrize("obeyed", [None, (30.0, 80.0)])
+def test_the_picture_shows_the_range(tmp_path: Path, obeyed: tuple[float, float] | None) -> None:
+    told = report(obeyed=obeyed)
+    for name in ("both.svg", "one.png", "one.pdf"):
+        draw(told, tmp_path / "pictures" / name)
+        told = msgspec.structs.replace(told, by_horizon=[], all_horizons=None)
+    ElementTree.fromstring((tmp_path / "pictures" / "both.svg").read_text())
+    assert (tmp_path / "pictures" / "one.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
+        draw(told, tmp_path / "picture.bmp")
+
+
+def test_what_is_kept_is_read(tmp_path: Path) -> None:
+    assert kept(tmp_path) is None
+    for told in (report(), report(obeyed=(30.0, 80.0))):
+        assert keep(tmp_path, told) == tmp_path / FILE
+        assert kept(tmp_path) == told
+    with pytest.raises(StoreError, match="make the directory writable"):
+        keep(tmp_path / "nowhere", report())
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [b"", b"\xff", b"[]", b'{"format": 1}', b'"format": 2', b'"tolerance": null',
+     b'"correlation": 7', b'"surplus": 1, "format": 1'],
+)  # fmt: skip
+def test_a_report_that_nobody_wrote(tmp_path: Path, damage: bytes) -> None:
+    written = keep(tmp_path, report()).read_bytes()
+    if damage.startswith(b'"'):
+        name = damage.split(b":")[0] if b"surplus" not in damage else b'"format"'
+        old = next(line for line in written.splitlines() if line.strip().startswith(name))
+        damage = written.replace(old.strip().rstrip(b","), damage)
+        assert damage != written
+    (tmp_path / FILE).write_bytes(damage)
+    with pytest.raises(InvalidData, match=r"obedience\.json: .*measure again: udrl obedience"):
+        kept(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "5", "1:1", "2:1", "a:2", "1:nan", "1:2:3", "1e12:2e12"])
+def test_ranges_of_returns_that_are_none(text: str) -> None:
+    with pytest.raises(click.BadParameter, match=r"is not (LOW:HIGH|a number)"):
+        RETURNS.convert(text, None, None)
+    assert RETURNS.convert("-100:2.5", None, None) == (-100.0, 2.5)
