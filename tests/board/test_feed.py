@@ -8,9 +8,10 @@ import pytest
 
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
-from udrl.errors import Unreachable
+from udrl.errors import InvalidData, Unreachable
 from udrl_board.feed import FRESH_S, Feed
 from udrl_board.source import Place
+from udrl_launch.obedience import Agreement, Obedience, Point
 from udrl_proto.messages import (
     Contents,
     EvaluationStatus,
@@ -52,6 +53,7 @@ class Told:
         self.asked: Counter[str] = Counter()
         self.is_gone = False
         self.is_doubtful = False
+        self.report: Obedience | InvalidData | None = None
 
     def _ask(self, what: str) -> None:
         self.asked[what] += 1
@@ -94,6 +96,11 @@ class Told:
 
     def weights(self, version: object) -> Weights:
         raise AssertionError("a feed needs no weights")
+
+    def obedience(self) -> Obedience | None:
+        if isinstance(self.report, InvalidData):
+            raise self.report
+        return self.report
 
     def close(self) -> None:
         pass
@@ -206,3 +213,39 @@ def test_a_run_that_came_back_from_a_backup_is_told_anew(
     news = feed.news(4, "run")
     assert news.hello == HELLO
     assert [i.iteration for i in news.iterations] == [0, 1, 2]
+
+
+def report(run_id: str = "run", *, obeys: bool) -> Obedience:
+    every = Agreement(low=0.0, high=4.0, mean_absolute_error=0.1, correlation=0.5)
+    numbers: dict[str, float] = dict.fromkeys(Point.__struct_fields__, 1)
+    points = [Point(**numbers | {"desired_return": r}) for r in (0.0, 4.0)]  # type: ignore[arg-type]
+    return Obedience(
+        run_id=run_id, environment="CartPole-v1", weights_version=3, temperature=1.0, episodes=1,
+        reachable_low=0.0, reachable_high=4.0, tolerance=0.4, by_return=points, by_horizon=[],
+        all_returns=every, obeyed=every if obeys else None, all_horizons=None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_what_the_agent_obeys_is_told(run: Told, clock: Clock, obeys: bool) -> None:
+    feed = Feed(run, clock)
+    assert feed.news().obeyed is None
+    run.report = report(obeys=obeys)
+    clock.now += FRESH_S
+    found = feed.news(after=4, run_id="run").obeyed
+    assert found is not None
+    assert (found.low, found.high) == ((0.0, 4.0) if obeys else (None, None))
+    assert found.weights_version == 3
+    assert found.answer.startswith("Command returns between 0 and 4" if obeys else "This agent")
+    run.report = report("of another run", obeys=obeys)
+    clock.now += FRESH_S
+    assert feed.news().obeyed is None
+
+
+def test_a_damaged_report_hides_nothing_else(run: Told, clock: Clock) -> None:
+    run.report = InvalidData("obedience.json: damaged; delete it")
+    news = Feed(run, clock).news()
+    assert news.problem == "obedience.json: damaged; delete it"
+    assert news.status is not None
+    assert news.contents is not None
+    assert news.obeyed is None

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 from collections.abc import Callable, Iterator
@@ -26,6 +27,8 @@ from udrl_launch.address import Address
 from udrl_launch.agents import load_agent
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import read_status
+from udrl_launch.obedience import keep, measure, plan_commands
+from udrl_launch.obedience_text import summary
 from udrl_launch.roles import ENDPOINT_FILE
 from udrl_proto.messages import Status
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
@@ -64,6 +67,16 @@ def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
     assert len(news["contents"]["returns"]) >= status.buffer.episodes
     known: dict[str, str | int] = {"after": status.iteration, "run": status.run_id}
     assert client.get("/news", params=known).json()["iterations"] == []
+
+
+def test_news_of_what_the_agent_obeys(ended_run: Path, tmp_path: Path) -> None:
+    run_dir = Path(shutil.copytree(ended_run, tmp_path / "run"))
+    agent = load_agent(run_dir)
+    report = measure(agent, plan_commands(agent, points=2, episodes=2))
+    keep(run_dir, report)
+    with page(run_dir) as client:
+        found = client.get("/news").json()["obeyed"]
+    assert (found["answer"], found["weights_version"]) == (summary(report), agent.version)
 
 
 @pytest.mark.parametrize("after", ["x", "1.5", "--1", "9" * 40])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -17,7 +18,10 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from test_take_cover import TAKE_COVER
 from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
+from udrl_launch.agents import load_agent
 from udrl_launch.inspection import read_status
+from udrl_launch.obedience import keep, measure, plan_commands
+from udrl_launch.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status
@@ -299,6 +303,32 @@ def test_the_map_is_clicked_and_says_what_was_never_seen(
     ]
     assert chosen[0] < min(seen["returns"])
     assert chosen[1] >= max(seen["lengths"])
+
+
+def test_the_map_shows_which_returns_the_agent_obeys(
+    board: Callable[..., str], pages: Callable[..., Page], obedient: Path, tmp_path: Path
+) -> None:
+    run_dir = Path(shutil.copytree(obedient, tmp_path / "run"))
+    page = pages(board(run_dir))
+    said, shaded = page.locator("#obeys"), page.locator("#map rect.obeys")
+    expect(said).to_contain_text(f"udrl obedience {run_dir}", timeout=SOON)
+    expect(shaded).to_have_count(0)
+    agent = load_agent(run_dir)
+    report = measure(agent, plan_commands(agent, points=5, episodes=20, temperature=0.0))
+    keep(run_dir, report)
+    expect(said).to_have_text(summary(report), timeout=SOON)
+    expect(said).to_contain_text("Command returns between 0 and 4")
+    expect(shaded).to_have_count(1)
+    left, right = shaded.bounding_box(), page.locator("#map svg").bounding_box()
+    assert left is not None
+    assert right is not None
+    assert 0.5 * right["width"] < left["width"] < right["width"]
+    latest = report.weights_version
+    keep(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
+    expect(said).to_contain_text(
+        f"Measured with weights version {latest - 1}; the latest are {latest}.", timeout=SOON
+    )
+    expect(shaded).to_have_count(0)
 
 
 def test_the_server_dies_and_comes_back(

@@ -8,8 +8,10 @@ from typing import TypeVar
 import msgspec
 
 import udrl
-from udrl.errors import UdrlError
+from udrl.errors import InvalidData, UdrlError
 from udrl_board.source import Place, Source
+from udrl_launch.obedience import Obedience
+from udrl_launch.obedience_text import summary
 from udrl_proto.messages import Contents, EvaluationStatus, Hello, IterationStatus, Status
 
 #: Seconds that an answer is good for.
@@ -18,6 +20,33 @@ FRESH_S = 1.0
 _PAGES = 20
 
 Answer = TypeVar("Answer")
+
+
+class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
+    """What ``udrl obedience`` found.
+
+    Attributes:
+        low: least return of the range in which the agent obeys; None: there is no such range.
+        high: greatest return of it; likewise.
+        answer: in two sentences: what can be commanded, and what to command for the most.
+        weights_version: of the agent that was measured.
+    """
+
+    low: float | None
+    high: float | None
+    answer: str
+    weights_version: int
+
+    @classmethod
+    def of(cls, report: Obedience) -> "Obeyed":
+        """Return what the page shows of a report."""
+        found = report.obeyed
+        return cls(
+            low=None if found is None else found.low,
+            high=None if found is None else found.high,
+            answer=summary(report),
+            weights_version=report.weights_version,
+        )
 
 
 class News(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,6 +60,7 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
         iterations: completed after the one that the page named.
         evaluations: made in these.
         contents: the replay buffer; None: the page has it.
+        obeyed: what ``udrl obedience`` found; None: it was not run.
         problem: why something cannot be said now, or may be of an earlier moment; empty: nothing
             is wrong.
     """
@@ -42,6 +72,7 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
     iterations: list[IterationStatus]
     evaluations: list[EvaluationStatus]
     contents: Contents | None
+    obeyed: Obeyed | None
     problem: str
 
 
@@ -63,6 +94,7 @@ class Feed:
         self._contents: Contents | None = None
         self._iterations: list[IterationStatus] = []
         self._evaluations: list[EvaluationStatus] = []
+        self._obeyed: Obeyed | None = None
         self._place = source.place()
         self._problem = ""
 
@@ -92,6 +124,7 @@ class Feed:
                 contents=contents
                 if contents and (not first or contents.iteration > after)
                 else None,
+                obeyed=self._obeyed,
                 problem=self._problem,
             )
 
@@ -114,6 +147,12 @@ class Feed:
             if known is None or not known.returns or known.iteration < self._status.iteration:
                 self._contents = self.source.contents()
             self._place, self._problem = self.source.place(), self.source.doubt()
+            self._obeyed = None
+            report = self.source.obedience()
+            if report is not None and report.run_id == self._status.run_id:
+                self._obeyed = Obeyed.of(report)
+        except InvalidData as error:  # all else is known
+            self._problem = str(error)
         except UdrlError as error:
             self._status = None
             self._problem = str(error)

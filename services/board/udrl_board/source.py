@@ -14,6 +14,7 @@ from udrl.errors import ConfigError, PeerError, Refused, Unreachable
 from udrl_launch.address import Address, connected
 from udrl_launch.agents import load_agent
 from udrl_launch.inspection import read_run, read_status, served_at
+from udrl_launch.obedience import Obedience, kept
 from udrl_proto import keys
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST
@@ -85,6 +86,10 @@ class Source(Protocol):
         """Return a weights version that is kept."""
         ...
 
+    def obedience(self) -> Obedience | None:
+        """Return the report of ``udrl obedience`` on the run; None: there is none here."""
+        ...
+
     def close(self) -> None:
         """Let go of what is held."""
         ...
@@ -131,6 +136,10 @@ class Stored:
         """Return a weights version that is kept."""
         agent = load_agent(self._run_dir, version)
         return Weights(version=agent.version, weights=agent.weights)
+
+    def obedience(self) -> Obedience | None:
+        """Return the report that its directory holds."""
+        return kept(self._run_dir)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -179,6 +188,10 @@ class Served:
         """Return a weights version that is kept."""
         request = WeightsRequest(version=version)
         return self._ask(lambda asker: asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
+
+    def obedience(self) -> Obedience | None:
+        """Return nothing: it is in the run's directory, which may be on another machine."""
+        return None
 
     def close(self) -> None:
         """Leave the run's router."""
@@ -253,6 +266,10 @@ class Directory:
     def weights(self, version: Wanted) -> Weights:
         """Return a weights version that is kept."""
         return self._ask(lambda source: source.weights(version))
+
+    def obedience(self) -> Obedience | None:
+        """Return the report that its directory holds."""
+        return self._stored.obedience()
 
     def close(self) -> None:
         """Leave the run's router."""

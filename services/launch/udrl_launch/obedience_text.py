@@ -98,6 +98,11 @@ def best(report: Obedience) -> str:
     )
 
 
+def summary(report: Obedience) -> str:
+    """Return the answer, and what to command for the most."""
+    return f"{answer(report)} {best(report)}"
+
+
 def horizons(report: Obedience) -> str:
     """Return the sentence about commanded horizons; empty: none were measured."""
     found = report.all_horizons

@@ -8,7 +8,7 @@ const EVERY_MS = 1000;
 // The board waits for a replay service that hangs, and says so; it must not be given up before.
 const LONGEST_MS = 20_000;
 
-const known = { place: {}, hello: null, status: null, iterations: [], evaluations: [], contents: null };
+const known = { place: {}, hello: null, status: null, iterations: [], evaluations: [], contents: null, obeyed: null };
 
 const curve = new Chart($("curve"), $("curve-said"), [
   { colour: "evaluation", width: 2, points: true },
@@ -45,6 +45,7 @@ function commands() {
   return {
     run_dir: directory,
     service: (role) => `udrl ${role} --connect ${endpoint || "ENDPOINT"}${keys}`,
+    obedience: `udrl obedience ${directory}`,
     resume: (more = "") => `udrl train ${word(env)} --run-dir ${directory} --resume${more}${keys}`,
   };
 }
@@ -168,6 +169,16 @@ function showContents(contents) {
     `Evaluations ask for ${number(contents.desired_return)} within ${number(contents.desired_horizon)} steps (M, large cross; S = ${number(contents.return_std)}); outstanding exploratory commands: ${asked.length}.`;
 }
 
+function showObeyed() {
+  const { obeyed, status } = known;
+  if (!status?.weights_version) return;
+  const others = obeyed && obeyed.weights_version !== status.weights_version;
+  const said = obeyed
+    ? obeyed.answer + (others ? ` Measured with weights version ${obeyed.weights_version}; the latest are ${status.weights_version}.` : "")
+    : `Measure which returns the agent delivers when they are commanded: ${commands().obedience}`;
+  if ($("obeys").textContent !== said) $("obeys").textContent = said;
+}
+
 async function ask() {
   const after = known.iterations.at(-1)?.iteration ?? -1;
   const run = encodeURIComponent(known.hello?.run_id ?? "");
@@ -181,10 +192,11 @@ async function ask() {
   const ended = news.status?.state !== known.status?.state;
   if (news.status) showStatus((known.status = news.status));
   if (news.hello || news.iterations.length || ended) showHistory();
-  if (news.contents) {
-    showContents((known.contents = news.contents));
-    command.know(known);
-  }
+  const measured = JSON.stringify(news.obeyed) !== JSON.stringify(known.obeyed);
+  known.obeyed = news.obeyed;
+  if (news.contents) showContents((known.contents = news.contents));
+  if (known.contents && (news.contents || measured)) command.know(known);
+  showObeyed();
   $("about").textContent = `udrl ${news.software}`;
   const why = news.status?.problem.replace("RUN_DIR", commands().run_dir);
   problem([news.problem, why].filter(Boolean).join(" "));

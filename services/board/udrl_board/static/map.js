@@ -105,6 +105,12 @@ export class Plane {
     if (x != null && this.xs) this.cross(x, y, name, size);
   }
 
+  // A range of the horizontal axis, as far as it is in the picture.
+  band(low, high, name) {
+    const [a, b] = [this.x(bounded(low, this.xs)), this.x(bounded(high, this.xs))];
+    this.svg.append(element("rect", { class: name, x: a, y: TOP, width: b - a, height: this.height - BOTTOM - TOP }));
+  }
+
   line(x1, y1, x2, y2, name) {
     this.svg.append(element("line", { class: name, x1: this.x(x1), y1: this.y(y1), x2: this.x(x2), y2: this.y(y2) }));
   }

@@ -40,7 +40,7 @@ export class Command {
   }
 
   // What the run says of the buffer: fields, sliders and map follow.
-  know({ hello, contents }) {
+  know({ hello, contents, obeyed }) {
     if (!contents.returns.length) return;
     const first = !this.contents;
     this.contents = contents;
@@ -58,6 +58,7 @@ export class Command {
     this.map.draw(() => {
       this.map.axes(xs, ys);
       this.seen.shade(this.map);
+      if (obeyed && obeyed.low !== null) this.map.band(obeyed.low, obeyed.high, "obeys");
       contents.returns.forEach((x, i) => this.map.dot(x, contents.lengths[i], { class: "episode", opacity: 0.5, r: 2 }));
     });
     if (first) this.fill(contents.desired_return, contents.desired_horizon);
