@@ -78,6 +78,20 @@ def test_one_document_and_the_same_each_time(run_dir: Path) -> None:
     assert (run_dir / "obedience.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_tolerance_of_ones_own(obedient: Path) -> None:
+    agent = load_agent(obedient)
+    plan = plan_commands(agent, points=5, episodes=10, temperature=0.0)
+    # All commands are obeyed to the bit, and none is beyond itself.
+    exact = measure(agent, plan, 0.0)
+    assert exact.tolerance == 0.0
+    assert exact.obeyed is not None
+    assert (exact.obeyed.low, exact.obeyed.mean_absolute_error) == (0.0, 0.0)
+    call("obedience", obedient, "--episodes", 2, "--points", 5, "--tolerance", 1.5)
+    report = kept(obedient)
+    assert report is not None
+    assert report.tolerance == 1.5
+
+
 def test_every_point_is_what_evaluate_says(run_dir: Path) -> None:
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=3, episodes=4, temperature=0.5))

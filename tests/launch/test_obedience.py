@@ -60,9 +60,8 @@ def test_the_answer_where_it_obeys_everywhere() -> None:
 
 def test_the_answer_where_it_follows_from_afar() -> None:
     assert answer(report(lambda r: r / 2 - 100, correlation=0.99)) == (
-        "Do not expect the return that you command: over commands from -20 to 130 the mean "
-        "obtained returns rise from -110 to -35 (correlation 0.99), with a mean absolute error "
-        "of 7."
+        "Higher commands obtain more, but not what is commanded: commands from -20 to 130 obtain "
+        "-110 to -35 on average; mean absolute error 7, correlation 0.99."
     )
 
 
@@ -86,6 +85,9 @@ def test_the_other_sentences() -> None:
     )
     assert horizons(msgspec.structs.replace(told, by_horizon=[], all_horizons=None)) == ""
     assert rule(told).startswith("Obeyed: the mean lies within 20 of the command (10 % of")
+    assert rule(report(tolerance=30.0)) == (
+        "Obeyed: the mean lies within 30 of the command, and increases with it."
+    )
 
 
 def test_the_table_ends_with_the_answer() -> None:

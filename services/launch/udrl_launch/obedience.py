@@ -31,7 +31,8 @@ from udrl_launch.tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
-#: How far a mean obtained return may be from its command, as a share of the reachable range.
+#: How far a mean obtained return may be from its command, as a share of the reachable range, where
+#: nothing else is wanted.
 TOLERANCE = 0.1
 
 _AtLeast0 = Annotated[float, Meta(ge=0)]
@@ -193,12 +194,19 @@ def plan_commands(
     return Plan(by_return, by_horizon, (common[0], common[-1]))
 
 
-def measure(agent: Agent, plan: Plan, ended: Callable[[], object] = lambda: None) -> Obedience:
+def measure(
+    agent: Agent,
+    plan: Plan,
+    tolerance: float | None = None,
+    ended: Callable[[], object] = lambda: None,
+) -> Obedience:
     """Carry out a plan and return the report.
 
     Args:
         agent: that the plan was made for.
         plan: its commands.
+        tolerance: how far a mean may be from its command, in units of the return; None:
+            :data:`TOLERANCE` of the reachable range.
         ended: called whenever an episode has ended.
 
     Raises:
@@ -215,7 +223,8 @@ def measure(agent: Agent, plan: Plan, ended: Callable[[], object] = lambda: None
         )
     )
     # Of a buffer whose returns are all the same no tolerance follows.
-    tolerance = TOLERANCE * (high - low or float(np.ptp(means.commanded)))
+    if tolerance is None:
+        tolerance = TOLERANCE * (high - low or float(np.ptp(means.commanded)))
     where = obeyed(means, tolerance)
     lengths = [point.length_mean for point in by_horizon]
     return Obedience(

@@ -77,10 +77,9 @@ def answer(report: Obedience) -> str:
     over = f"commands from {_exact(every.low)} to {_exact(every.high)}"
     if every.correlation >= _FOLLOWS and varies > report.tolerance:
         return (
-            f"Do not expect the return that you command: over {over} the mean obtained returns "
-            f"rise from {error(means[0])} to {error(means[-1])} (correlation "
-            f"{every.correlation:.2f}), with a mean absolute error of "
-            f"{error(every.mean_absolute_error)}."
+            f"Higher commands obtain more, but not what is commanded: {over} obtain "
+            f"{error(means[0])} to {error(means[-1])} on average; mean absolute error "
+            f"{error(every.mean_absolute_error)}, correlation {every.correlation:.2f}."
         )
     return (
         f"This agent does not follow its command: mean obtained returns vary by {error(varies)} "
@@ -119,10 +118,11 @@ def horizons(report: Obedience) -> str:
 
 def rule(report: Obedience) -> str:
     """Return the sentence that says when a command counts as obeyed."""
+    usual = TOLERANCE * (report.reachable_high - report.reachable_low)
+    share = f" ({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns)"
     return (
-        f"Obeyed: the mean lies within {_number(report)(report.tolerance)} of the command "
-        f"({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns), and increases "
-        f"with it."
+        f"Obeyed: the mean lies within {_number(report)(report.tolerance)} of the command"
+        f"{share if math.isclose(report.tolerance, usual) else ''}, and increases with it."
     )
 
 

@@ -31,6 +31,9 @@ _NAME = Path(reports.FILE)
 @click.option("--desired-returns", type=RETURNS, metavar="LOW:HIGH",
               help="Returns to command. Default: those of the replay buffer's episodes, the "
               "lowest 5 % left out.")  # fmt: skip
+@click.option("--tolerance", type=click.FloatRange(0, 1e9),
+              help="How far a mean obtained return may be from its command where the agent obeys. "
+              "Default: 10 % of the range of the replay buffer's returns.")  # fmt: skip
 @click.option("--temperature", type=click.FloatRange(0, 1000),
               help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip
@@ -45,6 +48,7 @@ def obedience(
     episodes: int,
     points: int,
     desired_returns: tuple[float, float] | None,
+    tolerance: float | None,
     temperature: float | None,
     greedy: bool,
     weights: str,
@@ -65,9 +69,9 @@ def obedience(
     )  # fmt: skip
     if sys.stderr.isatty():
         with click.progressbar(length=plan.total, label="episodes", file=sys.stderr) as bar:
-            report = reports.measure(agent, plan, lambda: bar.update(1))
+            report = reports.measure(agent, plan, tolerance, lambda: bar.update(1))
     else:
-        report = reports.measure(agent, plan)
+        report = reports.measure(agent, plan, tolerance)
     if as_json:
         document = {
             "run_dir": str(run_dir), "answer": obedience_text.answer(report),
