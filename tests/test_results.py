@@ -1,4 +1,4 @@
-"""What the results page shows is made of the tables that lie beside it."""
+"""What the pages of results show is made of the tables that lie beside them."""
 
 import re
 from pathlib import Path
@@ -47,8 +47,9 @@ def test_sensitivity_has_100_episodes_a_point(table: Path) -> None:
     assert all(f"seed {seed}" in picture for seed in seeds)
 
 
-def test_the_page_shows_what_lies_there_and_the_other_way_round() -> None:
-    shown = set(re.findall(r"\(results/([^)#]+)\)", text_of("docs/results.md")))
+def test_the_pages_show_what_lies_there_and_the_other_way_round() -> None:
+    text = text_of("docs/results.md") + text_of("docs/experiments.md")
+    shown = set(re.findall(r"\(results/([^)#]+)\)", text))
     lie = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*.*") if path.is_file()}
     pictures = {one for one in lie if one.endswith((".png", ".gif"))}
     assert shown <= lie
