@@ -141,8 +141,9 @@ class EpisodeGenerator:
         self._behaviors: list[BehaviorFunction | None] = [None] * n_environments
         self._calls: list[_Call] | None = None
         self._greedy: list[int] = []
-        # The round from which on a row's action is held, and how many rows have one.
-        self._hold_at = np.full(n_environments, _NEVER)
+        # The rounds from and before which a row's action is held, and how many rows have such.
+        self._hold_from = np.full(n_environments, _NEVER)
+        self._hold_until = np.full(n_environments, _NEVER)
         self._n_holding = 0
 
         # What the network reads in one call. See training._Batch for why torch owns it.
@@ -219,8 +220,9 @@ class EpisodeGenerator:
             self._cap[row] = self.spec.max_return
         self._logits[row] = 0.0
         self._began[row] = self._round
-        if command.hold_from is not None:
-            self._hold_at[row] = self._round + command.hold_from
+        if command.hold_steps:
+            self._hold_from[row] = self._round + command.hold_from
+            self._hold_until[row] = self._hold_from[row] + command.hold_steps
             self._n_holding += 1
         self._lay_out_uniforms(row, command)
         return None
@@ -284,7 +286,7 @@ class EpisodeGenerator:
         if self._greedy:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
         if self._n_holding:
-            held = self._hold_at <= self._round
+            held = (self._hold_from <= self._round) & (self._round < self._hold_until)
             actions[held] = (uniforms[held] * logits.shape[1]).astype(np.int64)
         return actions
 
@@ -336,8 +338,8 @@ class EpisodeGenerator:
         self._commands[row] = self._behaviors[row] = self._calls = None
         if row in self._greedy:
             self._greedy.remove(row)
-        if self._hold_at[row] != _NEVER:
-            self._hold_at[row] = _NEVER
+        if self._hold_from[row] != _NEVER:
+            self._hold_from[row] = _NEVER
             self._n_holding -= 1
         self._reward[row] = self._desired[row] = 0.0
 
@@ -356,14 +358,15 @@ class EpisodeGenerator:
         """Put number t of the command's stream where step t of its episode will look.
 
         Numbers of the warm-up are used ``warm_up_hold`` times, and so are the actions they choose;
-        number ``hold_from`` of a command that has one is used from there on.
+        number ``hold_from`` of a command is used for ``hold_steps`` steps.
         """
         numbers = Stream(command.stream_key).uniforms(self._capacity)
         if command.kind == "warm_up":
             hold = self._config.warm_up_hold
             numbers = numbers[np.arange(self._capacity) // hold * hold]
-        if command.hold_from is not None:
-            numbers[command.hold_from :] = Stream(command.stream_key).number(command.hold_from)
+        if command.hold_steps:
+            first, last = command.hold_from, command.hold_from + command.hold_steps
+            numbers[first:last] = Stream(command.stream_key).number(first)
         self._uniforms[self._places(int(self._began[row]), self._capacity), row] = numbers
 
     def _make_room(self) -> None:

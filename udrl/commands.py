@@ -14,7 +14,7 @@ from msgspec import Meta
 from udrl.config import COMMANDS_PER_ITERATION, Config, Temperature
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
-from udrl.strategies import Best, CommandStrategy, ask, make_strategy, nearest
+from udrl.strategies import Best, CommandStrategy, ask, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
 
 Kind = Literal["warm_up", "explore", "evaluate"]
@@ -41,8 +41,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         weights_version: the behavior function to act with; 0 in the warm-up: act at random.
         max_steps: the episode is truncated after so many steps.
         temperature: logits are divided by it before an action is sampled; 0: take the mode.
-        hold_from: the action of this step is drawn at random, and taken again until the episode
-            ends; None: none is.
+        hold_from: the step whose action is drawn uniformly at random and then held.
+        hold_steps: for how many steps, that one included; 0: no action is held.
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
@@ -54,7 +54,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     weights_version: Annotated[int, Meta(ge=0, le=2**62)]
     max_steps: Annotated[int, Meta(ge=1, le=2**31)]
     temperature: Temperature = 1.0
-    hold_from: Annotated[int, Meta(ge=0, le=2**31)] | None = None
+    hold_from: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    hold_steps: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
     @property
     def iteration(self) -> int:
@@ -94,29 +95,24 @@ class CommandSampler:
 
         What they ask for is the strategy's choice (:mod:`udrl.strategies`): in the paper the mean
         length of the ``last_few`` best episodes, and a return that is uniform in [M, M + S]. Not in
-        the paper: with a ``horizon_spread`` s, the desired horizon is then multiplied with a number
-        that is uniform in [1 - s, 1 + s]; and of the episodes a share, ``held_endings``, ends with
-        one action that is drawn at random and held, from a step within the desired horizon on.
+        the paper: in a share of the episodes, ``held_actions``, one random action is held for
+        ``hold_steps`` steps, from a step within the desired horizon on.
 
         Raises:
             ConfigError: the strategy cannot be imported, or asks for what cannot be.
         """
         best = buffer.best(self._config.last_few)
-        spread = self._config.horizon_spread
         n = self._config.n_episodes_per_iter
-        u, v, w, x = self._stream(iteration).uniforms(4 * n).reshape(4, n).tolist()
-        desired = []
-        for k in range(n):
-            desired_return, horizon = ask(self._strategy, best, u[k])
-            desired.append(
-                self.desired(desired_return, nearest(horizon * (1 + spread * (2 * v[k] - 1))))
-            )
+        u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
+        desired = [self.desired(*ask(self._strategy, best, number)) for number in u]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
             msgspec.structs.replace(
-                c, hold_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon))
+                c,
+                hold_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon)),
+                hold_steps=self._config.hold_steps,
             )
-            if w[k] < self._config.held_endings
+            if w[k] < self._config.held_actions
             else c
             for k, c in enumerate(commands)
         ]

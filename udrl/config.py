@@ -55,11 +55,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
-        held_endings: share of exploratory episodes that end with one random action, held from a
-            random step on, whatever the network says; 0 is the paper's.
+        held_actions: share of exploratory episodes in which one random action is held for
+            ``hold_steps`` steps, whatever the network says; 0 is the paper's.
+        hold_steps: steps that such an action is held for.
         horizon_scale: factor on the desired horizon at the network's input.
-        horizon_spread: how far desired horizons of exploratory commands are spread around the mean
-            length of the best episodes, as a part of it; 0 is the paper's.
         last_few: number of best episodes that exploratory commands are drawn from (2.3.4).
         learning_rate: Adam's.
         n_episodes_per_iter: exploratory episodes in an iteration.
@@ -108,9 +107,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
     desired_horizon: Literal["mean", "return"] = "mean"
-    held_endings: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    hold_steps: PositiveInt = 30
     horizon_scale: Scale = 0.01
-    horizon_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
     last_few: PositiveInt = 75
     learning_rate: Annotated[float, Meta(gt=0, le=10)] = 3.5e-4
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20
@@ -146,11 +145,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 f"last_few = {self.last_few}: must be at most replay_size = {self.replay_size}, "
                 f"because exploratory commands are drawn from the replay buffer; "
                 f"lower last_few or raise replay_size"
-            )
-        if self.desired_horizon == "return" and self.horizon_spread:
-            raise ConfigError(
-                f"horizon_spread = {self.horizon_spread}: with desired_horizon = 'return' horizons "
-                f"are as long as returns are high; set horizon_spread = 0"
             )
 
 

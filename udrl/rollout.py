@@ -58,7 +58,7 @@ class Rollout:
         self._cap = policy.spec.max_return if command.kind == "evaluate" else None
         self._stream = Stream(command.stream_key)
         self._uniforms: deque[float] = deque()
-        self._held: float | None = None
+        self._held = 0.0
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.frame_stack
@@ -91,8 +91,9 @@ class Rollout:
         if not self._uniforms:
             self._uniforms.extend(self._stream.uniforms(_AT_A_TIME).tolist())
         uniform = self._uniforms.popleft()
-        if self.command.hold_from is not None and self.steps >= self.command.hold_from:
-            self._held = uniform if self._held is None else self._held
+        held_for = self.steps - self.command.hold_from
+        if 0 <= held_for < self.command.hold_steps:
+            self._held = uniform if held_for == 0 else self._held
             action = int(self._held * self._policy.spec.n_actions)
         else:
             action = choose(self._logits(), self.temperature, uniform)

@@ -20,7 +20,7 @@ from udrl.config import Config
 from udrl.errors import ConfigError
 from udrl.replay import Entry
 
-#: Returns and horizons that a command may have, with room for a horizon's spread.
+#: Greatest return and horizon that a command may have.
 _MOST = 10**9
 
 
@@ -128,11 +128,35 @@ class Record:
         return best[-1].episode_return, best[-1].length
 
 
+class Maximum:
+    """Always the greatest return that the environment can give (``max_return``).
+
+    For tasks in which an agent delivers what is commanded and no more, such as balancing for so
+    many steps: there commands just above the best episodes make progress slow.
+
+    Raises:
+        ConfigError: ``max_return`` is not set.
+    """
+
+    def __init__(self, config: Config) -> None:
+        if config.max_return is None:
+            raise ConfigError(
+                "command_strategy = 'maximum' commands the greatest return possible, and "
+                "max_return is not set; set it, e.g. --set max_return=500"
+            )
+        self._max_return = config.max_return
+
+    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
+        """Return ``max_return`` and the best episodes' mean length."""
+        return self._max_return, Best.of(best).horizon
+
+
 STRATEGIES: dict[str, type[CommandStrategy]] = {
     "uniform": Uniform,
     "again": Again,
     "ranked": Ranked,
     "record": Record,
+    "maximum": Maximum,
 }
 
 

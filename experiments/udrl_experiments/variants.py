@@ -39,8 +39,9 @@ def commands(plan: Plan, tasks: Sequence[Task], strategies: Sequence[str]) -> St
         tasks: on which.
         strategies: your own, ``package.module:Class``, besides those of :mod:`udrl.strategies`.
     """
-    variants = {name: {"command_strategy": name} for name in (*STRATEGIES, *strategies)}
-    return _variants("commands", plan, tasks, variants)
+    # The landers declare no greatest return, which `maximum` commands.
+    names = (*(name for name in STRATEGIES if name != "maximum"), *strategies)
+    return _variants("commands", plan, tasks, {name: {"command_strategy": name} for name in names})
 
 
 def _variants(

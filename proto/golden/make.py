@@ -71,7 +71,6 @@ CONFIG = Config(
     lead=1,
     batch_size=256,
     horizon_scale=0.02,
-    horizon_spread=0.25,
     last_few=50,
     learning_rate=0.001,
     n_episodes_per_iter=15,

@@ -82,8 +82,8 @@ def algorithm2(
                 logits = behavior(states, commands)[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
         number = float(stream.uniforms(1)[0])
-        holds = command.hold_from is not None and len(episode) >= command.hold_from
-        if holds and len(episode) > (command.hold_from or 0):
+        holds = command.hold_from <= len(episode) < command.hold_from + command.hold_steps
+        if holds and len(episode) > command.hold_from:
             pass  # the same number again
         elif command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
             u = number

@@ -107,33 +107,6 @@ def test_without_spread_every_exploratory_return_is_the_mean() -> None:
     assert set(desired_returns(commands)) == {500.0}
 
 
-@pytest.mark.parametrize("spread", [0.25, 1.0])
-def test_exploratory_horizons_are_uniform_around_the_mean_length(spread: float) -> None:
-    n = 10_000
-    buffer = buffer_of([0.0, 2.0], [900, 1100])
-    commands = sampler(n_episodes_per_iter=n, horizon_spread=spread).explore(1, buffer)
-    empirical = np.sort([c.desired_horizon / 1000 for c in commands])
-    expected = np.linspace(1 - spread, 1 + spread, n)
-    assert np.abs(empirical - expected).max() < 2 * spread * 1.95 / sqrt(n)
-    # Whoever wants to come off better does not have more or less time for it.
-    related = np.corrcoef(desired_returns(commands), [c.desired_horizon for c in commands])
-    assert abs(related[0, 1]) < 4 / sqrt(n)
-
-
-def test_a_spread_changes_the_horizons_of_exploratory_commands_only() -> None:
-    buffer = buffer_of([1.0, 2.0, 6.0], [10, 20, 31])
-    paper, spread = sampler(), sampler(horizon_spread=0.5)
-    assert spread.evaluate(2, buffer) == paper.evaluate(2, buffer)
-    ours, theirs = spread.explore(2, buffer), paper.explore(2, buffer)
-    assert len(desired_horizons(ours)) > 1
-    assert [msgspec.structs.replace(c, desired_horizon=20) for c in ours] == theirs
-
-
-def test_a_desired_horizon_is_at_least_one_step() -> None:
-    commands = sampler(n_episodes_per_iter=100, horizon_spread=1.0).explore(1, buffer_of([0.0]))
-    assert desired_horizons(commands) == {1, 2}
-
-
 def test_evaluation_commands_take_the_lower_bound_and_the_same_horizon() -> None:
     buffer = buffer_of([1.0, 2.0, 6.0], [10, 20, 31])
     sample = sampler(eval_episodes=7)
@@ -242,20 +215,21 @@ def test_iteration_and_index_are_read_from_the_id() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_a_share_of_exploratory_episodes_ends_with_one_action(share: float) -> None:
+def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
     config = {
-        "held_endings": share, "horizon_spread": 0.9, "max_train_steps": 60, "last_few": 1,
+        "held_actions": share, "hold_steps": 7, "command_strategy": "again", "max_train_steps": 60,
         "n_episodes_per_iter": 1000,
     }  # fmt: skip
     buffer = buffer_of([1.0, 2.0], [20, 50])
     explored = sampler(**config).explore(3, buffer)
-    others = sampler(**config | {"held_endings": 0.0}).explore(3, buffer)
-    assert [msgspec.structs.replace(c, hold_from=None) for c in explored] == others
-    held = [c for c in explored if c.hold_from is not None]
+    others = sampler(**config | {"held_actions": 0.0}).explore(3, buffer)
+    assert [msgspec.structs.replace(c, hold_from=0, hold_steps=0) for c in explored] == others
+    held = [c for c in explored if c.hold_steps]
+    assert {c.hold_steps for c in held} <= {7}
     assert abs(len(held) - 1000 * share) <= 5 * sqrt(1000 * share * (1 - share))
-    where = [(c.hold_from or 0) / min(60, c.desired_horizon) for c in held]
+    where = [c.hold_from / min(60, c.desired_horizon) for c in held]
     assert all(0 <= part < 1 for part in where)
     if held:
         assert abs(sum(where) / len(where) - 0.5) < 0.1
     for command in [*sampler(**config).warm_up(), *sampler(**config).evaluate(3, buffer)]:
-        assert command.hold_from is None
+        assert command.hold_steps == 0

@@ -16,7 +16,6 @@ from udrl.config import Config, build
 from udrl.digests import tensors_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.errors import ConfigError
 from udrl.numerics import check_batch_invariance, settle, settle_as, training_class
 from udrl.replay import Entry, ReplayBuffer
 from udrl.segments import Experience
@@ -253,8 +252,3 @@ def test_horizon_is_the_return_as_an_integer() -> None:
         assert command.desired_return == command.desired_horizon
         assert 315 <= command.desired_return <= 315.75 + 78.1
     assert {c.desired_return for c in sampler.evaluate(1, buffer)} == {315.0}
-
-
-def test_spread_of_horizons_is_refused_beside_it() -> None:
-    with pytest.raises(ConfigError, match=r"horizon_spread = 0.3: .*set horizon_spread = 0"):
-        settings(desired_horizon="return", horizon_spread=0.3)

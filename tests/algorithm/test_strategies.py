@@ -25,7 +25,7 @@ def config(**values: Any) -> Config:
 
 
 def strategy(name: str) -> Any:
-    return make_strategy(config(command_strategy=name))
+    return make_strategy(config(command_strategy=name, max_return=500.0))
 
 
 @given(BEST, U)
@@ -67,6 +67,18 @@ def test_again_asks_for_each_as_often(best: list[Entry]) -> None:
 @given(BEST, U)
 def test_record_asks_for_what_the_very_best_did(best: list[Entry], u: float) -> None:
     assert strategy("record")(best, u) == (best[-1].episode_return, best[-1].length)
+
+
+@given(BEST, U)
+def test_maximum_asks_for_the_greatest_return_in_the_mean_length(
+    best: list[Entry], u: float
+) -> None:
+    assert strategy("maximum")(best, u) == (500.0, strategy("uniform")(best, u)[1])
+
+
+def test_maximum_needs_a_greatest_return() -> None:
+    with pytest.raises(ConfigError, match=r"max_return is not set; set it, e\.g\. --set"):
+        make_strategy(config(command_strategy="maximum"))
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
@@ -114,19 +126,10 @@ def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
     }
 
 
-def test_the_spread_applies_to_every_strategy() -> None:
-    for name in STRATEGIES:
-        sampler = CommandSampler(config(command_strategy=name, horizon_spread=0.5), 500)
-        horizons = {c.desired_horizon for c in sampler.explore(1, buffer())}
-        assert len(horizons) > 2
-        assert min(horizons) >= 5
-        assert max(horizons) <= 30
-
-
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("cautious", r"expected uniform, again, ranked, record, or a class of your own"),
+        ("cautious", r"expected uniform, again, ranked, record, maximum, or a class of your own"),
         ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
         ("udrl.strategies:Missing", "AttributeError"),
     ],

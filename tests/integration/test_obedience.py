@@ -133,7 +133,7 @@ def test_commands_lie_among_what_the_buffer_did(ended_run: Path) -> None:
 
 
 def with_horizons_that_follow(agent: Agent) -> Agent:
-    config = msgspec.structs.replace(agent.config, desired_horizon="return", horizon_spread=0.0)
+    config = msgspec.structs.replace(agent.config, desired_horizon="return")
     return agent._replace(config=config)
 
 

@@ -96,9 +96,9 @@ def run_episode(
             scaled = config["return_scale"] * desired, config["horizon_scale"] * max(horizon, 1.0)
             c[0] = torch.tensor(scaled, dtype=torch.float64)
             row = logits(weights, config, s, c)[0].tolist()
-        held = command["hold_from"]
-        if held is not None and len(actions) >= held:
-            action = int(u[held] * spec["n_actions"])
+        first = command["hold_from"]
+        if first <= len(actions) < first + command["hold_steps"]:
+            action = int(u[first] * spec["n_actions"])
         else:
             action = choose(row, u[len(actions)], command["temperature"])
         observations.append(np.asarray(observation, np.float32))
@@ -175,7 +175,8 @@ def numerics_class(hello: dict[str, Any]) -> str:
         "environment_seed": 1_000_000,
         "stream_key": stream_key(0, "probe", 1, 0),
         "temperature": 1.0,
-        "hold_from": None,
+        "hold_from": 0,
+        "hold_steps": 0,
     }
     episode = run_episode(command, hello, weights)
     digests = arrays_digest({"logits": found.numpy()}) + episode_digest(0, episode)

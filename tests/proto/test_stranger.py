@@ -66,14 +66,14 @@ def test_probe_has_the_same_digest(activation: Any, initialisation: Any) -> None
 
 
 @pytest.mark.parametrize(
-    ("kind", "version", "temperature", "hold_from"),
+    ("kind", "version", "temperature", "hold_steps"),
     [
-        ("warm_up", 0, 1.0, None), ("explore", 1, 1.0, None), ("explore", 1, 1.0, 4),
-        ("evaluate", 1, 0.3, None), ("evaluate", 1, 0.0, None),
+        ("warm_up", 0, 1.0, 0), ("explore", 1, 1.0, 0), ("explore", 1, 1.0, 3),
+        ("evaluate", 1, 0.3, 0), ("evaluate", 1, 0.0, 0),
     ],
 )  # fmt: skip
 def test_episode_has_the_same_bytes(
-    kind: Kind, version: int, temperature: float, hold_from: int | None, generator: EpisodeGenerator
+    kind: Kind, version: int, temperature: float, hold_steps: int, generator: EpisodeGenerator
 ) -> None:
     commands = [
         Command(
@@ -86,7 +86,8 @@ def test_episode_has_the_same_bytes(
             weights_version=version,
             max_steps=25,
             temperature=temperature,
-            hold_from=hold_from,
+            hold_from=4,
+            hold_steps=hold_steps,
         )
         for index in range(5)
     ]

@@ -45,7 +45,6 @@ def config(lead: int = 0) -> Config:
         max_age=MAX_AGE,
         recent_size=4,
         last_few=2,
-        horizon_spread=0.5,
         eval_every=9,
         eval_episodes=2,
     )
