@@ -1,10 +1,12 @@
 """Weights and optimizer state as safetensors; never pickle.
 
 A behavior function is one blob with its tensors by name; the optimizer is another, with Adam's two
-moments of each tensor and its step count. What comes from outside is validated for names, shapes,
+moments of each tensor and its step count, and with the trained weights where their moving average
+acts. What comes from outside is validated for names, shapes,
 dtypes and finite values before it is used.
 """
 
+import copy
 from collections.abc import Mapping
 
 import safetensors
@@ -41,10 +43,12 @@ def decode_weights(blob: bytes, config: Config, spec: EnvironmentSpec) -> Behavi
 def encode_optimizer(state: TrainingState) -> bytes:
     """Return Adam's state as safetensors; empty at version 0, when there is none."""
     tensors: dict[str, Tensor] = {}
-    for name, parameter in state.behavior.named_parameters():
+    for name, parameter in state.trained.named_parameters():
         held = state.optimizer.state.get(parameter)
         if held:
             tensors |= {f"{moment}.{name}": held[moment] for moment in (*_MOMENTS, "step")}
+            if state.trained is not state.behavior:
+                tensors[f"trained.{name}"] = parameter.detach()
     return safetensors.torch.save(tensors)
 
 
@@ -57,17 +61,22 @@ def decode_state(
         InvalidWeights: the bytes are not those of such a state.
     """
     behavior = decode_weights(weights, config, spec).to(config.device)
+    kept = (*_MOMENTS, "trained") if config.ema_decay else _MOMENTS
     expected: dict[str, Tensor] = {}
     for name, parameter in behavior.named_parameters():
-        expected |= {f"{moment}.{name}": parameter.detach() for moment in _MOMENTS}
+        expected |= {f"{kind}.{name}": parameter.detach() for kind in kept}
         expected[f"step.{name}"] = torch.zeros(())
     tensors = _decode(optimizer, expected)
-    adam = make_optimizer(behavior, config)
-    for name, parameter in behavior.named_parameters():
+    trained = behavior
+    if config.ema_decay:
+        trained = copy.deepcopy(behavior)
+        trained.load_state_dict({n: tensors[f"trained.{n}"] for n in behavior.state_dict()})
+    adam = make_optimizer(trained, config)
+    for name, parameter in trained.named_parameters():
         adam.state[parameter] = {
             k: tensors[f"{k}.{name}"].to(config.device) for k in ("step", *_MOMENTS)
         }
-    return TrainingState(version, behavior, adam)
+    return TrainingState(version, trained, behavior, adam)
 
 
 def _decode(blob: bytes, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
@@ -23,10 +24,14 @@ class TrainingState:
 
     Attributes:
         version: v; 0 is untrained.
+        trained: what the optimizer updates.
+        behavior: what acts: the moving average of ``trained``, or the same object where
+            ``ema_decay`` is 0.
         loss: mean cross-entropy, in nats, over the updates that made this version; NaN at 0.
     """
 
     version: int
+    trained: BehaviorFunction
     behavior: BehaviorFunction
     optimizer: torch.optim.Adam
     loss: float = float("nan")
@@ -40,8 +45,9 @@ class TrainingState:
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
     """Return version 0, a function of the seed."""
-    behavior = initialise(config, spec).to(config.device)
-    return TrainingState(0, behavior, make_optimizer(behavior, config))
+    trained = initialise(config, spec).to(config.device)
+    behavior = copy.deepcopy(trained) if config.ema_decay else trained
+    return TrainingState(0, trained, behavior, make_optimizer(trained, config))
 
 
 def make_optimizer(behavior: BehaviorFunction, config: Config) -> torch.optim.Adam:
@@ -72,17 +78,21 @@ def _update(
     state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
-    batch = _Batch(config, state.behavior)
-    parameters = list(state.behavior.parameters())
+    batch = _Batch(config, state.trained)
+    parameters = list(state.trained.parameters())
+    averages = list(state.behavior.parameters())
+    average = get_ema_multi_avg_fn(config.ema_decay)
     losses = torch.zeros((), dtype=torch.float64, device=config.device)
     one = torch.ones((), device=config.device)
     for rank, t1, t2 in zip(*segments, strict=True):
         observation, command, action = batch.fill(experience, Segments(rank, t1, t2))
-        loss = functional.cross_entropy(state.behavior(observation, command), action)
+        loss = functional.cross_entropy(state.trained(observation, command), action)
         for parameter in parameters:
             parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
         loss.backward(one)
         state.optimizer.step()
+        if config.ema_decay:
+            average(averages, parameters, None)
         losses += loss.detach()
     return float(losses)
 

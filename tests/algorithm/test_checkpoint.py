@@ -2,6 +2,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import safetensors.torch
@@ -48,10 +49,10 @@ def experience() -> RankedExperience:
     return held.by_rank([0])
 
 
-def trained(versions: int) -> TrainingState:
-    state = untrained(CONFIG, SPEC)
+def trained(versions: int, config: Config = CONFIG) -> TrainingState:
+    state = untrained(config, SPEC)
     for _ in range(versions):
-        train(state, experience(), CONFIG)
+        train(state, experience(), config)
     return state
 
 
@@ -59,9 +60,9 @@ def digest(state: TrainingState) -> bytes:
     return tensors_digest(state.behavior.state_dict())
 
 
-def restored(state: TrainingState) -> TrainingState:
+def restored(state: TrainingState, config: Config = CONFIG) -> TrainingState:
     weights, optimizer = encode_weights(state.behavior), encode_optimizer(state)
-    return decode_state(state.version, weights, optimizer, CONFIG, SPEC)
+    return decode_state(state.version, weights, optimizer, config, SPEC)
 
 
 def test_weights_come_back_bit_by_bit() -> None:
@@ -70,12 +71,14 @@ def test_weights_come_back_bit_by_bit() -> None:
     assert tensors_digest(behavior.state_dict()) == digest(state)
 
 
-def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped() -> None:
-    straight, resumed = trained(3), restored(trained(1))
+@pytest.mark.parametrize("ema_decay", [0.0, 0.9])
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(ema_decay: float) -> None:
+    config = msgspec.structs.replace(CONFIG, ema_decay=ema_decay)
+    straight, resumed = trained(3, config), restored(trained(1, config), config)
     assert resumed.version == 1
     for _ in range(2):
-        train(resumed, experience(), CONFIG)
-        resumed = restored(resumed)
+        train(resumed, experience(), config)
+        resumed = restored(resumed, config)
     assert resumed.version == straight.version
     assert digest(resumed) == digest(straight)
     assert encode_optimizer(resumed) == encode_optimizer(straight)
@@ -87,6 +90,15 @@ def test_the_optimizers_state_matters_to_what_follows() -> None:
     forgetful.version = 1
     train(forgetful, experience(), CONFIG)
     assert digest(forgetful) != digest(straight)
+
+
+def test_the_trained_weights_belong_to_the_state_where_their_average_acts() -> None:
+    config = msgspec.structs.replace(CONFIG, ema_decay=0.9)
+    state = trained(1, config)
+    copy = restored(state, config)
+    assert tensors_digest(copy.trained.state_dict()) == tensors_digest(state.trained.state_dict())
+    with pytest.raises(InvalidWeights, match=r"trained\."):
+        decode_state(1, encode_weights(state.behavior), encode_optimizer(trained(1)), config, SPEC)
 
 
 def test_a_checkpoint_is_a_copy() -> None:
