@@ -16,8 +16,8 @@ PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --qu
 
 .PHONY: train test test-slow test-browser test-compose lint format types bench chaos soak fuzz setup setup-dev clean
 
-train: setup  ## Train LunarLander until it lands.
-	$(VENV)/bin/udrl train $(ENV) --stop-return 100 $(ARGS)
+train: setup  ## Train LunarLander until it is solved: a mean return of 200.
+	$(VENV)/bin/udrl train $(ENV) --stop-return 200 $(ARGS)
 
 test: setup-dev  ## The tests, except the slow ones.
 	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 2 $(ARGS)

@@ -41,6 +41,8 @@ from udrl_replay.store import FILE, Store
 def number(value: float) -> str:
     """Return a bound as the tables have it: powers of two from 2^16 as such."""
     whole = int(value)
+    if whole != value:
+        return str(value)
     for power, rest in ((whole, ""), (whole + 1, " - 1")):
         if whole >= 2**16 and power & (power - 1) == 0:
             return f"2^{power.bit_length() - 1}{rest}"

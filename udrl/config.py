@@ -109,7 +109,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
     desired_horizon: Literal["mean", "return"] = "mean"
-    ema_decay: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    ema_decay: Annotated[float, Meta(ge=0, le=0.9999)] = 0.0
     held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
     hold_steps: PositiveInt = 30
     horizon_scale: Scale = 0.01
