@@ -26,6 +26,8 @@ STRUCTS = [*MESSAGES, Command, Config, EnvironmentSpec]
 def number(value: float) -> str:
     """Return a limit, large powers of two as such."""
     whole = int(value)
+    if whole != value:
+        return str(value)
     for power, rest in ((whole, ""), (whole + 1, " - 1")):
         if whole >= 2**16 and power & (power - 1) == 0:
             return f"2^{power.bit_length() - 1}{rest}"
