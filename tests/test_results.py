@@ -37,7 +37,7 @@ def test_pictures_show_every_line(folder: Path) -> None:
         assert f"{words} ({seeds} seed" in picture
 
 
-@pytest.mark.parametrize("table", sorted(RESULTS.glob("sensitivity/*.csv")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("table", sorted(RESULTS.glob("sensitivity*/*.csv")), ids=lambda p: p.stem)
 def test_sensitivity_has_100_episodes_a_point(table: Path) -> None:
     rows = read(table, Obtained)
     assert {row.episodes for row in rows} == {100}
