@@ -29,7 +29,7 @@ def test_services_started_by_hand_equal_one_process(
     config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
     replay = cli(
         "replay", "CartPole-v1", "--listen", endpoint, "--run-dir", str(run_dir),
-        "--config", str(config),
+        "--preset", "none", "--config", str(config),
     )  # fmt: skip
     others = [cli("learner", "--connect", endpoint), cli("actor", "--connect", endpoint)]
     others.append(cli("actor", "--connect", endpoint, "--envs", "3"))

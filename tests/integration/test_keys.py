@@ -51,7 +51,7 @@ def test_services_that_have_only_their_own_keys_equal_one_process(
     # Beyond loopback, and without --insecure.
     replay = cli(
         "replay", "CartPole-v1", "--listen", f"tls/0.0.0.0:{port}", "--run-dir", str(run_dir),
-        "--config", str(config), "--keys", str(keys_dir / "replay"),
+        "--preset", "none", "--config", str(config), "--keys", str(keys_dir / "replay"),
     )  # fmt: skip
     others = [
         cli(role, "--connect", f"tls/localhost:{port}", "--keys", str(keys_dir / role))
@@ -72,7 +72,8 @@ def test_services_meet_at_a_router_of_somebody_else(
 ) -> None:
     endpoint, run_dir = f"tls/127.0.0.1:{free_port()}", tmp_path / "run"
     config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
-    given = {"replay": ["CartPole-v1", "--run-dir", str(run_dir), "--config", str(config)]}
+    settings = ["--preset", "none", "--config", str(config)]
+    given = {"replay": ["CartPole-v1", "--run-dir", str(run_dir), *settings]}
     with configured_router(endpoint, keys_dir):
         others = [
             cli(

@@ -19,7 +19,6 @@ from udrl.algorithm1 import Run, algorithm1
 from udrl.config import Budget, Config, build
 from udrl.errors import UdrlError
 from udrl_launch.inspection import status_of
-from udrl_launch.settings import gather
 from udrl_proto.messages import Status
 
 #: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
@@ -134,10 +133,8 @@ def arguments(config: dict[str, Any], max_env_steps: int, run_dir: Path) -> list
         for name, value in config.items()
         if name != "environment" and value is not None
     ]
-    understood = gather(config["environment"], options={}, assignments=given).config
-    assert understood == build(Config, config), "a preset has what this configuration leaves out"
     return [
-        "train", config["environment"], "--run-dir", str(run_dir), "--json",
+        "train", config["environment"], "--preset", "none", "--run-dir", str(run_dir), "--json",
         *(item for assignment in given for item in ("--set", assignment)),
         "--max-env-steps", str(max_env_steps),
     ]  # fmt: skip
