@@ -24,9 +24,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from udrl.behavior import Acting, BehaviorFunction, stacked_shape
+from udrl.behavior import Acting, BehaviorFunction
 from udrl.commands import Command
 from udrl.config import Config
+from udrl.encoders import stacked_shape
 from udrl.environments.making import (
     Environment,
     EnvironmentSpec,

@@ -5,31 +5,30 @@ an image by convolutions. The command, scaled by fixed factors, passes a fully c
 layer and is multiplied element-wise with the embedding; fully connected layers follow.
 """
 
-import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from udrl.config import Config
+from udrl.encoders import (
+    ACTIVATIONS,
+    PRECISIONS,
+    Layers,
+    convolutions,
+    encode,
+    fully_connected,
+    image_features,
+    stacked_shape,
+    tensors,
+)
 from udrl.environments.making import EnvironmentSpec
 from udrl.streams import Purpose, Stream, stream_key
+from udrl.value import ValueFunction, relative
 
 #: From observation [n, *observation_shape] and scaled command [n, 2] to logits [n, n_actions].
 Acting = Callable[[Tensor, Tensor], Tensor]
-
-_Layers = list[tuple[Tensor, Tensor]]
-
-# In place, to touch less memory: the gradient of a layer needs its input only.
-_ACTIVATIONS = {"relu": torch.relu_, "tanh": torch.tanh_}
-
-_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-
-# Appendix B.2.
-_FILTER, _STRIDE, _PADDING = 3, 2, 1
 
 
 class BehaviorFunction(nn.Module):
@@ -38,31 +37,33 @@ class BehaviorFunction(nn.Module):
     Args:
         spec: sizes of observation and action space.
         config: ``frame_stack``, ``convolutions`` (of images), ``hidden``, ``activation``,
-            ``precision``.
+            ``precision``, ``baseline``.
+
+    Attributes:
+        value: V(s), to which desired returns are relative; None where ``baseline`` is ``none``.
+        deviation: what one unit of a relative desired return stands for, in scaled return.
     """
+
+    deviation: Tensor
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
-        self._activation = _ACTIVATIONS[config.activation]
-        self._precision = _PRECISIONS[config.precision]
-        self.observation_shape = stacked_shape(spec, config)
-        # skip_init: values come from `initialise` or a checkpoint, never from torch's global state.
+        self._activation = ACTIVATIONS[config.activation]
+        self._precision = PRECISIONS[config.precision]
+        self.observation_shape = shape = stacked_shape(spec, config)
         if spec.is_image:
-            channels = (self.observation_shape[0], *config.convolutions)
-            self.convolutions = nn.ModuleList(
-                nn.utils.skip_init(nn.Conv2d, i, o, _FILTER, _STRIDE, _PADDING)
-                for i, o in pairwise(channels)
-            )
-            first = _embedding_size(self.observation_shape, config.convolutions)
+            self.convolutions = convolutions(shape, config.convolutions)
+            first = image_features(shape, config.convolutions)
             widths = (first, *config.hidden)
         else:
             first, *_ = widths = config.hidden
-            self.observation = nn.utils.skip_init(nn.Linear, self.observation_shape[0], first)
-        self.command = nn.utils.skip_init(nn.Linear, 2, first)
-        self.layers = nn.ModuleList(
-            nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise(widths)
-        )
-        self.action = nn.utils.skip_init(nn.Linear, widths[-1], spec.n_actions)
+            self.observation = fully_connected(shape[0], first)
+        self.command = fully_connected(2, first)
+        self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
+        self.action = fully_connected(widths[-1], spec.n_actions)
+        self.value = ValueFunction(spec, config) if config.baseline == "value" else None
+        if self.value is not None:
+            self.register_buffer("deviation", torch.ones(()))
 
     def forward(self, observation: Tensor, command: Tensor) -> Tensor:
         """Return the logits of P(a | s, c).
@@ -74,6 +75,10 @@ class BehaviorFunction(nn.Module):
         Returns:
             float32 [batch, n_actions].
         """
+        if self.value is not None:
+            with torch.no_grad():
+                expected = self.value(observation)
+            command = relative(command, expected, self.deviation)
         return self._logits(self._tensors(), observation, command)
 
     def frozen(self) -> Acting:
@@ -82,62 +87,37 @@ class BehaviorFunction(nn.Module):
         It shares the weights, unless they are rounded. On 16 vectors it takes three quarters of
         the time.
         """
-        return partial(self._logits, [(w.detach(), b.detach()) for w, b in self._tensors()])
+        layers = [(w.detach(), b.detach()) for w, b in self._tensors()]
+        value = None if self.value is None else self.value.frozen()
 
-    def _tensors(self) -> _Layers:
-        """Return weights and biases as they are used: fully connected ones transposed."""
-        embedding = self.convolutions if self.is_convolutional else (self.observation,)
-        tensors = []
-        for layer in (*embedding, self.command, *self.layers, self.action):
-            assert isinstance(layer, nn.Conv2d | nn.Linear)
-            assert layer.bias is not None
-            weight, bias = layer.weight.to(self._precision), layer.bias.to(self._precision)
-            if isinstance(layer, nn.Conv2d):
-                weight = weight.contiguous(memory_format=torch.channels_last)
-            else:
-                weight = weight.t()
-            tensors.append((weight, bias))
-        return tensors
+        def act(observation: Tensor, command: Tensor) -> Tensor:
+            if value is not None:
+                command = relative(command, value(observation), self.deviation)
+            return self._logits(layers, observation, command)
+
+        return act
+
+    def _tensors(self) -> list[tuple[Tensor, Tensor]]:
+        return tensors((*self._encoder, self.command, *self.layers, self.action), self._precision)
+
+    @property
+    def _encoder(self) -> Sequence[nn.Module]:
+        return tuple(self.convolutions) if self.is_convolutional else (self.observation,)
 
     @property
     def is_convolutional(self) -> bool:
         """Whether observations are images."""
         return len(self.observation_shape) > 1
 
-    def _logits(self, layers: _Layers, observation: Tensor, command: Tensor) -> Tensor:
-        activation = self._activation
-        n_embedding = len(self.convolutions) if self.is_convolutional else 1
-        embedding_layers, others = layers[:n_embedding], layers[n_embedding:]
-        (gate_weight, gate_bias), *hidden, (action_weight, action_bias) = others
-        embedding = observation.to(self._precision)
-        if self.is_convolutional:
-            embedding = (embedding * (1 / 255)).contiguous(memory_format=torch.channels_last)
-            for weight, bias in embedding_layers:
-                embedding = activation(
-                    functional.conv2d(embedding, weight, bias, _STRIDE, _PADDING)
-                )
-            embedding = embedding.flatten(1)
-        else:
-            ((weight, bias),) = embedding_layers
-            embedding = activation(torch.addmm(bias, embedding, weight))
+    def _logits(self, layers: Layers, observation: Tensor, command: Tensor) -> Tensor:
+        n = len(self._encoder)
+        (gate_weight, gate_bias), *hidden, (action_weight, action_bias) = layers[n:]
+        features = encode(layers[:n], observation, self._activation)
         gate = torch.sigmoid(torch.addmm(gate_bias, command.to(self._precision), gate_weight))
-        embedding = embedding * gate
+        features = features * gate
         for weight, bias in hidden:
-            embedding = activation(torch.addmm(bias, embedding, weight))
-        return torch.addmm(action_bias, embedding, action_weight).float()
-
-
-def stacked_shape(spec: EnvironmentSpec, config: Config) -> tuple[int, ...]:
-    """Return the shape of what the network observes: the most recent frames, one after another."""
-    first, *rest = spec.observation_shape
-    return (config.frame_stack * first, *rest)
-
-
-def _embedding_size(shape: tuple[int, ...], convolutions: tuple[int, ...]) -> int:
-    _, *size = shape
-    for _ in convolutions:
-        size = [(n + 2 * _PADDING - _FILTER) // _STRIDE + 1 for n in size]
-    return convolutions[-1] * math.prod(size)
+            features = self._activation(torch.addmm(bias, features, weight))
+        return torch.addmm(action_bias, features, action_weight).float()
 
 
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
@@ -152,7 +132,7 @@ def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
         bound = layer.weight[0].numel() ** -0.5
         assert layer.bias is not None
         if config.initialisation == "orthogonal":
-            hidden = name not in ("command", "action")
+            hidden = name not in ("command", "action", "value.expected")
             nn.init.orthogonal_(layer.weight, gain if hidden else 1.0, generator)
             nn.init.zeros_(layer.bias)
         else:

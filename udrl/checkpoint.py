@@ -47,8 +47,8 @@ def encode_optimizer(state: TrainingState) -> bytes:
         held = state.optimizer.state.get(parameter)
         if held:
             tensors |= {f"{moment}.{name}": held[moment] for moment in (*_MOMENTS, "step")}
-            if state.trained is not state.behavior:
-                tensors[f"trained.{name}"] = parameter.detach()
+    if tensors and state.trained is not state.behavior:
+        tensors |= {f"trained.{n}": t.contiguous() for n, t in state.trained.state_dict().items()}
     return safetensors.torch.save(tensors)
 
 
@@ -61,11 +61,12 @@ def decode_state(
         InvalidWeights: the bytes are not those of such a state.
     """
     behavior = decode_weights(weights, config, spec).to(config.device)
-    kept = (*_MOMENTS, "trained") if config.ema_decay else _MOMENTS
     expected: dict[str, Tensor] = {}
     for name, parameter in behavior.named_parameters():
-        expected |= {f"{kind}.{name}": parameter.detach() for kind in kept}
+        expected |= {f"{moment}.{name}": parameter.detach() for moment in _MOMENTS}
         expected[f"step.{name}"] = torch.zeros(())
+    if config.ema_decay:
+        expected |= {f"trained.{name}": t for name, t in behavior.state_dict().items()}
     tensors = _decode(optimizer, expected)
     trained = behavior
     if config.ema_decay:

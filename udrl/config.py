@@ -46,6 +46,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             return in evaluation (2.3.2); None: what the environment declares, if anything.
         seed: the seed that every random stream is keyed by.
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
+        baseline: what desired returns are relative to where the network reads them: ``none``, the
+            paper's; or ``value``: what a learned value function expects (:mod:`udrl.value`).
         batch_size: examples in one update.
         command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
             ``ranked``, ``record``, or a class of your own as ``package.module:Class``
@@ -73,6 +75,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             never.
         recent_size: newest episodes that the replay buffer holds besides, whatever they returned;
             0 is the paper's.
+        return_lambda: with a ``baseline``, the lambda of the lambda-returns that examples are
+            labelled with: 1 for the observed return, 0 for one reward and the value after it.
         return_scale: factor on the desired return at the network's input.
         segments: ``trailing`` segments only (the paper's experiments) or ``all`` (2.3.3).
         frame_stack: most recent observations that the network sees at once, one after another
@@ -104,6 +108,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
     lead: Annotated[int, Meta(ge=0, le=64)] = 0
 
+    baseline: Literal["none", "value"] = "none"
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -122,6 +127,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     replay_size: Annotated[int, Meta(ge=1, le=1_000_000)] = 500
     max_age: PositiveInt | None = None
     recent_size: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    return_lambda: Annotated[float, Meta(ge=0, le=1)] = 0.95
     return_scale: Scale = 0.025
 
     segments: Literal["trailing", "all"] = "trailing"
@@ -143,6 +149,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def __post_init__(self) -> None:
         _refuse_non_finite(self)
+        if self.baseline != "none" and self.segments != "trailing":
+            raise ConfigError(
+                f"segments = {self.segments!r} with baseline = {self.baseline!r}: lambda-returns "
+                f"reach to the end of an episode; set segments = 'trailing' or baseline = 'none'"
+            )
         if self.last_few > self.replay_size:
             raise ConfigError(
                 f"last_few = {self.last_few}: must be at most replay_size = {self.replay_size}, "

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import BehaviorFunction, initialise, stacked_shape
+from udrl.behavior import BehaviorFunction, initialise
 from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
 from udrl.digests import arrays_digest, episode_digest, tensors_digest
+from udrl.encoders import stacked_shape
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode, Observations, action_dtype
 from udrl.errors import InexactArithmetic

@@ -10,8 +10,9 @@ import numpy.typing as npt
 import torch
 
 from udrl.acting import CommandReader, sample
-from udrl.behavior import BehaviorFunction, stacked_shape
+from udrl.behavior import BehaviorFunction
 from udrl.config import Config
+from udrl.encoders import stacked_shape
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 

@@ -4,6 +4,7 @@ An example asks: in state s_t1, what action began a behavior that earned the des
 sum(r[t1..t2-1]) in the desired horizon t2 - t1? The answer is a_t1. Trailing segments have t2 = T.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -33,7 +34,8 @@ class Examples(NamedTuple):
 
     Attributes:
         observation: s_t1, [n, *stacked_shape]: float32 vectors or uint8 images.
-        desired_return: float64 [n].
+        desired_return: what the segment returned, or its label
+            (:meth:`RankedExperience.label`), float64 [n].
         desired_horizon: int64 [n], in steps.
         action: a_t1, uint8 or int32 [n].
     """
@@ -94,6 +96,7 @@ class Experience:
         self._page_table = np.zeros((n_episodes, pages_per_episode), np.int64)
         self._lengths = np.zeros(n_episodes, np.int64)
         self._returns = np.zeros(n_episodes)
+        self._truncated = np.zeros(n_episodes, np.bool_)
         self._free_slots = list(range(n_episodes))[::-1]
         self._free_pages = list(range(n_pages))[::-1]
         self._places: dict[int, _Place] = {}
@@ -117,6 +120,7 @@ class Experience:
         self._page_table[slot, :count] = pages
         self._lengths[slot] = episode.length
         self._returns[slot] = episode.episode_return
+        self._truncated[slot] = episode.truncated
         self._places[episode.command_id] = _Place(slot, pages)
 
     def remove(self, episode_id: int) -> None:
@@ -132,28 +136,81 @@ class Experience:
 
 
 class RankedExperience:
-    """The episodes of an :class:`Experience` in the order of the buffer, least return first."""
+    """The episodes of an :class:`Experience` in the order of the buffer, least return first.
+
+    Attributes:
+        lengths: of the episodes, by rank.
+    """
 
     def __init__(self, experience: Experience, slots: Indices) -> None:
         self._experience = experience
         self._slots = slots
+        self._labels: Numbers | None = None
         self.lengths: Indices = experience._lengths[slots]
+        self._first_step: Indices = np.cumsum(self.lengths) - self.lengths
 
     def examples(self, segments: Segments) -> Examples:
         """Gather the examples that segments stand for."""
         held = self._experience
         slot = self._slots[segments.rank]
         row = self._row(slot, segments.t1)
-        earned_at_t2 = held._returns[slot]
-        inner = np.flatnonzero(segments.t2 < held._lengths[slot])
-        if len(inner):
-            earned_at_t2[inner] = held._earned[self._row(slot[inner], segments.t2[inner])]
+        if self._labels is None:
+            desired_return = self._earned_until(slot, segments.t2) - held._earned[row]
+        else:
+            desired_return = self._labels[self._first_step[segments.rank] + segments.t1]
         return Examples(
             observation=self._observed(slot, segments.t1),
-            desired_return=earned_at_t2 - held._earned[row],
+            desired_return=desired_return,
             desired_horizon=segments.t2 - segments.t1,
             action=held._actions[row],
         )
+
+    def observations(self, at_once: int = 4096) -> Iterator[Observations]:
+        """Yield what the network sees at every step, episode by episode."""
+        rank = np.repeat(np.arange(len(self.lengths)), self.lengths)
+        t = np.arange(len(rank)) - self._first_step[rank]
+        for first in range(0, len(rank), at_once):
+            part = slice(first, first + at_once)
+            yield self._observed(self._slots[rank[part]], t[part])
+
+    def label(self, expected: Numbers, lam: float, scale: float) -> float:
+        """Make lambda-returns the desired returns of all trailing segments.
+
+        G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
+        expected; after a truncation what was expected a step before (the last observation is not
+        kept).
+
+        Args:
+            expected: V at every step, in the order of :meth:`observations`, in scaled return.
+            lam: lambda, in [0, 1].
+            scale: factor on rewards.
+
+        Returns:
+            The root mean square of what the labels differ from V by.
+        """
+        held, slots, first, last = self._experience, self._slots, self._first_step, self.lengths - 1
+        labels = np.empty(len(expected))
+        beyond = np.where(held._truncated[slots], expected[first + last], 0.0)
+        label, following = beyond.copy(), beyond.copy()
+        for t in reversed(range(int(self.lengths.max()))):
+            ranks = np.flatnonzero(t <= last)
+            slot, step = slots[ranks], first[ranks] + t
+            earned = self._earned_until(slot, np.full(len(slot), t + 1))
+            reward = scale * (earned - held._earned[self._row(slot, np.full(len(slot), t))])
+            label[ranks] = reward + (1 - lam) * following[ranks] + lam * label[ranks]
+            labels[step] = label[ranks]
+            following[ranks] = expected[step]
+        self._labels = labels / scale
+        return float(np.sqrt(np.mean((labels - expected) ** 2)))
+
+    def _earned_until(self, slot: Indices, t: Indices) -> Numbers:
+        """Return the rewards earned before step t, which may be the episode's length."""
+        held = self._experience
+        earned = held._returns[slot]
+        inner = np.flatnonzero(t < held._lengths[slot])
+        if len(inner):
+            earned[inner] = held._earned[self._row(slot[inner], t[inner])]
+        return earned
 
     def _observed(self, slot: Indices, t: Indices) -> Observations:
         """Return what the network sees at times t: single observations, or stacks of them."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -16,6 +16,10 @@ from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Purpose, Stream, stream_key
+from udrl.value import ValueFunction
+
+#: Where V fits perfectly, every command but V's own would be infinitely far from it.
+_LEAST_DEVIATION = 1e-3
 
 
 @dataclass
@@ -79,22 +83,64 @@ def _update(
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
     batch = _Batch(config, state.trained)
+    losses = torch.zeros((), dtype=torch.float64, device=config.device)
+    one = torch.ones((), device=config.device)
     parameters = list(state.trained.parameters())
     averages = list(state.behavior.parameters())
     average = get_ema_multi_avg_fn(config.ema_decay)
-    losses = torch.zeros((), dtype=torch.float64, device=config.device)
-    one = torch.ones((), device=config.device)
+    if state.trained.value is not None:
+        _learn_value(state, state.trained.value, experience, segments, config, batch)
     for rank, t1, t2 in zip(*segments, strict=True):
         observation, command, action = batch.fill(experience, Segments(rank, t1, t2))
         loss = functional.cross_entropy(state.trained(observation, command), action)
-        for parameter in parameters:
-            parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
-        loss.backward(one)
-        state.optimizer.step()
+        _step(state.optimizer, parameters, loss, one)
         if config.ema_decay:
             average(averages, parameters, None)
         losses += loss.detach()
     return float(losses)
+
+
+def _learn_value(
+    state: TrainingState,
+    value: ValueFunction,
+    experience: RankedExperience,
+    segments: Segments,
+    config: Config,
+    batch: "_Batch",
+) -> None:
+    """Bring V to the lambda-returns, one update for each row, then label the examples anew."""
+    parameters = list(state.trained.parameters())
+    one = torch.ones((), device=config.device)
+    _label(value, experience, config)
+    for rank, t1, t2 in zip(*segments, strict=True):
+        observation, command, _ = batch.fill(experience, Segments(rank, t1, t2))
+        loss = functional.mse_loss(value(observation), command[:, 0])
+        _step(state.optimizer, parameters, loss, one)
+    deviation = _label(value, experience, config)
+    for behavior in (state.trained, state.behavior):
+        behavior.deviation.fill_(max(deviation, _LEAST_DEVIATION))
+
+
+def _label(value: ValueFunction, experience: RankedExperience, config: Config) -> float:
+    """Label the buffer's steps with lambda-returns; return their deviation from V."""
+    with torch.inference_mode():
+        act = value.frozen()
+        expected = [
+            act(torch.from_numpy(part).clone().to(config.device)).cpu().numpy()
+            for part in experience.observations()
+        ]
+    return experience.label(
+        np.concatenate(expected).astype(np.float64), config.return_lambda, config.return_scale
+    )
+
+
+def _step(
+    optimizer: torch.optim.Adam, parameters: list[nn.Parameter], loss: Tensor, one: Tensor
+) -> None:
+    for parameter in parameters:
+        parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
+    loss.backward(one)
+    optimizer.step()
 
 
 @contextlib.contextmanager

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import Acting, BehaviorFunction, initialise, stacked_shape
+from udrl.behavior import Acting, BehaviorFunction, initialise
 from udrl.commands import Command
 from udrl.config import Config, build
+from udrl.encoders import stacked_shape
 from udrl.environments import make_environment, specify
 from udrl.episode import Episode, recent
 from udrl.segments import Experience, Segments

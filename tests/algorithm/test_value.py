@@ -1,0 +1,199 @@
+"""The value function and desired returns relative to it (udrl.value)."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.behavior import initialise
+from udrl.checkpoint import decode_state, encode_optimizer, encode_weights
+from udrl.config import Config, build
+from udrl.digests import tensors_digest
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import ConfigError
+from udrl.numerics import check_batch_invariance
+from udrl.segments import Experience, RankedExperience, Segments
+from udrl.training import train, untrained
+from udrl.value import relative
+
+SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
+IMAGES = EnvironmentSpec(
+    observation_shape=(1, 16, 16), observation_dtype="uint8", n_actions=2, max_episode_steps=20
+)
+
+
+def settings(**values: Any) -> Config:
+    small = {
+        "environment": "Figure2-v0",
+        "baseline": "value",
+        "hidden": [16, 16],
+        "convolutions": [4, 8],
+        "batch_size": 32,
+        "n_updates_per_iter": 6,
+        "learning_rate": 1e-2,
+        "return_scale": 0.5,
+    }
+    return build(Config, small | values)
+
+
+def episode(
+    number: int, rewards: list[float], *, truncated: bool = False, spec: EnvironmentSpec = SPEC
+) -> Episode:
+    rng = np.random.default_rng(number)
+    shape = (len(rewards), *spec.observation_shape)
+    observations = (
+        rng.integers(256, size=shape, dtype=np.uint8)
+        if spec.is_image
+        else rng.standard_normal(shape, np.float32)
+    )
+    return Episode(
+        command_id=number,
+        observations=observations,
+        actions=rng.integers(spec.n_actions, size=len(rewards), dtype=np.uint8),
+        rewards=np.array(rewards, np.float32),
+        terminated=not truncated,
+        truncated=truncated,
+    )
+
+
+def ranked(
+    episodes: list[Episode], config: Config | None = None, spec: EnvironmentSpec = SPEC
+) -> RankedExperience:
+    held = Experience(config or settings(), spec)
+    for one in episodes:
+        held.add(one)
+    return held.by_rank([one.command_id for one in episodes])
+
+
+def lambda_return(rewards: list[float], values: list[float], end: float, lam: float) -> float:
+    """The definition: a mean of n-step returns, of which the last has all the weight left."""
+    n_step, earned = [], 0.0
+    for n, reward in enumerate(rewards, start=1):
+        earned += reward
+        n_step.append(earned + (values[n] if n < len(values) else end))
+    weights = [(1 - lam) * lam**n for n in range(len(rewards) - 1)] + [lam ** (len(rewards) - 1)]
+    return sum(w * g for w, g in zip(weights, n_step, strict=True))
+
+
+numbers = st.floats(-100, 100, width=32)
+
+
+@given(
+    st.lists(
+        st.tuples(st.lists(numbers, min_size=1, max_size=70), st.booleans()), min_size=1, max_size=4
+    ),
+    st.floats(0, 1),
+    st.sampled_from([0.25, 1.0]),
+    st.randoms(use_true_random=False),
+)
+def test_labels_are_lambda_returns(
+    drawn: list[tuple[list[float], bool]], lam: float, scale: float, random: Any
+) -> None:
+    experience = ranked(
+        [episode(i, rewards, truncated=cut) for i, (rewards, cut) in enumerate(drawn)]
+    )
+    values = [[random.uniform(-50, 50) for _ in rewards] for rewards, _ in drawn]
+    deviation = experience.label(np.concatenate(values), lam, scale)
+
+    squares = []
+    for rank, (rewards, cut) in enumerate(drawn):
+        n = len(rewards)
+        got = experience.examples(
+            Segments(np.full(n, rank), np.arange(n), np.full(n, n))
+        ).desired_return
+        scaled = [scale * reward for reward in rewards]
+        end = values[rank][-1] if cut else 0.0
+        expected = [lambda_return(scaled[t:], values[rank][t:], end, lam) for t in range(n)]
+        np.testing.assert_allclose(got * scale, expected, rtol=1e-9, atol=1e-6)
+        squares += [(e - v) ** 2 for e, v in zip(expected, values[rank], strict=True)]
+    assert deviation == pytest.approx(np.sqrt(np.mean(squares)), abs=1e-6)
+
+
+def test_with_lambda_1_labels_are_what_was_obtained() -> None:
+    experience = ranked([episode(0, [1.0, 2.0, 4.0]), episode(1, [-1.0])])
+    segments = Segments(np.array([0, 0, 0, 1]), np.array([0, 1, 2, 0]), np.array([3, 3, 3, 1]))
+    before = experience.examples(segments).desired_return
+    experience.label(np.array([9.0, 9.0, 9.0, 9.0]), 1.0, 0.5)
+    assert experience.examples(segments).desired_return.tolist() == before.tolist()
+
+
+def test_observations_come_step_by_step_in_parts() -> None:
+    episodes = [episode(0, [0.0] * 70), episode(1, [0.0] * 3)]
+    parts = list(ranked(episodes).observations(at_once=50))
+    assert [len(part) for part in parts] == [50, 23]
+    expected = np.concatenate([e.observations for e in episodes])
+    np.testing.assert_array_equal(np.concatenate(parts), expected)
+
+
+def test_a_relative_return_is_in_deviations_and_bounded() -> None:
+    command = torch.tensor([[3.0, 0.1], [1.0, 0.2], [90.0, 0.3], [-90.0, 0.4]])
+    got = relative(command, torch.tensor([1.0, 1.0, 1.0, 1.0]), torch.tensor(2.0))
+    torch.testing.assert_close(got, torch.tensor([[1.0, 0.1], [0.0, 0.2], [2.0, 0.3], [-2.0, 0.4]]))
+
+
+@pytest.mark.parametrize("spec", [SPEC, IMAGES], ids=["vectors", "images"])
+def test_what_acts_computes_what_is_trained(spec: EnvironmentSpec) -> None:
+    behavior = initialise(settings(), spec)
+    rng = torch.Generator().manual_seed(0)
+    observation = torch.rand(16, *spec.observation_shape, generator=rng)
+    if spec.is_image:
+        observation = (255 * observation).to(torch.uint8)
+    command = torch.rand(16, 2, generator=rng)
+    assert torch.equal(behavior.frozen()(observation, command), behavior(observation, command))
+    check_batch_invariance(settings(), spec)
+
+
+def test_the_value_function_learns_what_follows() -> None:
+    config = settings(n_updates_per_iter=100, learning_rate=3e-3, return_lambda=0.9)
+    # What follows is written in the observation.
+    episodes = [episode(i, [1.0] * 40) for i in range(8)]
+    for one in episodes:
+        one.observations[:, 0] = np.arange(40, 0, -1) / 40
+    state = untrained(config, SPEC)
+    experience = ranked(episodes, config)
+    for _ in range(20):
+        train(state, experience, config)
+    value = state.behavior.value
+    assert value is not None
+    observation = torch.zeros(3, 3)
+    observation[:, 0] = torch.tensor([1.0, 0.5, 0.1])
+    expected = value(observation) / config.return_scale
+    torch.testing.assert_close(expected, torch.tensor([40.0, 20.0, 4.0]), atol=3.0, rtol=0)
+    assert float(state.behavior.deviation) < 1.0
+
+
+@pytest.mark.parametrize("ema_decay", [0.0, 0.9])
+def test_a_restored_state_trains_on_as_if_nothing_had_happened(ema_decay: float) -> None:
+    config = settings(ema_decay=ema_decay)
+    experience = ranked([episode(i, [1.0, 0.0, float(i)]) for i in range(4)], config)
+    state = untrained(config, SPEC)
+    train(state, experience, config)
+    restored = decode_state(
+        1, encode_weights(state.behavior), encode_optimizer(state), config, SPEC
+    )
+    for one in (state, restored):
+        train(one, experience, config)
+    assert tensors_digest(state.behavior.state_dict()) == tensors_digest(
+        restored.behavior.state_dict()
+    )
+    assert encode_optimizer(state) == encode_optimizer(restored)
+
+
+def test_the_baseline_changes_what_is_learned() -> None:
+    episodes = [episode(i, [1.0, 0.0, float(i)]) for i in range(4)]
+    digests = set()
+    for lam in (0.5, 1.0):
+        config = settings(return_lambda=lam)
+        state = untrained(config, SPEC)
+        train(state, ranked(episodes, config), config)
+        digests.add(tensors_digest(state.behavior.state_dict()))
+    assert len(digests) == 2
+
+
+def test_a_baseline_needs_trailing_segments() -> None:
+    with pytest.raises(ConfigError, match="segments = 'all' with baseline = 'value'"):
+        settings(segments="all")
