@@ -40,11 +40,8 @@ class BehaviorFunction(nn.Module):
             ``precision``, ``baseline``.
 
     Attributes:
-        value: V(s), to which desired returns are relative; None where ``baseline`` is ``none``.
-        deviation: what one unit of a relative desired return stands for, in scaled return.
+        value: what desired returns are relative to; None where ``baseline`` is ``none``.
     """
-
-    deviation: Tensor
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
@@ -62,8 +59,6 @@ class BehaviorFunction(nn.Module):
         self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
         self.action = fully_connected(widths[-1], spec.n_actions)
         self.value = ValueFunction(spec, config) if config.baseline == "value" else None
-        if self.value is not None:
-            self.register_buffer("deviation", torch.ones(()))
 
     def forward(self, observation: Tensor, command: Tensor) -> Tensor:
         """Return the logits of P(a | s, c).
@@ -78,7 +73,7 @@ class BehaviorFunction(nn.Module):
         if self.value is not None:
             with torch.no_grad():
                 expected = self.value(observation)
-            command = relative(command, expected, self.deviation)
+            command = relative(command, expected)
         return self._logits(self._tensors(), observation, command)
 
     def frozen(self) -> Acting:
@@ -92,7 +87,7 @@ class BehaviorFunction(nn.Module):
 
         def act(observation: Tensor, command: Tensor) -> Tensor:
             if value is not None:
-                command = relative(command, value(observation), self.deviation)
+                command = relative(command, value(observation))
             return self._logits(layers, observation, command)
 
         return act

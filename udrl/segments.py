@@ -173,7 +173,7 @@ class RankedExperience:
             part = slice(first, first + at_once)
             yield self._observed(self._slots[rank[part]], t[part])
 
-    def label(self, expected: Numbers, lam: float, scale: float) -> float:
+    def label(self, expected: Numbers, lam: float) -> None:
         """Make lambda-returns the desired returns of all trailing segments.
 
         G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
@@ -181,12 +181,8 @@ class RankedExperience:
         kept).
 
         Args:
-            expected: V at every step, in the order of :meth:`observations`, in scaled return.
+            expected: V at every step, in the order of :meth:`observations`, float64.
             lam: lambda, in [0, 1].
-            scale: factor on rewards.
-
-        Returns:
-            The root mean square of what the labels differ from V by.
         """
         held, slots, first, last = self._experience, self._slots, self._first_step, self.lengths - 1
         labels = np.empty(len(expected))
@@ -196,12 +192,11 @@ class RankedExperience:
             ranks = np.flatnonzero(t <= last)
             slot, step = slots[ranks], first[ranks] + t
             earned = self._earned_until(slot, np.full(len(slot), t + 1))
-            reward = scale * (earned - held._earned[self._row(slot, np.full(len(slot), t))])
+            reward = earned - held._earned[self._row(slot, np.full(len(slot), t))]
             label[ranks] = reward + (1 - lam) * following[ranks] + lam * label[ranks]
             labels[step] = label[ranks]
             following[ranks] = expected[step]
-        self._labels = labels / scale
-        return float(np.sqrt(np.mean((labels - expected) ** 2)))
+        self._labels = labels
 
     def _earned_until(self, slot: Indices, t: Indices) -> Numbers:
         """Return the rewards earned before step t, which may be the episode's length."""

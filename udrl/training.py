@@ -16,10 +16,7 @@ from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.value import ValueFunction
-
-#: Where V fits perfectly, every command but V's own would be infinitely far from it.
-_LEAST_DEVIATION = 1e-3
+from udrl.value import ValueFunction, value_loss
 
 
 @dataclass
@@ -114,24 +111,20 @@ def _learn_value(
     _label(value, experience, config)
     for rank, t1, t2 in zip(*segments, strict=True):
         observation, command, _ = batch.fill(experience, Segments(rank, t1, t2))
-        loss = functional.mse_loss(value(observation), command[:, 0])
+        loss = value_loss(value(observation), command[:, 0])
         _step(state.optimizer, parameters, loss, one)
-    deviation = _label(value, experience, config)
-    for behavior in (state.trained, state.behavior):
-        behavior.deviation.fill_(max(deviation, _LEAST_DEVIATION))
+    _label(value, experience, config)
 
 
-def _label(value: ValueFunction, experience: RankedExperience, config: Config) -> float:
-    """Label the buffer's steps with lambda-returns; return their deviation from V."""
+def _label(value: ValueFunction, experience: RankedExperience, config: Config) -> None:
+    """Label all steps of the buffer with lambda-returns."""
     with torch.inference_mode():
         act = value.frozen()
         expected = [
-            act(torch.from_numpy(part).clone().to(config.device)).cpu().numpy()
+            act(torch.from_numpy(part).clone().to(config.device))[:, 0].cpu().numpy()
             for part in experience.observations()
         ]
-    return experience.label(
-        np.concatenate(expected).astype(np.float64), config.return_lambda, config.return_scale
-    )
+    experience.label(np.concatenate(expected) / config.return_scale, config.return_lambda)
 
 
 def _step(

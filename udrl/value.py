@@ -1,21 +1,22 @@
 """A value function, and desired returns relative to it. Not in the paper, which has none.
 
-An episode's return is mostly decided by the states that the agent was in and by luck, and hardly by
-one action; so the behavior function learns little from it, and soon reads the desired return no
-more. With ``baseline = "value"`` a second network, V(s), learns what return to expect from a state.
-It serves twice:
+One action changes an episode's return by little; states and luck decide most of it. So the behavior
+function learns little from whole returns, and soon ignores the desired return. With ``baseline =
+"value"`` a second network learns V(s), the return to expect from a state, and D(s), by how much
+returns deviate from it. They serve twice:
 
-- Examples are labelled with lambda-returns instead of observed ones: what follows later counts less
-  than what V expects, by ``return_lambda`` a step.
-- The behavior function reads how far the desired return is above V(s), in standard deviations. In
-  training that is what an action gained (the generalised advantage estimate of Schulman et al.,
-  2016); in acting it says to do better or worse than usual, until V(s) fits the command.
+- Examples are labelled with lambda-returns instead of observed ones: after a few steps V stands for
+  the rewards that follow (``return_lambda``).
+- The behavior function reads (desired return - V(s)) / D(s). In training that is what an action
+  gained, the generalised advantage estimate of Schulman et al. (2016), in units that are alike in
+  all states. In acting it asks for better or worse than usual, until V(s) is what is desired.
 """
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from udrl.config import Config
 from udrl.encoders import (
@@ -32,12 +33,15 @@ from udrl.environments.making import EnvironmentSpec
 
 _WIDTH = 64
 
-#: Relative desired returns are kept within so many standard deviations.
+#: D(s) is at least this, in scaled return: where V fits perfectly, every gain would be infinite.
+_LEAST_DEVIATION = 3e-3
+
+#: Relative desired returns are kept within so many deviations.
 _LIMIT = 2.0
 
 
 class ValueFunction(nn.Module):
-    """V(s): the scaled return to expect from an observation on.
+    """V(s) and D(s): the scaled return to expect, and its mean absolute deviation.
 
     Args:
         spec: size of the observation space.
@@ -55,10 +59,10 @@ class ValueFunction(nn.Module):
             self.encoder = nn.ModuleList([fully_connected(shape[0], _WIDTH)])
             features = _WIDTH
         self.hidden = fully_connected(features, _WIDTH)
-        self.expected = fully_connected(_WIDTH, 1)
+        self.expected = fully_connected(_WIDTH, 2)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return V(s), float32 [batch].
+        """Return (V(s), D(s)), float32 [batch, 2].
 
         Args:
             observation: s, [batch, *observation_shape]: float32 vectors or uint8 images.
@@ -77,16 +81,22 @@ class ValueFunction(nn.Module):
         *encoder, (weight, bias), (out_weight, out_bias) = layers
         features = encode(encoder, observation, torch.tanh_)
         features = torch.tanh_(torch.addmm(bias, features, weight))
-        return torch.addmm(out_bias, features, out_weight)[:, 0].float()
+        value, deviation = torch.addmm(out_bias, features, out_weight).float().unbind(1)
+        return torch.stack([value, functional.softplus(deviation) + _LEAST_DEVIATION], dim=1)
 
 
-def relative(command: Tensor, expected: Tensor, deviation: Tensor) -> Tensor:
+def value_loss(expected: Tensor, label: Tensor) -> Tensor:
+    """Return the loss of (V(s), D(s)), [batch, 2], for lambda-returns, scaled, float32 [batch]."""
+    error = label - expected[:, 0]
+    return error.square().mean() + (error.detach().abs() - expected[:, 1]).square().mean()
+
+
+def relative(command: Tensor, expected: Tensor) -> Tensor:
     """Return scaled commands, [batch, 2], with the desired return relative to what is expected.
 
     Args:
         command: (desired return, desired horizon), each scaled, float32 [batch, 2].
-        expected: V(s), float32 [batch].
-        deviation: standard deviation of lambda-returns around V.
+        expected: (V(s), D(s)), float32 [batch, 2].
     """
-    above = (command[:, 0] - expected) / deviation
+    above = (command[:, 0] - expected[:, 0]) / expected[:, 1]
     return torch.stack([above.clamp(-_LIMIT, _LIMIT), command[:, 1]], dim=1)

@@ -55,6 +55,11 @@ def logits(weights: Weights, config: dict[str, Any], s: torch.Tensor, c: torch.T
     def layer(name: str, x: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.linear(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
 
+    if config["baseline"] == "value":
+        v = torch.tanh(layer("value.hidden", torch.tanh(layer("value.encoder.0", s))))
+        value, deviation = layer("value.expected", v).unbind(1)
+        above = (c[:, 0] - value) / (torch.nn.functional.softplus(deviation) + 0.003)
+        c = torch.stack([above.clamp(-2, 2), c[:, 1]], 1)
     x = f(layer("observation", s)) * torch.sigmoid(layer("command", c))
     for i in range(len(config["hidden"]) - 1):
         x = f(layer(f"layers.{i}", x))
@@ -142,10 +147,13 @@ def initial_weights(config: dict[str, Any], spec: dict[str, Any]) -> Weights:
     shapes |= {f"layers.{i}": (h[i + 1], h[i]) for i in range(len(h) - 1)}
     shapes["action"] = (spec["n_actions"], h[-1])
     weights: dict[str, torch.Tensor] = {}
+    if config["baseline"] == "value":
+        shapes |= {"value.encoder.0": (64, *spec["observation_shape"])}
+        shapes |= {"value.hidden": (64, 64), "value.expected": (2, 64)}
     for name, (outputs, inputs) in shapes.items():
         weight, bias = torch.empty(outputs, inputs), torch.zeros(outputs)
         if config["initialisation"] == "orthogonal":
-            outer = name in ("command", "action")
+            outer = name in ("command", "action", "value.expected")
             gain = 1.0 if outer else torch.nn.init.calculate_gain(config["activation"])
             torch.nn.init.orthogonal_(weight, gain, generator)
         else:

@@ -54,10 +54,13 @@ def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
     return {name: msgspec.to_builtins(value) for name, value in plain.items()}
 
 
+@pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-def test_probe_has_the_same_digest(activation: Any, initialisation: Any) -> None:
-    config = msgspec.structs.replace(CONFIG, activation=activation, initialisation=initialisation)
+def test_probe_has_the_same_digest(activation: Any, initialisation: Any, baseline: Any) -> None:
+    config = msgspec.structs.replace(
+        CONFIG, activation=activation, initialisation=initialisation, baseline=baseline
+    )
     generator = EpisodeGenerator(config, 1)
     assert stranger.numerics_class(hello(config, generator.spec)) == (
         acting_class(config, generator)
