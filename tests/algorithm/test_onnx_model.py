@@ -38,6 +38,8 @@ def policy(spec: EnvironmentSpec, **values: Any) -> Policy:
         (VECTOR, {"desired_horizon": "return", "activation": "tanh"}),
         (VECTOR, {"frame_stack": 3}),
         (IMAGE, {"frame_stack": 4}),
+        (VECTOR, {"baseline": "value"}),
+        (IMAGE, {"frame_stack": 4, "baseline": "value"}),
     ],
 )
 def test_it_acts_as_the_policy_does(
