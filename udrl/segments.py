@@ -154,10 +154,14 @@ class RankedExperience:
         held = self._experience
         slot = self._slots[segments.rank]
         row = self._row(slot, segments.t1)
-        if self._labels is None:
-            desired_return = self._earned_until(slot, segments.t2) - held._earned[row]
-        else:
+        if self._labels is not None:
             desired_return = self._labels[self._first_step[segments.rank] + segments.t1]
+        else:
+            earned_at_t2 = held._returns[slot]
+            inner = np.flatnonzero(segments.t2 < held._lengths[slot])
+            if len(inner):
+                earned_at_t2[inner] = held._earned[self._row(slot[inner], segments.t2[inner])]
+            desired_return = earned_at_t2 - held._earned[row]
         return Examples(
             observation=self._observed(slot, segments.t1),
             desired_return=desired_return,
@@ -167,11 +171,10 @@ class RankedExperience:
 
     def observations(self, at_once: int = 4096) -> Iterator[Observations]:
         """Yield what the network sees at every step, episode by episode."""
-        rank = np.repeat(np.arange(len(self.lengths)), self.lengths)
-        t = np.arange(len(rank)) - self._first_step[rank]
-        for first in range(0, len(rank), at_once):
+        slot, t = self._all_steps()
+        for first in range(0, len(t), at_once):
             part = slice(first, first + at_once)
-            yield self._observed(self._slots[rank[part]], t[part])
+            yield self._observed(slot[part], t[part])
 
     def label(self, expected: Numbers, lam: float) -> None:
         """Make lambda-returns the desired returns of all trailing segments.
@@ -184,28 +187,26 @@ class RankedExperience:
             expected: V at every step, in the order of :meth:`observations`, float64.
             lam: lambda, in [0, 1].
         """
-        held, slots, first, last = self._experience, self._slots, self._first_step, self.lengths - 1
-        labels = np.empty(len(expected))
-        beyond = np.where(held._truncated[slots], expected[first + last], 0.0)
-        label, following = beyond.copy(), beyond.copy()
-        for t in reversed(range(int(self.lengths.max()))):
-            ranks = np.flatnonzero(t <= last)
-            slot, step = slots[ranks], first[ranks] + t
-            earned = self._earned_until(slot, np.full(len(slot), t + 1))
-            reward = earned - held._earned[self._row(slot, np.full(len(slot), t))]
-            label[ranks] = reward + (1 - lam) * following[ranks] + lam * label[ranks]
-            labels[step] = label[ranks]
-            following[ranks] = expected[step]
+        held, slots, first = self._experience, self._slots, self._first_step
+        last = first + self.lengths - 1
+        earned = held._earned[self._row(*self._all_steps())]
+        beyond = np.where(held._truncated[slots], expected[last], 0.0)
+        # What follows each step: rewards earned until then, V, and (where it ends) the label.
+        earned_next, expected_next = np.roll(earned, -1), np.roll(expected, -1)
+        earned_next[last], expected_next[last] = held._returns[slots], beyond
+        labels = earned_next - earned + (1 - lam) * expected_next
+        labels[last] += lam * beyond
+        longest_first = np.argsort(-self.lengths, kind="stable")
+        first, lengths = first[longest_first], self.lengths[longest_first]
+        for t in reversed(range(int(lengths[0]) - 1)):
+            step = first[: np.searchsorted(-lengths, -(t + 1), side="left")] + t
+            labels[step] += lam * labels[step + 1]
         self._labels = labels
 
-    def _earned_until(self, slot: Indices, t: Indices) -> Numbers:
-        """Return the rewards earned before step t, which may be the episode's length."""
-        held = self._experience
-        earned = held._returns[slot]
-        inner = np.flatnonzero(t < held._lengths[slot])
-        if len(inner):
-            earned[inner] = held._earned[self._row(slot[inner], t[inner])]
-        return earned
+    def _all_steps(self) -> tuple[Indices, Indices]:
+        """Return slot and time of every step, episode by episode."""
+        rank = np.repeat(np.arange(len(self.lengths)), self.lengths)
+        return self._slots[rank], np.arange(len(rank)) - self._first_step[rank]
 
     def _observed(self, slot: Indices, t: Indices) -> Observations:
         """Return what the network sees at times t: single observations, or stacks of them."""
