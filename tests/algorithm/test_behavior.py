@@ -94,7 +94,7 @@ def test_what_acts_has_the_bits_of_what_is_trained(
     behavior = initialise(settings(hidden=hidden, activation=activation), LANDER)
     act = behavior.frozen()
     with torch.no_grad():
-        behavior.action.bias += 1  # shared, not copied
+        behavior.action.bias.add_(1)  # shared, not copied
     given = rows(16)
     logits = behavior(*given)
     assert logits.requires_grad

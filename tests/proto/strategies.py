@@ -62,4 +62,6 @@ def _build(cls: type[msgspec.Struct], values: dict[str, Any]) -> msgspec.Struct:
             values.get("replay_size", 500), min(values.get("last_few", 75), 1_000_000)
         )
         values["last_few"] = min(values.get("last_few", 75), values["replay_size"])
+        if values.get("segments") == "all":
+            values["baseline"] = "none"
     return cls(**values)
