@@ -27,7 +27,8 @@ def lead(plan: Plan, tasks: Sequence[Task]) -> Study:
 
 def segments(plan: Plan, tasks: Sequence[Task]) -> Study:
     """Return the study of trailing segments against all, 0 <= t1 < t2 <= T (section 2.3.3)."""
-    variants = {name: {"segments": name} for name in ("trailing", "all")}
+    # A baseline's labels are of trailing segments only.
+    variants = {name: {"segments": name, "baseline": "none"} for name in ("trailing", "all")}
     return _variants("segments", plan, tasks, variants)
 
 

@@ -56,7 +56,7 @@ TOY: dict[str, Any] = SMALL | {
 LANDER: dict[str, Any] = SMALL | {
     "environment": "LunarLander-v3",
     "max_return": None,
-    "command_strategy": "ranked",
+    "baseline": "value",
     "max_train_steps": 500,
     "n_warm_up_episodes": 20,
     "n_episodes_per_iter": 10,
