@@ -1,7 +1,7 @@
 """A value function, and desired returns relative to it. Not in the paper, which has none.
 
 One action changes an episode's return by little; states and luck decide most of it. So the behavior
-function learns little from whole returns, and soon ignores the desired return. With ``baseline =
+function learns little from whole returns, and hardly reads the desired return. With ``baseline =
 "value"`` a second network learns V(s), the return to expect from a state, and D(s), by how much
 returns deviate from it. They serve twice:
 
