@@ -130,6 +130,7 @@ def _label(value: ValueFunction, experience: RankedExperience, config: Config) -
 def _step(
     optimizer: torch.optim.Adam, parameters: list[nn.Parameter], loss: Tensor, one: Tensor
 ) -> None:
+    """Make one update."""
     for parameter in parameters:
         parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
     loss.backward(one)
