@@ -49,8 +49,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         baseline: what desired returns are relative to where the network reads them: ``none``, the
             paper's; or ``value``: what a learned value function expects (:mod:`udrl.value`).
         batch_size: examples in one update.
-        command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``again``,
-            ``ranked``, ``record``, or a class of your own as ``package.module:Class``
+        command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``ranked``,
+            ``maximum``, or a class of your own as ``package.module:Class``
             (:mod:`udrl.strategies`).
         dataset: a Minari dataset whose episodes take the place of the warm-up's; None: none.
         dataset_sha256: digest of these; empty: whatever they are when the run is created.

@@ -86,20 +86,8 @@ class Uniform:
         return mean + deviation * u, horizon
 
 
-class Again:
-    """Do again what one of the best did: its return, in its time. The two always fit together."""
-
-    def __init__(self, config: Config) -> None:
-        pass
-
-    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
-        """Return the return and the length of one of the best, each as likely."""
-        chosen = best[int(u * len(best))]
-        return chosen.episode_return, chosen.length
-
-
 class Ranked:
-    """As :class:`Again`, but the better an episode, the likelier it is chosen.
+    """Do again what one of the best did, its return in its time; the better, the likelier.
 
     Orders that differ, each of which somebody has obeyed, keep agents from doing everything in one
     way; and rare successes are repeated before they are many.
@@ -115,17 +103,6 @@ class Ranked:
         """
         chosen = best[-1 - int(u * u * len(best))]
         return chosen.episode_return, chosen.length
-
-
-class Record:
-    """The greedy one: always the best return there is, in the time that it took."""
-
-    def __init__(self, config: Config) -> None:
-        pass
-
-    def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
-        """Return the return and the length of the very best."""
-        return best[-1].episode_return, best[-1].length
 
 
 class Maximum:
@@ -153,9 +130,7 @@ class Maximum:
 
 STRATEGIES: dict[str, type[CommandStrategy]] = {
     "uniform": Uniform,
-    "again": Again,
     "ranked": Ranked,
-    "record": Record,
     "maximum": Maximum,
 }
 

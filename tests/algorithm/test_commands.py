@@ -217,7 +217,7 @@ def test_iteration_and_index_are_read_from_the_id() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
     config = {
-        "held_actions": share, "hold_steps": 7, "command_strategy": "again", "max_train_steps": 60,
+        "held_actions": share, "hold_steps": 7, "command_strategy": "ranked", "max_train_steps": 60,
         "n_episodes_per_iter": 1000,
     }  # fmt: skip
     buffer = buffer_of([1.0, 2.0], [20, 50])

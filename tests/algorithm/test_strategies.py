@@ -40,11 +40,6 @@ def test_uniform_asks_for_returns_in_m_to_m_plus_s_and_the_mean_length(
     assert horizon == floor(sum(e.length for e in best) / n + 0.5)
 
 
-@given(BEST, U)
-def test_again_asks_for_what_one_of_the_best_did(best: list[Entry], u: float) -> None:
-    assert strategy("again")(best, u) in [(e.episode_return, e.length) for e in best]
-
-
 @given(BEST)
 def test_ranked_asks_for_one_of_the_k_best_with_probability_sqrt_k_of_n(best: list[Entry]) -> None:
     n, tries = len(best), 1_000
@@ -55,18 +50,6 @@ def test_ranked_asks_for_one_of_the_k_best_with_probability_sqrt_k_of_n(best: li
         others = [(e.episode_return, e.length) for e in best[: n - k]]
         if not set(kept) & set(others):
             assert abs(share - sqrt(k / n)) < 2 / tries
-
-
-@given(BEST)
-def test_again_asks_for_each_as_often(best: list[Entry]) -> None:
-    n = len(best)
-    asked = [strategy("again")(best, (i + 0.5) / n) for i in range(n)]
-    assert asked == [(e.episode_return, e.length) for e in best]
-
-
-@given(BEST, U)
-def test_record_asks_for_what_the_very_best_did(best: list[Entry], u: float) -> None:
-    assert strategy("record")(best, u) == (best[-1].episode_return, best[-1].length)
 
 
 @given(BEST, U)
@@ -129,7 +112,7 @@ def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("cautious", r"expected uniform, again, ranked, record, maximum, or a class of your own"),
+        ("cautious", r"expected uniform, ranked, maximum, or a class of your own"),
         ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
         ("udrl.strategies:Missing", "AttributeError"),
     ],
