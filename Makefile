@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 ENV ?= LunarLander-v3
 ARGS ?=
 
-EXTRAS = board,box2d,doom,play,plot,secure
+EXTRAS = board,box2d,doom,play,plot,secure,train
 
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
@@ -68,7 +68,7 @@ $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,minari,onnx,tensorboard,dev]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,minari,tensorboard,dev]'
 	touch $@
 
 clean:

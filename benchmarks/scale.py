@@ -27,12 +27,13 @@ import msgspec
 import numpy as np
 
 from fleet import RUN, Load, Measured
-from udrl.checkpoint import encode_optimizer, encode_weights
+from udrl.checkpoint import encode_optimizer
 from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import Interrupted
-from udrl.numerics import use_one_thread
-from udrl.training import untrained
+from udrl.graph import acting_graph
+from udrl.training import untrained, use_one_thread
+from udrl.weights import encode_weights
 from udrl_launch.training import free_port
 from udrl_proto import PROTOCOL, keys
 from udrl_proto import session as sessions
@@ -82,7 +83,7 @@ def deliver_versions(
     for parameter in state.behavior.parameters():
         parameter.grad = parameter.new_zeros(parameter.shape)
     state.optimizer.step()  # gives Adam the state that a delivery must have
-    weights, optimizer = encode_weights(state.behavior), encode_optimizer(state)
+    weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
         asker = Asker(session, RUN, "learner scale", stop)
         version = 1
@@ -165,7 +166,14 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
         lead=2,
         eval_every=2**31 - 1,
     )
-    hello = Hello(protocol=PROTOCOL, software="0", run_id=RUN, config=config, environment=spec)
+    hello = Hello(
+        protocol=PROTOCOL,
+        software="0",
+        run_id=RUN,
+        config=config,
+        environment=spec,
+        graph=acting_graph(config, spec),
+    )
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stop = threading.Event()
     announced: list[Announced] = []

@@ -34,16 +34,15 @@ from torch.nn import functional
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
-from udrl.behavior import initialise
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
-from udrl.numerics import use_one_thread
+from udrl.graph import ActingFunction, acting_graph, probe_weights
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import train, untrained
+from udrl.training import train, untrained, use_one_thread
 from udrl_launch.agents import load_agent
 from udrl_launch.inspection import status_of
 from udrl_launch.process import keep_freed_memory
@@ -53,6 +52,8 @@ from udrl_replay.run import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
+#: Rows of the call whose time is measured.
+_ROWS = 16
 _ROLES = ("actor", "learner", "replay", "train")
 
 
@@ -260,14 +261,9 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
         steps += episode.length
     step = (time.perf_counter() - began) / steps
 
-    behavior = initialise(config, spec)
-    rows = config.inference_rows
-    observation = torch.zeros(
-        rows, *behavior.observation_shape, dtype=getattr(torch, spec.observation_dtype)
-    )
-    command = torch.zeros(rows, 2)
-    with torch.inference_mode():
-        inference = _seconds(lambda: behavior(observation, command), 5000) / rows
+    graph = acting_graph(config, spec)
+    call = ActingFunction(graph, probe_weights(graph)).call(_ROWS)
+    inference = _seconds(call.run, 5000) / _ROWS
 
     experience = Experience(config, spec)
     for episode in episodes:

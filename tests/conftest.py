@@ -6,7 +6,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from udrl.numerics import use_one_thread
+from udrl.training import use_one_thread
 from udrl_launch import authority
 
 # Box2D's types warn while it is imported; as an error, such a warning kills the interpreter.

@@ -50,6 +50,20 @@ def test_swarm_runs_the_services_of_compose() -> None:
         assert deploy["restart_policy"]["condition"] == service["restart"]
 
 
+def test_torch_is_in_the_image_of_the_learner_only() -> None:
+    dockerfile = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    assert re.findall(r"^FROM (\S+) AS (?:actor|learner)$", dockerfile, flags=re.MULTILINE) == [
+        "${BASE_IMAGE:-python:3.11-slim-bookworm}",
+        "actor",
+    ]
+    compose = services("compose.yaml")
+    targets = {name: s["build"]["target"] for name, s in compose.items() if "build" in s}
+    assert targets == {"replay": "actor", "learner": "learner"}
+    assert {name for name, s in compose.items() if s["image"].endswith("-learner")} == {"learner"}
+    assert compose["actor"]["image"] == compose["replay"]["image"]
+    assert "TORCH_INDEX" not in compose["replay"]["build"]["args"]
+
+
 def test_no_override_publishes_a_port_where_nobody_is_asked() -> None:
     overrides = ["compose.secure.yaml", "compose.gpu.yaml"]
     assert "--insecure" in services("compose.yaml")["replay"]["command"]
@@ -108,6 +122,7 @@ def test_kubernetes_runs_the_services_of_compose() -> None:
         (container,) = workload["spec"]["template"]["spec"]["containers"]
         words = [re.sub(r"\$\((\w+)\)", lambda m: values[m[1]], w) for w in container["args"]]
         assert words[0] == name
+        assert container["image"] == ("udrl-learner" if name == "learner" else "udrl")
         check_udrl(words)
         for probe in ("readinessProbe", "livenessProbe"):
             if probe in container:
@@ -124,6 +139,16 @@ def test_an_autoscaler_may_scale_actors_and_nothing_else() -> None:
 def test_kustomization_names_every_manifest() -> None:
     named = load(KUBERNETES / "kustomization.yaml")["resources"]
     assert sorted([*named, "kustomization.yaml"]) == [path.name for path in MANIFESTS]
+
+
+def test_kustomization_names_every_image() -> None:
+    named = {image["name"] for image in load(KUBERNETES / "kustomization.yaml")["images"]}
+    used = {
+        container["image"]
+        for workload in workloads()
+        for container in workload["spec"]["template"]["spec"]["containers"]
+    }
+    assert named == used
 
 
 def test_slurm_script_says_what_it_needs() -> None:

@@ -9,10 +9,10 @@
         for outcome in generator.step():
             ...  # an Episode, or a Failure
 
-The behavior function is evaluated for all environments in one call, padded to a fixed number of
-rows. Which rows stand beside it does not change a row's result (:mod:`udrl.numerics` checks), so an
-episode depends on its command alone. With a ``frame_stack`` of more than 1 it sees the episode's
-most recent observations (:func:`udrl.episode.recent`).
+The behavior function is evaluated for all environments in one call. Which rows stand beside it does
+not change a row's result (:class:`udrl.graph.ActingFunction`), so an episode depends on its command
+alone. With a ``frame_stack`` of more than 1 it sees the episode's most recent observations
+(:func:`udrl.episode.recent`).
 """
 
 import contextlib
@@ -22,12 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from udrl.behavior import Acting, BehaviorFunction
+from udrl.architecture import stacked_shape
 from udrl.commands import Command
 from udrl.config import Config
-from udrl.encoders import stacked_shape
 from udrl.environments.making import (
     Environment,
     EnvironmentSpec,
@@ -37,6 +35,7 @@ from udrl.environments.making import (
 )
 from udrl.episode import Episode, action_dtype, recent
 from udrl.errors import EnvironmentFault
+from udrl.graph import Acting, Call
 from udrl.streams import Stream
 
 #: Failures under the same command after which it is hopeless.
@@ -48,34 +47,6 @@ _FIRST_BYTES = 64 << 20
 _NEVER = np.iinfo(np.int64).max
 
 _Rows = npt.NDArray[np.int64]
-
-
-class CommandReader:
-    """What the network reads of a command: bounded and scaled (sections 2.3.2 and 3.1).
-
-    Args:
-        config: ``desired_horizon``, ``return_scale``, ``horizon_scale``.
-    """
-
-    def __init__(self, config: Config) -> None:
-        self._horizon_is_return = config.desired_horizon == "return"
-        self._least = np.array([1.0 if self._horizon_is_return else -np.inf, 1.0])
-        self._scales = np.array([config.return_scale, config.horizon_scale])
-
-    def __call__(
-        self, desired: npt.NDArray[np.float64], out: npt.NDArray[np.float32]
-    ) -> npt.NDArray[np.float32]:
-        """Write what is read of ``desired`` to ``out``, and return it.
-
-        Args:
-            desired: (desired return, desired horizon), float64 [n, 2]. Where horizons follow from
-                returns they are set here.
-            out: float32 [n, 2].
-        """
-        if self._horizon_is_return:
-            np.floor(desired[:, 0], out=desired[:, 1])
-        np.multiply(np.maximum(desired, self._least), self._scales, out=out, casting="same_kind")
-        return out
 
 
 def sample(
@@ -106,14 +77,6 @@ class Failure(NamedTuple):
     error: EnvironmentFault
 
 
-class _Call(NamedTuple):
-    """A call of a behavior function: the rows it is for, and those again until there are enough."""
-
-    act: Acting
-    rows: _Rows
-    padded: _Rows
-
-
 class EpisodeGenerator:
     """Runs Algorithm 2 in ``n_environments`` environments at once.
 
@@ -137,33 +100,25 @@ class EpisodeGenerator:
         self._make = make
         self._envs = [make(config) for _ in range(n_environments)]
         self.spec: EnvironmentSpec = specify(self._envs[0], config)
+        self._stacked_shape = stacked_shape(self.spec, config)
         self._limits = [self.spec.max_episode_steps] * n_environments
         self._commands: list[Command | None] = [None] * n_environments
-        self._behaviors: list[BehaviorFunction | None] = [None] * n_environments
-        self._calls: list[_Call] | None = None
+        self._behaviors: list[Acting | None] = [None] * n_environments
+        self._calls: list[tuple[Call, _Rows]] | None = None
         self._greedy: list[int] = []
         # The rounds from and before which a row's action is held, and how many rows have such.
         self._hold_from = np.full(n_environments, _NEVER)
         self._hold_until = np.full(n_environments, _NEVER)
         self._n_holding = 0
 
-        # What the network reads in one call. See training._Batch for why torch owns it.
-        self._inference_rows = rows = config.inference_rows
+        # s_t, c_t = (dr_t, dh_t), r_t, and the logits of P(a | s_t, c_t).
         dtype = np.dtype(self.spec.observation_dtype)
-        self._observation_in = torch.from_numpy(np.zeros(0, dtype)).new_zeros(
-            rows, *stacked_shape(self.spec, config)
-        )
-        self._command_in = torch.zeros(rows, 2)
-
-        # s_t, c_t = (dr_t, dh_t), c_t bounded and scaled, r_t, and the logits of P(a | s_t, c_t).
         self._observation = np.zeros((n_environments, *self.spec.observation_shape), dtype)
         self._desired = np.zeros((n_environments, 2))
-        self._command = np.zeros((n_environments, 2), np.float32)
         self._reward = np.zeros(n_environments, np.float32)
         self._logits = np.zeros((n_environments, self.spec.n_actions))
         self._temperature = np.ones((n_environments, 1))
         self._cap = np.full(n_environments, np.inf)
-        self._read = CommandReader(config)
 
         # A ring of rounds: round k of all environments is kept at k % capacity, until the longest
         # running episode needs more.
@@ -189,7 +144,7 @@ class EpisodeGenerator:
         """The commands being carried out."""
         return [c for c in self._commands if c is not None]
 
-    def start(self, command: Command, behavior: BehaviorFunction | None) -> Failure | None:
+    def start(self, command: Command, behavior: Acting | None) -> Failure | None:
         """Begin an episode; there must be a free environment.
 
         Args:
@@ -270,19 +225,17 @@ class EpisodeGenerator:
 
     def _choose_actions(self, uniforms: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
         """Sample a_t ~ P(a | s_t, c_t) for every row, by inverse CDF in float64."""
-        desired, command, logits = self._desired, self._command, self._logits
+        desired, logits = self._desired, self._logits
         if self.spec.max_return is not None:
             np.minimum(desired[:, 0], self._cap, out=desired[:, 0])
-        self._read(desired, out=command)
         if self._calls is None:
             self._calls = self._plan_calls()
         observation = self._observation if self._frame_stack == 1 else self._stacks()
-        observation_in, command_in = self._observation_in.numpy(), self._command_in.numpy()
-        with torch.inference_mode():
-            for act, rows, padded in self._calls:
-                observation.take(padded, axis=0, out=observation_in, mode="clip")
-                command.take(padded, axis=0, out=command_in, mode="clip")
-                logits[rows] = act(self._observation_in, self._command_in).numpy()[: len(rows)]
+        for call, rows in self._calls:
+            observation.take(rows, axis=0, out=call.observation, mode="clip")
+            desired.take(rows, axis=0, out=call.command, mode="clip")
+            call.run()
+            logits[rows] = call.logits
         actions = sample(logits, self._temperature, uniforms)
         if self._greedy:
             actions[self._greedy] = logits[self._greedy].argmax(axis=1)
@@ -296,25 +249,16 @@ class EpisodeGenerator:
         t = recent(self._round - self._began, self._frame_stack)
         rounds = (self._began[:, None] + t) % self._capacity
         frames = self._observations[rounds, np.arange(len(rounds))[:, None]]
-        stacks: npt.NDArray[np.generic] = frames.reshape(
-            len(frames), *self._observation_in.shape[1:]
-        )
+        stacks: npt.NDArray[np.generic] = frames.reshape(len(frames), *self._stacked_shape)
         return stacks
 
-    def _plan_calls(self) -> list[_Call]:
-        """Gather the rows of each weights version into calls of at most ``inference_rows``."""
-        rows_of: dict[BehaviorFunction, list[int]] = {}
+    def _plan_calls(self) -> list[tuple[Call, _Rows]]:
+        """Gather the rows of each weights version into a call."""
+        rows_of: dict[Acting, list[int]] = {}
         for row, behavior in enumerate(self._behaviors):
             if behavior is not None:
                 rows_of.setdefault(behavior, []).append(row)
-        size = self._inference_rows
-        calls = []
-        for behavior, rows in rows_of.items():
-            act = behavior.frozen()
-            for first in range(0, len(rows), size):
-                part = np.array(rows[first : first + size])
-                calls.append(_Call(act, part, np.resize(part, size)))
-        return calls
+        return [(b.call(len(rows)), np.array(rows)) for b, rows in rows_of.items()]
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
         command = self._command_of(row)
@@ -406,7 +350,7 @@ def _fault(where: str, command: Command, error: Exception) -> EnvironmentFault:
 
 
 def generate_episodes(
-    generator: EpisodeGenerator, commands: Iterable[Command], behavior: BehaviorFunction | None
+    generator: EpisodeGenerator, commands: Iterable[Command], behavior: Acting | None
 ) -> list[Episode]:
     """Carry out commands with one behavior function and return the episodes, by command id.
 
@@ -419,7 +363,7 @@ def generate_episodes(
 
 
 def iterate_episodes(
-    generator: EpisodeGenerator, commands: Iterable[Command], behavior: BehaviorFunction | None
+    generator: EpisodeGenerator, commands: Iterable[Command], behavior: Acting | None
 ) -> Iterator[Episode]:
     """As :func:`generate_episodes`, but yield each episode when it ends, in any order.
 

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config
-from udrl.digests import Digest, episode_digest, replay_digest, tensors_digest
+from udrl.digests import Digest, arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
-from udrl.numerics import settle, use_one_thread
+from udrl.graph import ActingFunction, acting_graph
+from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
-from udrl.training import TrainingState, train, untrained
+from udrl.training import TrainingState, train, untrained, use_one_thread
 
 
 @dataclass
@@ -55,7 +56,7 @@ class Run:
     @property
     def weights_sha256(self) -> str:
         """Digest of the behavior function."""
-        return tensors_digest(self.state.behavior.state_dict()).hex()
+        return arrays_digest(self.state.weights).hex()
 
     @property
     def replay_sha256(self) -> str:
@@ -86,6 +87,7 @@ def algorithm1(
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec.max_episode_steps)
+    graph = acting_graph(config, generator.spec)
 
     # 1: initialise replay buffer with warm-up episodes using random actions (or others')
     run = Run(
@@ -107,7 +109,7 @@ def algorithm1(
         exploratory = sample.explore(run.iteration, run.buffer)
         evaluation = sample.evaluate(run.iteration, run.buffer) if due else []
         # 6: generate episodes using Algorithm 2 and add to replay buffer
-        before, behavior = run.env_steps, run.state.acting()
+        before, behavior = run.env_steps, ActingFunction(graph, run.state.weights)
         run.add(generate_episodes(generator, exploratory, behavior))
         # 7-9: if evaluation required, evaluate current agent using Algorithm 2
         if due:

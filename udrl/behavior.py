@@ -5,12 +5,13 @@ an image by convolutions. The command, scaled by fixed factors, passes a fully c
 layer and is multiplied element-wise with the embedding; fully connected layers follow.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from udrl.architecture import image_features, stacked_shape
 from udrl.config import Config
 from udrl.encoders import (
     ACTIVATIONS,
@@ -19,16 +20,11 @@ from udrl.encoders import (
     convolutions,
     encode,
     fully_connected,
-    image_features,
-    stacked_shape,
     tensors,
 )
 from udrl.environments.making import EnvironmentSpec
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.value import ValueFunction, relative
-
-#: From observation [n, *observation_shape] and scaled command [n, 2] to logits [n, n_actions].
-Acting = Callable[[Tensor, Tensor], Tensor]
 
 
 class BehaviorFunction(nn.Module):
@@ -75,22 +71,6 @@ class BehaviorFunction(nn.Module):
                 expected = self.value(observation)
             command = relative(command, expected)
         return self._logits(self._tensors(), observation, command)
-
-    def frozen(self) -> Acting:
-        """Return what acts: :meth:`forward`, the same bits, without gradients or nn.Module.
-
-        It shares the weights, unless they are rounded. On 16 vectors it takes three quarters of
-        the time.
-        """
-        layers = [(w.detach(), b.detach()) for w, b in self._tensors()]
-        value = None if self.value is None else self.value.frozen()
-
-        def act(observation: Tensor, command: Tensor) -> Tensor:
-            if value is not None:
-                command = relative(command, value(observation))
-            return self._logits(layers, observation, command)
-
-        return act
 
     def _tensors(self) -> list[tuple[Tensor, Tensor]]:
         return tensors((*self._encoder, self.command, *self.layers, self.action), self._precision)

@@ -92,9 +92,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             it; 1 is the paper's, 0 takes the mode.
         eval_seeds: reset seeds of evaluations: ``final``, in [1, 0.5M), or ``search``, in
             [0.5M, 1M), for choosing hyperparameters (3.2).
-        inference_rows: rows that every inference call is padded to.
-        precision: what the network computes in; weights and optimizer are float32 always.
-            ``auto``: bfloat16 if the machine that creates the run is fast in it.
+        precision: what the learner's network computes in; weights, optimizer and acting are float32
+            always. ``auto``: bfloat16 if the machine that creates the run is fast in it.
         training_threads: threads that the learner computes with on a CPU; everything else has one.
         device: what the learner trains on; ``auto``: ``cuda`` if the machine that creates the run
             has it.
@@ -142,7 +141,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     eval_temperature: Temperature = 1.0
     eval_seeds: Literal["final", "search"] = "final"
 
-    inference_rows: Annotated[int, Meta(ge=16, le=4096)] = 16
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
     training_threads: Annotated[int, Meta(ge=1, le=256)] = 1
     device: Literal["auto", "cpu", "cuda"] = "cpu"

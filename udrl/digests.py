@@ -1,6 +1,6 @@
 """SHA-256 digests of content: two runs are equal when these are.
 
-They cover decoded values, not encodings: tensors by name, dtype, shape and bytes; episodes by their
+They cover decoded values, not encodings: weights by name, dtype, shape and bytes; episodes by their
 arrays; a buffer by its episodes in the order of (return, id). Who made an episode and when is left
 out. Numbers are little-endian.
 """
@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from udrl.episode import Episode
 
@@ -27,11 +26,6 @@ def arrays_digest(arrays: Mapping[str, npt.NDArray[np.generic]]) -> Digest:
         sha.update(f"{name}|{little.dtype.str}|{little.shape}|".encode())
         sha.update(little.tobytes())
     return sha.digest()
-
-
-def tensors_digest(tensors: Mapping[str, Tensor]) -> Digest:
-    """Return the digest of named tensors, e.g. a ``state_dict``."""
-    return arrays_digest({name: t.detach().cpu().numpy() for name, t in tensors.items()})
 
 
 def episode_digest(episode: Episode) -> Digest:

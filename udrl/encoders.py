@@ -5,7 +5,6 @@ a stride of 2. The behavior function and the value function (:mod:`udrl.value`) 
 encoder of their own.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -13,8 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.architecture import FILTER, PADDING, STRIDE
 
 #: Weight and bias of each layer, those of fully connected layers transposed.
 Layers = Sequence[tuple[Tensor, Tensor]]
@@ -26,15 +24,6 @@ ACTIVATIONS: dict[str, Activation] = {"relu": torch.relu_, "tanh": torch.tanh_}
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
-# Appendix B.2.
-_FILTER, _STRIDE, _PADDING = 3, 2, 1
-
-
-def stacked_shape(spec: EnvironmentSpec, config: Config) -> tuple[int, ...]:
-    """Return the shape of what the network observes: the most recent frames, one after another."""
-    first, *rest = spec.observation_shape
-    return (config.frame_stack * first, *rest)
-
 
 def fully_connected(n_in: int, n_out: int) -> nn.Linear:
     """Return a layer whose values come from ``initialise`` or a checkpoint."""
@@ -45,17 +34,9 @@ def fully_connected(n_in: int, n_out: int) -> nn.Linear:
 def convolutions(shape: tuple[int, ...], channels: Sequence[int]) -> nn.ModuleList:
     """Return an image encoder's layers, for images of ``shape`` (channels, height, width)."""
     return nn.ModuleList(
-        nn.utils.skip_init(nn.Conv2d, i, o, _FILTER, _STRIDE, _PADDING)
+        nn.utils.skip_init(nn.Conv2d, i, o, FILTER, STRIDE, PADDING)
         for i, o in pairwise((shape[0], *channels))
     )
-
-
-def image_features(shape: tuple[int, ...], channels: Sequence[int]) -> int:
-    """Return how many features an image encoder has."""
-    _, *size = shape
-    for _ in channels:
-        size = [(n + 2 * _PADDING - _FILTER) // _STRIDE + 1 for n in size]
-    return channels[-1] * math.prod(size)
 
 
 def tensors(layers: Sequence[nn.Module], precision: torch.dtype) -> list[tuple[Tensor, Tensor]]:
@@ -90,5 +71,5 @@ def encode(layers: Layers, observation: Tensor, activation: Activation) -> Tenso
         return activation(torch.addmm(bias, features, weight))
     features = (features * (1 / 255)).contiguous(memory_format=torch.channels_last)
     for weight, bias in layers:
-        features = activation(functional.conv2d(features, weight, bias, _STRIDE, _PADDING))
+        features = activation(functional.conv2d(features, weight, bias, STRIDE, PADDING))
     return features.flatten(1)

@@ -6,7 +6,6 @@
     ├── ConfigError              a setting, preset or file that cannot be used
     │   └── UnsupportedEnvironment   an environment we cannot act in
     ├── EnvironmentFault         an environment raised, or returned what it may not
-    ├── InexactArithmetic        results on this machine depend on what they may not
     ├── InvalidData              bytes from outside that are not what they should be
     │   ├── InvalidMessage           a message
     │   └── InvalidWeights           a set of tensors
@@ -46,12 +45,6 @@ class EnvironmentFault(UdrlError):
     """An environment raised an exception or returned a value it may not return."""
 
     exit_code = 3
-
-
-class InexactArithmetic(UdrlError):
-    """A row's result depends on its neighbours, or differs from the run's other machines."""
-
-    exit_code = 4
 
 
 class InvalidData(UdrlError):

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import msgspec
 
-from udrl.checkpoint import decode_weights, encode_weights
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.graph import acting_graph
 from udrl.policy import Policy
+from udrl.weights import decode_behavior, encode_weights
 
 FORMAT = 1
 
@@ -66,7 +67,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
     described = msgspec.json.format(msgspec.json.encode(description), indent=2)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / _WEIGHTS).write_bytes(encode_weights(policy.behavior))
+        (folder / _WEIGHTS).write_bytes(encode_weights(policy.behavior.weights))
         (folder / _DESCRIPTION).write_bytes(described + b"\n")
         (folder / _CARD).write_text(card, encoding="utf-8")
     except OSError as error:
@@ -100,7 +101,8 @@ def load(folder: str | Path) -> Policy:
             f"{folder / _DESCRIPTION}: format {description.format}, this version of udrl reads "
             f"{FORMAT}; export the run again"
         )
-    behavior = decode_weights(weights, description.config, description.environment)
+    graph = acting_graph(description.config, description.environment)
+    behavior = decode_behavior(graph, weights)
     return Policy(
         behavior,
         description.config,

@@ -1,53 +1,34 @@
-"""Arithmetic that does not depend on company, and how we make sure.
+"""Whether two machines round alike, and what a run leaves to the machine that creates it.
 
-A run is exact when a row's result does not depend on its place in a batch or on its neighbours
-(:func:`check_batch_invariance`), when the environment replays exactly
-(:func:`environment_replays`), and when all machines round alike: they do when their *numerics
-class*, the digest of a fixed probe, is the same (:func:`acting_class`, :func:`training_class`).
+A run is exact when the environment replays exactly (:func:`environment_replays`) and when all
+machines round alike: they do when their *numerics class*, the digest of a fixed probe, is the same
+(:func:`acting_class`, :func:`udrl.training_class.training_class`).
 """
 
+import ctypes
 import hashlib
-import math
-import os
 from pathlib import Path
 
 import msgspec
-import numpy as np
-import torch
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import BehaviorFunction, initialise
 from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
-from udrl.digests import arrays_digest, episode_digest, tensors_digest
-from udrl.encoders import stacked_shape
-from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Episode, Observations, action_dtype
-from udrl.errors import InexactArithmetic
-from udrl.segments import Experience
-from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import train, untrained
+from udrl.digests import arrays_digest, episode_digest
+from udrl.episode import Episode
+from udrl.graph import Acting, ActingFunction, probe_rows, probe_weights
+from udrl.streams import Purpose, stream_key
 
-#: Environment variable that makes Intel's MKL round alike everywhere, at half the speed. It is read
-#: when torch is loaded.
-STRICT_MKL = {"MKL_CBWR": "AVX2,STRICT"}
-
-_PROBE_STEPS = 64
-
-
-def use_one_thread() -> None:
-    """Let torch compute deterministically in one thread, as every role of a run does."""
-    if torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # CUDA's matrix products too
-    torch.use_deterministic_algorithms(mode=True)
+#: Steps of an episode of the probe, and rows of its logits.
+PROBE_STEPS = 64
+PROBE_ROWS = 16
 
 
 def settle(config: Config) -> Config:
     """Return the settings of a new run: what says ``auto`` is chosen for this machine."""
     device, precision = config.device, config.precision
     if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = "cuda" if _has_cuda() else "cpu"
     if precision == "auto":
         precision = "bfloat16" if _is_fast_in_bfloat16() else "float32"
     return msgspec.structs.replace(config, device=device, precision=precision)
@@ -63,10 +44,7 @@ def settle_as(held: Config, config: Config) -> Config:
 
 
 def _is_fast_in_bfloat16() -> bool:
-    """Say whether this processor has instructions for it; where nobody tells, it has not.
-
-    Acting is done on the CPU, also where a GPU trains.
-    """
+    """Say whether this processor has instructions for it; where nobody tells, it has not."""
     try:
         flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
     except OSError:
@@ -74,91 +52,28 @@ def _is_fast_in_bfloat16() -> bool:
     return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 
-def _probe_stream(index: int) -> Stream:
-    return Stream(stream_key(0, Purpose.PROBE, 0, index))
-
-
-def _probe_observations(
-    stream: Stream, n: int, shape: tuple[int, ...], *, images: bool
-) -> Observations:
-    """Return noise: bytes, or numbers in [-2, 2)."""
-    uniforms = stream.uniforms(n * math.prod(shape)).reshape(n, *shape)
-    return (uniforms * 256).astype(np.uint8) if images else (uniforms * 4 - 2).astype(np.float32)
-
-
-def _probe_rows(config: Config, spec: EnvironmentSpec) -> tuple[torch.Tensor, torch.Tensor]:
-    rows = config.inference_rows
-    observation = _probe_observations(
-        _probe_stream(0), rows, stacked_shape(spec, config), images=spec.is_image
-    )
-    command = _probe_stream(1).uniforms(rows * 2) * 4 - 2
-    return (
-        torch.tensor(observation),
-        torch.tensor(command.reshape(rows, 2), dtype=torch.float32),
+def _has_cuda() -> bool:
+    """Ask the driver for GPUs; whoever creates a run may have no torch."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int()
+    return bool(
+        driver.cuInit(0) == 0
+        and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+        and count.value > 0
     )
 
 
-def check_batch_invariance(config: Config, spec: EnvironmentSpec, tries: int = 8) -> None:
-    """Permute rows and change their neighbours; every row's logits must stay the same bits.
-
-    Raises:
-        InexactArithmetic: they do not.
-    """
-    behavior = initialise(config, spec).frozen()
-    rows = config.inference_rows
-    observation, command = _probe_rows(config, spec)
-    with torch.inference_mode():
-        expected = behavior(observation, command)
-        for index in range(tries):
-            order = torch.from_numpy(np.argsort(_probe_stream(2 + index).uniforms(rows)))
-            changed = behavior(observation[order].clone(), command[order].clone())
-            kept = order % 2 == 0
-            others = torch.where(kept, torch.arange(rows), torch.arange(rows).flip(0))
-            neighbours = behavior(observation[others].clone(), command[others].clone())
-            if not (
-                torch.equal(changed, expected[order])
-                and torch.equal(neighbours[kept], expected[kept])
-            ):
-                raise InexactArithmetic(
-                    f"a row's logits depend on the other {rows - 1} rows of the batch, so episodes "
-                    f"would depend on chance; set the environment variable "
-                    f"{'='.join(next(iter(STRICT_MKL.items())))} or run on another machine"
-                )
-
-
-def acting_class(config: Config, generator: EpisodeGenerator) -> str:
-    """Return the numerics class of acting: digest of initial logits and of a short episode."""
-    spec = generator.spec
-    behavior = initialise(config, spec)
-    with torch.inference_mode():
-        logits = behavior.frozen()(*_probe_rows(config, spec))
-    episode = _short_episode(config, generator, behavior, index=0)
-    sha = hashlib.sha256(arrays_digest({"logits": logits.numpy()}))
+def acting_class(config: Config, generator: EpisodeGenerator, graph: bytes) -> str:
+    """Return the numerics class of acting: digest of the probe's logits and of a short episode."""
+    function = ActingFunction(graph, probe_weights(graph))
+    logits = function.logits(*probe_rows(function, PROBE_ROWS))
+    episode = _short_episode(config, generator, function, index=0)
+    sha = hashlib.sha256(arrays_digest({"logits": logits}))
     sha.update(episode_digest(episode))
     return sha.hexdigest()[:16]
-
-
-def training_class(config: Config, spec: EnvironmentSpec) -> str:
-    """Return the numerics class of training: digest of the weights after two updates."""
-    small = msgspec.structs.replace(
-        config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1
-    )
-    stream = _probe_stream(1000)
-    length = min(_PROBE_STEPS, spec.max_episode_steps)
-    observations = _probe_observations(stream, length, spec.observation_shape, images=spec.is_image)
-    episode = Episode(
-        command_id=0,
-        observations=observations,
-        actions=stream.integers(length, 0, spec.n_actions).astype(action_dtype(spec.n_actions)),
-        rewards=stream.uniforms(length).astype(np.float32),
-        terminated=True,
-        truncated=False,
-    )
-    experience = Experience(small, msgspec.structs.replace(spec, max_episode_steps=length))
-    experience.add(episode)
-    state = untrained(small, spec)
-    train(state, experience.by_rank([0]), small)
-    return tensors_digest(state.behavior.state_dict()).hex()[:16]
 
 
 def environment_replays(config: Config, generator: EpisodeGenerator) -> bool:
@@ -170,9 +85,9 @@ def environment_replays(config: Config, generator: EpisodeGenerator) -> bool:
 
 
 def _short_episode(
-    config: Config, generator: EpisodeGenerator, behavior: BehaviorFunction | None, index: int
+    config: Config, generator: EpisodeGenerator, behavior: Acting | None, index: int
 ) -> Episode:
-    steps = min(_PROBE_STEPS, generator.spec.max_episode_steps)
+    steps = min(PROBE_STEPS, generator.spec.max_episode_steps)
     command = Command(
         id=index,
         kind="explore",

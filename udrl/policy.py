@@ -7,14 +7,13 @@ import gymnasium as gym
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from udrl.acting import CommandReader, sample
-from udrl.behavior import BehaviorFunction
+from udrl.acting import sample
+from udrl.architecture import stacked_shape
 from udrl.config import Config
-from udrl.encoders import stacked_shape
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
+from udrl.graph import ActingFunction
 
 
 class Policy:
@@ -34,7 +33,7 @@ class Policy:
 
     def __init__(
         self,
-        behavior: BehaviorFunction,
+        behavior: ActingFunction,
         config: Config,
         spec: EnvironmentSpec,
         rng: np.random.Generator | None = None,
@@ -49,14 +48,6 @@ class Policy:
         self.desired_horizon = desired_horizon
         self.observation_shape = stacked_shape(spec, config)
         self._rng = rng or np.random.default_rng()
-        self._act = behavior.frozen()
-        self._read = CommandReader(config)
-        # As many rows as in a run, all alike: fewer may round differently.
-        rows = config.inference_rows
-        self._observation_in = torch.from_numpy(
-            np.zeros((rows, *self.observation_shape), spec.observation_dtype)
-        )
-        self._command_in = torch.zeros(rows, 2)
 
     def make_environment(self, **kwargs: Any) -> Environment:
         """Return the environment that it was trained in, with observations as it knows them.
@@ -108,11 +99,10 @@ class Policy:
                 f"desired return {desired_return}, desired horizon {desired_horizon}: these and "
                 f"the observation must be finite numbers"
             )
-        self._observation_in.numpy()[:] = seen.reshape(self.observation_shape)
-        self._command_in.numpy()[:] = self._read(desired, np.empty((1, 2), np.float32))
-        with torch.inference_mode():
-            logits = self._act(self._observation_in, self._command_in)[0].numpy()
-        return logits.astype(np.float64)
+        observation = seen.reshape(1, *self.observation_shape)
+        seen = observation.astype(self.spec.observation_dtype)
+        logits: npt.NDArray[np.float64] = self.behavior.logits(seen, desired)[0].astype(np.float64)
+        return logits
 
     def probabilities(
         self,

@@ -2,6 +2,8 @@
 
 import contextlib
 import copy
+import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,9 +16,13 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
+from udrl.graph import Weights
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.value import ValueFunction, value_loss
+
+#: Bytes of observations that are gathered at once for the next updates.
+_GATHERED_BYTES = 16 << 20
 
 
 @dataclass
@@ -37,11 +43,23 @@ class TrainingState:
     optimizer: torch.optim.Adam
     loss: float = float("nan")
 
-    def acting(self) -> BehaviorFunction:
-        """Return the behavior function on the CPU, where acting is done."""
-        if self.behavior.action.weight.is_cpu:
-            return self.behavior
-        return copy.deepcopy(self.behavior).cpu()
+    @property
+    def weights(self) -> Weights:
+        """The weights that act."""
+        return weights_of(self.behavior)
+
+
+def weights_of(behavior: BehaviorFunction) -> Weights:
+    """Return a behavior function's parameters as arrays of their own."""
+    return {n: t.detach().cpu().numpy().copy() for n, t in behavior.state_dict().items()}
+
+
+def use_one_thread() -> None:
+    """Let torch compute deterministically in one thread."""
+    if torch.get_num_threads() != 1:
+        torch.set_num_threads(1)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # CUDA's matrix products too
+    torch.use_deterministic_algorithms(mode=True)
 
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
@@ -79,16 +97,15 @@ def _update(
     state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
-    batch = _Batch(config, state.trained)
+    batches = _Batches(config, state.trained)
     losses = torch.zeros((), dtype=torch.float64, device=config.device)
     one = torch.ones((), device=config.device)
     parameters = list(state.trained.parameters())
     averages = list(state.behavior.parameters())
     average = get_ema_multi_avg_fn(config.ema_decay)
     if state.trained.value is not None:
-        _learn_value(state, state.trained.value, experience, segments, config, batch)
-    for rank, t1, t2 in zip(*segments, strict=True):
-        observation, command, action = batch.fill(experience, Segments(rank, t1, t2))
+        _learn_value(state, state.trained.value, experience, segments, config, batches)
+    for observation, command, action in batches.gather(experience, segments):
         loss = functional.cross_entropy(state.trained(observation, command), action)
         _step(state.optimizer, parameters, loss, one)
         if config.ema_decay:
@@ -103,14 +120,13 @@ def _learn_value(
     experience: RankedExperience,
     segments: Segments,
     config: Config,
-    batch: "_Batch",
+    batches: "_Batches",
 ) -> None:
     """Bring V to the lambda-returns, one update for each row, then label the examples anew."""
     parameters = list(state.trained.parameters())
     one = torch.ones((), device=config.device)
     _label(value, experience, config)
-    for rank, t1, t2 in zip(*segments, strict=True):
-        observation, command, _ = batch.fill(experience, Segments(rank, t1, t2))
+    for observation, command, _ in batches.gather(experience, segments):
         loss = value_loss(value(observation), command[:, 0])
         _step(state.optimizer, parameters, loss, one)
     _label(value, experience, config)
@@ -148,33 +164,41 @@ def _threads(n: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class _Batch:
-    """Tensors that every update of a version is copied into.
+class _Batches:
+    """The batches of a version's updates, gathered many at a time.
 
-    They are torch's own memory: it is aligned to 64 bytes, which numpy's is not, and the rounding
-    of a matrix product may depend on alignment.
+    The tensors are torch's own memory: it is aligned to 64 bytes, which numpy's is not, and the
+    rounding of a matrix product may depend on alignment.
     """
 
     def __init__(self, config: Config, behavior: BehaviorFunction) -> None:
-        n, shape = config.batch_size, behavior.observation_shape
+        shape = behavior.observation_shape
         dtype = torch.uint8 if behavior.is_convolutional else torch.float32
+        bytes_each = config.batch_size * math.prod(shape) * dtype.itemsize
+        self._at_once = max(1, min(config.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
+        n = self._at_once, config.batch_size
         self._tensors = (
-            torch.empty(n, *shape, dtype=dtype),
-            torch.empty(n, 2),
+            torch.empty(*n, *shape, dtype=dtype),
+            torch.empty(*n, 2),
             torch.empty(n, dtype=torch.int64),
         )
-        self._observation, self._command, self._action = (t.numpy() for t in self._tensors)
         self._device = config.device
         self._scales = np.array([config.return_scale, config.horizon_scale])
 
-    def fill(
+    def gather(
         self, experience: RankedExperience, segments: Segments
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return observations, scaled commands and actions, where the network is."""
-        examples = experience.examples(segments)
-        self._observation[:] = examples.observation
-        self._command[:, 0] = examples.desired_return * self._scales[0]
-        self._command[:, 1] = examples.desired_horizon * self._scales[1]
-        self._action[:] = examples.action
-        observation, command, action = (t.to(self._device) for t in self._tensors)
-        return observation, command, action
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield observations, scaled commands and actions of each update, where the network is."""
+        n_updates = len(segments.rank)
+        for first in range(0, n_updates, self._at_once):
+            part = Segments(*(s[first : first + self._at_once] for s in segments))
+            n = len(part.rank)
+            observation, command, action = (t[:n].numpy() for t in self._tensors)
+            examples = experience.examples(Segments(*(s.reshape(-1) for s in part)))
+            observation[:] = examples.observation.reshape(observation.shape)
+            command[:, :, 0] = (examples.desired_return * self._scales[0]).reshape(n, -1)
+            command[:, :, 1] = (examples.desired_horizon * self._scales[1]).reshape(n, -1)
+            action[:] = examples.action.reshape(n, -1)
+            for k in range(n):
+                observed, commanded, acted = (t[k].to(self._device) for t in self._tensors)
+                yield observed, commanded, acted

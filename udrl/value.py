@@ -16,28 +16,18 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from udrl.config import Config
-from udrl.encoders import (
-    PRECISIONS,
-    Layers,
-    convolutions,
-    encode,
-    fully_connected,
+from udrl.architecture import (
+    DEVIATIONS,
+    LEAST_DEVIATION,
+    SQUAREPLUS,
+    VALUE_WIDTH,
     image_features,
     stacked_shape,
-    tensors,
 )
+from udrl.config import Config
+from udrl.encoders import PRECISIONS, Layers, convolutions, encode, fully_connected, tensors
 from udrl.environments.making import EnvironmentSpec
-
-_WIDTH = 64
-
-#: D(s) is at least this, in scaled return: where V fits perfectly, every gain would be infinite.
-_LEAST_DEVIATION = 3e-3
-
-#: Relative desired returns are kept within so many deviations.
-_LIMIT = 2.0
 
 
 class ValueFunction(nn.Module):
@@ -56,10 +46,10 @@ class ValueFunction(nn.Module):
             self.encoder = convolutions(shape, config.convolutions)
             features = image_features(shape, config.convolutions)
         else:
-            self.encoder = nn.ModuleList([fully_connected(shape[0], _WIDTH)])
-            features = _WIDTH
-        self.hidden = fully_connected(features, _WIDTH)
-        self.expected = fully_connected(_WIDTH, 2)
+            self.encoder = nn.ModuleList([fully_connected(shape[0], VALUE_WIDTH)])
+            features = VALUE_WIDTH
+        self.hidden = fully_connected(features, VALUE_WIDTH)
+        self.expected = fully_connected(VALUE_WIDTH, 2)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return (V(s), D(s)), float32 [batch, 2].
@@ -81,8 +71,9 @@ class ValueFunction(nn.Module):
         *encoder, (weight, bias), (out_weight, out_bias) = layers
         features = encode(encoder, observation, torch.tanh_)
         features = torch.tanh_(torch.addmm(bias, features, weight))
-        value, deviation = torch.addmm(out_bias, features, out_weight).float().unbind(1)
-        return torch.stack([value, functional.softplus(deviation) + _LEAST_DEVIATION], dim=1)
+        value, d = torch.addmm(out_bias, features, out_weight).float().unbind(1)
+        deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
+        return torch.stack([value, deviation], dim=1)
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:
@@ -99,4 +90,4 @@ def relative(command: Tensor, expected: Tensor) -> Tensor:
         expected: (V(s), D(s)), float32 [batch, 2].
     """
     above = (command[:, 0] - expected[:, 0]) / expected[:, 1]
-    return torch.stack([above.clamp(-_LIMIT, _LIMIT), command[:, 1]], dim=1)
+    return torch.stack([above.clamp(-DEVIATIONS, DEVIATIONS), command[:, 1]], dim=1)

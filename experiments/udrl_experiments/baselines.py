@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import msgspec
 import safetensors
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import BehaviorFunction
+from udrl.architecture import stacked_shape
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue
 from udrl.errors import ConfigError, Interrupted, InvalidData
@@ -148,8 +148,7 @@ def run(
             )
             if stop.is_set():
                 raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
-            # The generator asks no more of a behavior function than this.
-            behavior = cast(BehaviorFunction, policies.InPlaceOfBehavior(model))
+            behavior = policies.InPlaceOfBehavior(model, stacked_shape(generator.spec, config))
             commands = _commands(baseline, generator, len(rows) + 1)
             episodes = generate_episodes(generator, commands, behavior)
             evaluation = summarise([episode.episode_return for episode in episodes])

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import gymnasium as gym
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN
@@ -17,10 +18,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import Tensor, nn
 
-from udrl.behavior import Acting
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
+from udrl.graph import Call, Observations
 from udrl.streams import Purpose, Stream, stream_key
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -156,29 +157,46 @@ def explore_for(model: DQN | A2C, env_steps: int) -> None:
 
 
 class InPlaceOfBehavior:
-    """A model in the place of a behavior function (:mod:`udrl.acting`); it hears no command."""
+    """A model in the place of an acting function (:mod:`udrl.acting`); it hears no command.
 
-    def __init__(self, model: DQN | A2C) -> None:
-        self._model = model
+    Args:
+        model: who acts; it must not be trained meanwhile.
+        shape: of what is observed, with frames stacked along the first dimension.
+    """
 
-    def frozen(self) -> Acting:
-        """Return what acts; the model must not be trained meanwhile."""
-        self._model.policy.set_training_mode(mode=False)
-        return self._logits
+    def __init__(self, model: DQN | A2C, shape: tuple[int, ...]) -> None:
+        model.policy.set_training_mode(mode=False)
+        self.model = model
+        self.shape = shape
 
-    def _logits(self, observation: Tensor, command: Tensor) -> Tensor:
-        """Return A2C's logits, or DQN's Q-values, of which the greatest one is meant."""
+    def call(self, n: int) -> Call:
+        """Return a call of ``n`` rows."""
+        return _Rows(self, n)
+
+
+class _Rows:
+    def __init__(self, behavior: InPlaceOfBehavior, n: int) -> None:
+        self._model = behavior.model
+        space = behavior.model.observation_space
+        self.observation: Observations = np.zeros((n, *behavior.shape), space.dtype)
+        self.command = np.zeros((n, 2))
+        assert isinstance(behavior.model.action_space, spaces.Discrete)
+        self.logits = np.zeros((n, int(behavior.model.action_space.n)), np.float32)
+
+    def run(self) -> None:
+        """Compute A2C's logits, or DQN's Q-values, of which the greatest one is meant."""
         model = self._model
         shape = model.observation_space.shape
         assert shape is not None
-        seen = observation.reshape(-1, *shape).to(model.device)
-        if isinstance(model, DQN):
-            logits: Tensor = model.q_net(seen)
-        else:
-            distribution = model.policy.get_distribution(seen).distribution
-            assert isinstance(distribution, torch.distributions.Categorical)
-            logits = distribution.logits
-        return logits.cpu()
+        with torch.inference_mode():
+            seen = torch.from_numpy(self.observation).reshape(-1, *shape).to(model.device)
+            if isinstance(model, DQN):
+                logits: Tensor = model.q_net(seen)
+            else:
+                distribution = model.policy.get_distribution(seen).distribution
+                assert isinstance(distribution, torch.distributions.Categorical)
+                logits = distribution.logits
+        self.logits[:] = logits.cpu().numpy()
 
 
 def counters(model: DQN | A2C) -> dict[str, int]:

@@ -1,7 +1,8 @@
 """Write the golden vectors: ``python proto/golden/make.py``.
 
 Every message type has one example here. Its bytes are in ``<name>.msgpack`` and its values in
-``README.md``; ``streams.json`` and ``choices.json`` are test vectors for an actor's arithmetic.
+``README.md``; ``streams.json``, ``choices.json`` and ``probe.json`` are test vectors for an actor's
+arithmetic.
 """
 
 import json
@@ -15,9 +16,13 @@ import numpy as np
 
 from udrl.commands import Command
 from udrl.config import Config
+from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.graph import ActingFunction, acting_graph, probe_rows, probe_weights
+from udrl.numerics import PROBE_ROWS
 from udrl.streams import Purpose, Stream, stream_key
+from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode, encode_array, encode_episode
 from udrl_proto.messages import (
     Acknowledged,
@@ -87,6 +92,7 @@ CONFIG = Config(
 ENVIRONMENT = EnvironmentSpec(
     observation_shape=(4,), n_actions=2, max_episode_steps=500, max_return=500.0
 )
+GRAPH = acting_graph(CONFIG, ENVIRONMENT)
 EPISODE = Episode(
     command_id=5_000_003,
     observations=np.array(
@@ -159,11 +165,12 @@ EXAMPLES: tuple[Message, ...] = (
     Problem(code="rewind", message="version 6 is next, not 5; ask for the state"),
     HelloRequest(),
     Hello(
-        protocol=1,
+        protocol=PROTOCOL,
         software="0.1.0",
         run_id="cartpole-v1-seed7-20260102-030405-678901",
         config=CONFIG,
         environment=ENVIRONMENT,
+        graph=GRAPH,
         acting_class="0123456789abcdef",
     ),
     JoinRequest(
@@ -274,7 +281,7 @@ EXAMPLES: tuple[Message, ...] = (
 _STREAMS = (
     (7, Purpose.EPISODE, 5, 3),
     (7, Purpose.COMMANDS, 5, -1),
-    (0, Purpose.PROBE, 0, 0),
+    (0, Purpose.PROBE, 2, 0),
     (2**63 - 1, Purpose.TRAINING, 1, 0),
 )
 _LOGITS = ((0.0, 0.0, 0.0), (1.5, -0.25, 0.125), (-100.0, 0.0, 100.0), (2.0, 2.0, 1.0))
@@ -293,6 +300,11 @@ mean. All files here are written by `make.py` and checked by the tests.
 - `choices.json` holds choices of the first action of an episode: the key of its stream, the first
   number u of that, float32 logits, and the action; `half` and `mode` are the actions
   at the temperatures 0.5 and 0, `action` that at 1.
+- `probe.json` holds the first half of the [probe](../README.md#numerics-class), with the graph of
+  `hello.msgpack`: the digest of its weights, the digest of its rows as the arrays `command` (`<f8`)
+  and `observation`, and the logits of each row. The decimals are exact: read as float32 they give
+  the bits. Another kind of processor or version of ONNX Runtime may differ from them in the last
+  bits, and is then of another numerics class. A difference above 0.00001 is a mistake.
 
 """
 
@@ -353,6 +365,18 @@ def choose(logits: tuple[float, ...], u: float) -> int:
     return min(sum(c <= u * total for c in cumulative), len(logits) - 1)
 
 
+def probe() -> dict[str, Any]:
+    """Return the probe of the graph: digests of its weights and rows, and the logits."""
+    weights = probe_weights(GRAPH)
+    function = ActingFunction(GRAPH, weights)
+    observation, command = probe_rows(function, PROBE_ROWS)
+    return {
+        "weights": arrays_digest(weights).hex(),
+        "rows": arrays_digest({"command": command, "observation": observation}).hex(),
+        "logits": function.logits(observation, command).tolist(),
+    }
+
+
 def contents() -> dict[str, bytes]:
     """Return every golden file by its name."""
     files = {file_name(message): encode(message) for message in EXAMPLES}
@@ -364,6 +388,7 @@ def contents() -> dict[str, bytes]:
     files["README.md"] = (readme.rstrip() + "\n").encode()
     files["streams.json"] = (as_json(streams()) + "\n").encode()
     files["choices.json"] = (as_json(choices()) + "\n").encode()
+    files["probe.json"] = (as_json(probe()) + "\n").encode()
     return files
 
 

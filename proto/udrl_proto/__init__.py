@@ -3,4 +3,4 @@
 ``proto/README.md`` is the page from which someone could write an actor in another language.
 """
 
-PROTOCOL = 1
+PROTOCOL = 2

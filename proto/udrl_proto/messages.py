@@ -80,6 +80,7 @@ class Hello(Message, frozen=True, kw_only=True):
         run_id: the run's name in key expressions.
         config: what the run is.
         environment: what its environment looks like.
+        graph: the acting graph, an ONNX model whose weights have no values (:mod:`udrl.graph`).
         acting_class: numerics class of the actors, set by the first (``docs/protocol.md``).
         training_class: numerics class of the learner, likewise.
         allow_inexact: accept services of other numerics classes.
@@ -91,6 +92,7 @@ class Hello(Message, frozen=True, kw_only=True):
     run_id: Name
     config: Config
     environment: EnvironmentSpec
+    graph: Annotated[bytes, Meta(max_length=2**19)]
     acting_class: Text = ""
     training_class: Text = ""
     allow_inexact: bool = False
@@ -211,7 +213,7 @@ class VersionMessage(Message, frozen=True, kw_only=True):
 
     Attributes:
         version: v.
-        weights: safetensors (:mod:`udrl.checkpoint`).
+        weights: safetensors (:mod:`udrl.weights`).
         optimizer: safetensors, Adam's state.
         loss: mean cross-entropy, nats.
         train_s: seconds that training took.

@@ -9,24 +9,30 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 from gymnasium.envs.registration import EnvSpec
-from torch import Tensor
 
 from udrl import acting
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
-from udrl.behavior import Acting, BehaviorFunction, initialise
+from udrl.behavior import initialise
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, build
 from udrl.digests import episode_digest
-from udrl.environments import Environment, limit_steps, make_environment, specify
+from udrl.environments import (
+    Environment,
+    EnvironmentSpec,
+    limit_steps,
+    make_environment,
+    specify,
+)
 from udrl.episode import Episode, action_dtype
 from udrl.errors import EnvironmentFault
+from udrl.graph import ActingFunction, Call, Observations, acting_graph
 from udrl.replay import Entry, ReplayBuffer
 from udrl.streams import Purpose, Stream, stream_key
+from udrl.training import weights_of
 
 Make = Callable[[Config], Environment]
-Order = tuple[Command, BehaviorFunction | None]
+Order = tuple[Command, ActingFunction | None]
 
 
 def settings(environment: str = "Scripted-v0", **values: Any) -> Config:
@@ -49,10 +55,14 @@ def order(number: int, **values: Any) -> Command:
     return Command(**(usual | values))
 
 
+def behavior_of(config: Config, spec: EnvironmentSpec) -> ActingFunction:
+    return ActingFunction(acting_graph(config, spec), weights_of(initialise(config, spec)))
+
+
 def algorithm2(
     config: Config,
     command: Command,
-    behavior: BehaviorFunction | None,
+    behavior: ActingFunction | None,
     make: Make = make_environment,
 ) -> Episode:
     """Algorithm 2 as the paper prints it: one environment, one episode, one action at a time."""
@@ -75,11 +85,7 @@ def algorithm2(
         if behavior is None:
             logits = [0.0] * spec.n_actions
         else:
-            c = [dr * config.return_scale, max(dh, 1) * config.horizon_scale]
-            states = torch.tensor(np.tile(s, (config.inference_rows, 1)))
-            commands = torch.tensor([c] * config.inference_rows, dtype=torch.float32)
-            with torch.inference_mode():
-                logits = behavior(states, commands)[0].tolist()
+            logits = behavior.logits(s[None], np.array([[dr, dh]], np.float64))[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
         number = float(stream.uniforms(1)[0])
         holds = command.hold_from <= len(episode) < command.hold_from + command.hold_steps
@@ -150,7 +156,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     )
     env = make_environment(config)
     spec = specify(env, config)
-    one, other = (initialise(settings(environment, seed=seed), spec) for seed in (1, 2))
+    one, other = (behavior_of(settings(environment, seed=seed), spec) for seed in (1, 2))
     buffer = ReplayBuffer(config, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
     sample = CommandSampler(config, spec.max_episode_steps)
     evaluation = sample.evaluate(2, buffer)
@@ -268,22 +274,29 @@ class Scripted(gym.Env[Any, Any]):
         self.closed = True
 
 
-class Spy(BehaviorFunction):
+class Spy:
     """Gives the same logits for whatever it is asked, and remembers what it was asked."""
 
-    def __init__(self, generator: EpisodeGenerator, config: Config, logits: list[float]) -> None:
-        super().__init__(generator.spec, config)
-        self.logits = torch.tensor(logits)
+    def __init__(self, generator: EpisodeGenerator, logits: list[float]) -> None:
+        self.shape = generator.spec.observation_shape
+        self.logits = logits
         self.commands: list[list[float]] = []  # of the first row
         self.rows: list[int] = []
 
-    def frozen(self) -> Acting:
-        def act(observation: Tensor, command: Tensor) -> Tensor:
-            self.commands.append(command[0].tolist())
-            self.rows.append(len(observation))
-            return self.logits.expand(len(observation), -1)
+    def call(self, n: int) -> Call:
+        return _SpiedOn(self, n)
 
-        return act
+
+class _SpiedOn:
+    def __init__(self, spy: Spy, n: int) -> None:
+        self.observation: Observations = np.zeros((n, *spy.shape), np.float32)
+        self.command = np.zeros((n, 2))
+        self.logits = np.tile(np.array(spy.logits, np.float32), (n, 1))
+        self._spy = spy
+
+    def run(self) -> None:
+        self._spy.commands.append(self.command[0].tolist())
+        self._spy.rows.append(len(self.command))
 
 
 def act(world: World, commands: list[Command], n_environments: int = 1) -> list[Episode | Failure]:
@@ -295,56 +308,28 @@ def act(world: World, commands: list[Command], n_environments: int = 1) -> list[
 @pytest.mark.parametrize(
     ("kind", "max_return", "seen"),
     [
-        ("explore", None, [[3, 2], [2, 1], [4, 1], [0, 1]]),
-        ("explore", 2.5, [[3, 2], [2, 1], [4, 1], [0, 1]]),
-        ("evaluate", None, [[3, 2], [2, 1], [4, 1], [0, 1]]),
-        ("evaluate", 2.5, [[2.5, 2], [1.5, 1], [2.5, 1], [-1.5, 1]]),
+        ("explore", None, [[3, 2], [2, 1], [4, 0], [0, -1]]),
+        ("explore", 2.5, [[3, 2], [2, 1], [4, 0], [0, -1]]),
+        ("evaluate", None, [[3, 2], [2, 1], [4, 0], [0, -1]]),
+        ("evaluate", 2.5, [[2.5, 2], [1.5, 1], [2.5, 0], [-1.5, -1]]),
     ],
 )
-def test_the_network_is_given_what_is_left_of_the_command(
+def test_the_graph_is_given_what_is_left_of_the_command(
     kind: str, max_return: float | None, seen: list[list[float]]
 ) -> None:
-    config = settings(return_scale=1, horizon_scale=1, max_return=max_return)
+    config = settings(max_return=max_return)
     generator = EpisodeGenerator(config, 1, World().make)
-    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    spy = Spy(generator, [0.0, 0.0, 0.0])
     generate_episodes(generator, [order(1, kind=kind, desired_horizon=2)], spy)
     assert spy.commands == seen
 
 
-@pytest.mark.parametrize(
-    ("kind", "seen"),
-    [
-        ("explore", [[3, 3], [2, 2], [4, 4], [1, 1]]),
-        ("evaluate", [[2.5, 2], [1.5, 1], [2.5, 2], [1, 1]]),
-    ],
-)
-def test_the_horizon_may_be_the_return_as_an_integer(kind: str, seen: list[list[float]]) -> None:
-    config = settings(return_scale=1, horizon_scale=1, max_return=2.5, desired_horizon="return")
-    generator = EpisodeGenerator(config, 1, World().make)
-    spy = Spy(generator, config, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(1, kind=kind, desired_horizon=3)], spy)
-    assert spy.commands == seen
-
-
-def test_commands_are_scaled_for_the_network() -> None:
-    config = settings(return_scale=0.5, horizon_scale=0.25)
-    generator = EpisodeGenerator(config, 1, World().make)
-    spy = Spy(generator, config, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(1, desired_return=3.0, desired_horizon=5)], spy)
-    assert spy.commands[0] == [1.5, 1.25]
-
-
-@pytest.mark.parametrize(
-    ("n_environments", "rows", "calls"), [(1, 16, 1), (16, 16, 1), (17, 16, 2), (40, 24, 2)]
-)
-def test_every_call_has_the_number_of_rows_in_the_settings(
-    n_environments: int, rows: int, calls: int
-) -> None:
-    config = settings(inference_rows=rows)
-    generator = EpisodeGenerator(config, n_environments, World().make)
-    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+@pytest.mark.parametrize("n_environments", [1, 7, 40])
+def test_a_call_has_a_row_for_each_running_episode(n_environments: int) -> None:
+    generator = EpisodeGenerator(settings(), n_environments, World().make)
+    spy = Spy(generator, [0.0, 0.0, 0.0])
     generate_episodes(generator, [order(i) for i in range(n_environments)], spy)
-    assert spy.rows == [rows] * calls * 4
+    assert spy.rows == [n_environments] * 4
 
 
 @pytest.mark.parametrize(
@@ -356,7 +341,7 @@ def test_actions_have_the_networks_probabilities_and_are_uniform_in_the_warm_up(
 ) -> None:
     n, config = 4000, settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * n).make)
-    behavior = None if logits is None else Spy(generator, config, logits)
+    behavior = None if logits is None else Spy(generator, logits)
     (episode,) = generate_episodes(generator, [order(1)], behavior)
     expected = n * np.array(probabilities)
     counts = np.bincount(episode.actions, minlength=3)
@@ -389,14 +374,14 @@ def test_an_action_of_probability_zero_is_never_taken(
     monkeypatch.setattr(acting, "Stream", Edges)
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 3).make)
-    (episode,) = generate_episodes(generator, [order(1)], Spy(generator, config, logits))
+    (episode,) = generate_episodes(generator, [order(1)], Spy(generator, logits))
     assert episode.actions.tolist() == actions
 
 
 def test_at_temperature_0_actions_are_the_mode() -> None:
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 100).make)
-    spy = Spy(generator, config, [0.1, 0.3, 0.2])
+    spy = Spy(generator, [0.1, 0.3, 0.2])
     mode, sampled = generate_episodes(generator, [order(1, temperature=0.0), order(2)], spy)
     assert set(mode.actions.tolist()) == {1}
     assert set(sampled.actions.tolist()) == {0, 1, 2}
@@ -406,7 +391,7 @@ def test_temperatures_sharpen_and_flatten_each_episodes_own_actions() -> None:
     n, logits = 3000, [0.0, 1.0, -0.5]
     config = settings(max_episode_steps=n)
     generator = EpisodeGenerator(config, 2, World(script=lambda _: [0.0] * n).make)
-    spy = Spy(generator, config, logits)
+    spy = Spy(generator, logits)
     temperatures = (0.25, 1.0, 4.0)
     orders = [order(i, temperature=t, max_steps=n) for i, t in enumerate(temperatures)]
     for temperature, episode in zip(
@@ -464,7 +449,7 @@ def test_a_command_truncates_its_episode_and_no_other() -> None:
 def test_rewards_are_rounded_to_float32_before_they_are_counted() -> None:
     config = settings(return_scale=1, horizon_scale=1)
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.1, 0.0]).make)
-    spy = Spy(generator, config, [0.0, 0.0, 0.0])
+    spy = Spy(generator, [0.0, 0.0, 0.0])
     generate_episodes(generator, [order(1, desired_return=0.1)], spy)
     assert spy.commands[1][0] == np.float32(0.1 - float(np.float32(0.1)))
 
@@ -478,7 +463,7 @@ def test_episodes_longer_than_the_first_storage_are_whole(n_environments: int) -
     # 1024 steps are provided for at first; these have 1100, 2200 and 3300.
     config, world = settings(), World(script=long_ones)
     generator = EpisodeGenerator(config, n_environments, world.make)
-    behavior = initialise(config, generator.spec)
+    behavior = behavior_of(config, generator.spec)
     orders: list[Order] = [(order(1), behavior), (order(3), None), (order(2), behavior)]
     outcomes = carry_out(generator, orders)
     assert digests(outcomes) == {
@@ -511,7 +496,7 @@ def test_a_fault_costs_one_episode_and_its_environment_and_nothing_else(
 ) -> None:
     config, world = settings(), World(faults={4: fault})
     generator = EpisodeGenerator(config, 3, world.make)
-    behavior = None if random else initialise(config, generator.spec)
+    behavior = None if random else behavior_of(config, generator.spec)
     commands = [order(i) for i in range(9)]
     outcomes = carry_out(generator, [(command, behavior) for command in commands])
 

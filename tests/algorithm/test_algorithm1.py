@@ -10,6 +10,7 @@ from udrl.config import Budget, Config, build
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import summarise
+from udrl.graph import ActingFunction, acting_graph
 from udrl.replay import Entry, ReplayBuffer
 from udrl.segments import Experience
 from udrl.training import train, untrained
@@ -112,13 +113,12 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
         for episode in known:
             experience.add(episode)
         train(state, experience.by_rank([e.command_id for e in known]), config)  # 4
+        act = ActingFunction(acting_graph(config, generator.spec), state.weights)
         exploratory = sample.explore(iteration, buffer)  # 5
-        new = generate_episodes(generator, exploratory, state.behavior)  # 6
+        new = generate_episodes(generator, exploratory, act)  # 6
         seen += new
         if crossed:  # 7, 8
-            evaluated = generate_episodes(
-                generator, sample.evaluate(iteration, buffer), state.behavior
-            )
+            evaluated = generate_episodes(generator, sample.evaluate(iteration, buffer), act)
             evaluations[iteration] = summarise([e.episode_return for e in evaluated])
         before, env_steps = env_steps, env_steps + sum(e.length for e in new)
         crossed = env_steps // config.eval_every > before // config.eval_every

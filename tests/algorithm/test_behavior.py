@@ -86,23 +86,6 @@ def test_logits_are_those_of_section_3_2(hidden: tuple[int, ...], activation: st
     np.testing.assert_allclose(logits.numpy(), expected, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
-@pytest.mark.parametrize("hidden", ARCHITECTURES, ids=str)
-def test_what_acts_has_the_bits_of_what_is_trained(
-    hidden: tuple[int, ...], activation: str
-) -> None:
-    behavior = initialise(settings(hidden=hidden, activation=activation), LANDER)
-    act = behavior.frozen()
-    with torch.no_grad():
-        behavior.action.bias.add_(1)  # shared, not copied
-    given = rows(16)
-    logits = behavior(*given)
-    assert logits.requires_grad
-    acting = act(*given)
-    assert not acting.requires_grad
-    assert torch.equal(acting, logits)
-
-
 @pytest.mark.parametrize("hidden", ARCHITECTURES, ids=str)
 def test_layers_have_the_widths_asked_for(hidden: tuple[int, ...]) -> None:
     behavior = initialise(settings(hidden=hidden), LANDER)

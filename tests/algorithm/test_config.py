@@ -74,7 +74,6 @@ def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
         ("hidden", [32, 0]),
         ("hidden", 32),
         ("horizon_scale", 0.0),
-        ("inference_rows", 8),
         ("initialisation", "zeros"),
         ("lead", -1),
         ("learning_rate", 0.0),

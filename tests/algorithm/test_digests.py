@@ -3,9 +3,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from udrl.digests import arrays_digest, episode_digest, replay_digest, tensors_digest
+from udrl.digests import arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 
 
@@ -58,12 +57,6 @@ def test_the_order_of_names_and_the_layout_in_memory_do_not_count() -> None:
 )
 def test_other_arrays_have_another_digest(other: dict[str, Any]) -> None:
     assert arrays_digest(other) != arrays_digest({"x": np.zeros(4, np.float32)})
-
-
-def test_tensors_count_as_arrays() -> None:
-    tensors = {"w": torch.ones(2, 3, requires_grad=True), "b": torch.zeros(3)}
-    arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
-    assert tensors_digest(tensors) == arrays_digest(arrays)
 
 
 @pytest.mark.parametrize(

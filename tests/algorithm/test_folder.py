@@ -9,11 +9,12 @@ import safetensors.torch
 
 import udrl
 from udrl import folder
-from udrl.behavior import initialise
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.errors import ConfigError, InvalidData, InvalidWeights
+from udrl.graph import ActingFunction, acting_graph
 from udrl.policy import Policy
+from udrl.training import untrained
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def policy() -> Policy:
     config = build(Config, {"environment": "CartPole-v1", "hidden": [16, 16], "frame_stack": 2})
     env = make_environment(config)
     spec = specify(env, config)
-    behavior = initialise(config, spec)
+    behavior = ActingFunction(acting_graph(config, spec), untrained(config, spec).weights)
     return Policy(behavior, config, spec, desired_return=120.5, desired_horizon=130)
 
 
@@ -43,7 +44,7 @@ def test_a_loaded_policy_is_the_one_that_was_saved(policy: Policy, written: Path
 
 def test_weights_are_read_by_safetensors_own_loader(policy: Policy, written: Path) -> None:
     tensors = safetensors.torch.load_file(written / "model.safetensors")
-    expected = policy.behavior.state_dict()
+    expected = policy.behavior.weights
     assert {name: t.tolist() for name, t in tensors.items()} == {
         name: t.tolist() for name, t in expected.items()
     }

@@ -7,16 +7,14 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
-from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import Acting, BehaviorFunction, initialise
+from udrl.architecture import stacked_shape
 from udrl.commands import Command
 from udrl.config import Config, build
-from udrl.encoders import stacked_shape
 from udrl.environments import make_environment, specify
 from udrl.episode import Episode, recent
+from udrl.graph import ActingFunction, Call, acting_graph, probe_weights
 from udrl.segments import Experience, Segments
 from udrl.streams import Purpose, stream_key
 
@@ -72,26 +70,31 @@ def settings(environment: str = "Noise-v0", **values: Any) -> Config:
     return build(Config, small | values)
 
 
-class Watching(BehaviorFunction):
-    """Notes what it is shown, by the first bytes of the newest frame."""
+class Watching(ActingFunction):
+    """Notes what it is shown."""
 
-    seen: list[npt.NDArray[Any]]
+    def __init__(self, graph: bytes) -> None:
+        super().__init__(graph, probe_weights(graph))
+        self.seen: list[npt.NDArray[Any]] = []
 
-    def frozen(self) -> Acting:
-        act = super().frozen()
+    def call(self, n: int) -> Call:
+        return _Noting(super().call(n), self.seen)
 
-        def noting(observation: Tensor, command: Tensor) -> Tensor:
-            self.seen.extend(observation.numpy().copy())
-            return act(observation, command)
 
-        return noting
+class _Noting:
+    def __init__(self, call: Call, seen: list[npt.NDArray[Any]]) -> None:
+        self.observation, self.command, self.logits = call.observation, call.command, call.logits
+        self._call = call
+        self._seen = seen
+
+    def run(self) -> None:
+        self._seen.extend(self.observation.copy())
+        self._call.run()
 
 
 def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], Watching]:
     generator = EpisodeGenerator(config, n_environments)
-    behavior = Watching(generator.spec, config)
-    behavior.load_state_dict(initialise(config, generator.spec).state_dict())
-    behavior.seen = []
+    behavior = Watching(acting_graph(config, generator.spec))
     commands = [
         Command(
             id=i,
@@ -167,4 +170,4 @@ def test_stack_of_one_is_the_observation() -> None:
     episodes, behavior = watch(config, 2, 3)
     frames = {frame.tobytes() for e in episodes for frame in e.observations}
     assert {image.tobytes() for image in behavior.seen} == frames
-    assert torch.tensor(episodes[0].observations).dtype == torch.uint8
+    assert episodes[0].observations.dtype == np.uint8

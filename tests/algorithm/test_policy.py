@@ -4,10 +4,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from udrl.behavior import initialise
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.errors import InvalidData
+from udrl.graph import ActingFunction, acting_graph, probe_weights
 from udrl.policy import Policy, choose, probabilities
 
 
@@ -16,21 +16,18 @@ def policy(environment: str = "CartPole-v1", seed: int = 1, **values: Any) -> Po
     env = make_environment(config)
     spec = specify(env, config)
     env.close()
-    return Policy(initialise(config, spec), config, spec, np.random.default_rng(seed))
+    graph = acting_graph(config, spec)
+    behavior = ActingFunction(graph, probe_weights(graph))
+    return Policy(behavior, config, spec, np.random.default_rng(seed))
 
 
 SEEN = [0.1, -0.2, 0.03, 0.4]
 
 
 def test_logits_are_those_of_the_behavior_function() -> None:
-    import torch
-
     agent = policy(return_scale=0.02, horizon_scale=0.01)
-    with torch.inference_mode():
-        expected = agent.behavior(
-            torch.tensor([SEEN] * 16), torch.tensor([[100.0 * 0.02, 50 * 0.01]] * 16)
-        )
-    assert agent.logits(SEEN, 100.0, 50).tolist() == expected[0].double().tolist()
+    expected = agent.behavior.logits(np.array([SEEN], np.float32), np.array([[100.0, 50.0]]))
+    assert agent.logits(SEEN, 100.0, 50).tolist() == expected[0].tolist()
 
 
 def test_a_horizon_counts_as_one_step_at_least() -> None:

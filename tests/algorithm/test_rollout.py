@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import initialise
 from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.environments import Environment, make_environment, specify
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.graph import ActingFunction, acting_graph
 from udrl.policy import Policy
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
+from udrl.training import untrained
 
 
 def command(**values: Any) -> Command:
@@ -35,7 +36,9 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
     config = build(Config, {"environment": environment, "hidden": [16, 16]} | values)
     env = make_environment(config)
     spec = specify(env, config)
-    return Policy(initialise(config, spec), config, spec), env
+    return Policy(
+        ActingFunction(acting_graph(config, spec), untrained(config, spec).weights), config, spec
+    ), env
 
 
 @pytest.mark.parametrize(

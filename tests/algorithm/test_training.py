@@ -9,13 +9,14 @@ from torch.nn import functional
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, build
-from udrl.digests import tensors_digest
+from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.figure2 import A1, A2, A3
 from udrl.episode import Episode
+from udrl.graph import ActingFunction, acting_graph
 from udrl.segments import Experience, RankedExperience
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import TrainingState, train, untrained
+from udrl.training import TrainingState, train, untrained, use_one_thread, weights_of
 
 SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
 
@@ -56,7 +57,7 @@ def ranked(config: Config, episodes: list[Episode]) -> RankedExperience:
 
 
 def digest(state: TrainingState) -> bytes:
-    return tensors_digest(state.behavior.state_dict())
+    return arrays_digest(state.weights)
 
 
 def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Config) -> float:
@@ -116,7 +117,7 @@ def test_what_acts_is_a_moving_average_of_what_is_trained() -> None:
     train(plain, ranked(config, EPISODES), settings())
     trained = fast.trained.state_dict()
     # The average does not change what is trained, and lags behind it.
-    assert tensors_digest(trained) == digest(plain) != digest(fast)
+    assert arrays_digest(weights_of(fast.trained)) == digest(plain) != digest(fast)
     for name, tensor in fast.behavior.state_dict().items():
         torch.testing.assert_close(tensor, slow.behavior.state_dict()[name])
         assert not torch.equal(tensor, trained[name])
@@ -262,7 +263,8 @@ def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: 
         )
         for i in range(180)
     ]
-    did = generate_episodes(generator, told, state.behavior)
+    act = ActingFunction(acting_graph(config, generator.spec), state.weights)
+    did = generate_episodes(generator, told, act)
     disobeyed = [
         command
         for command, episode in zip(told, did, strict=True)
@@ -289,3 +291,22 @@ def test_training_has_the_threads_of_the_settings_and_leaves_the_others_alone(
         assert torch.get_num_threads() == 1
     assert seen == {3}
     assert digest(one) == digest(other)
+
+
+def test_a_learner_computes_in_one_thread_and_deterministically() -> None:
+    use_one_thread()
+    assert torch.get_num_threads() == 1
+    assert torch.are_deterministic_algorithms_enabled()
+
+
+def test_gathering_a_few_updates_at_a_time_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = settings(n_updates_per_iter=7)
+    digests = set()
+    for gathered in (1, 2000, 1 << 20):  # bytes: one update, some, all
+        monkeypatch.setattr("udrl.training._GATHERED_BYTES", gathered)
+        state = untrained(config, SPEC)
+        train(state, ranked(config, EPISODES), config)
+        digests.add(digest(state))
+    assert len(digests) == 1

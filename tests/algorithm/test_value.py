@@ -8,17 +8,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.behavior import initialise
-from udrl.checkpoint import decode_state, encode_optimizer, encode_weights
+from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.config import Config, build
-from udrl.digests import tensors_digest
+from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
-from udrl.numerics import check_batch_invariance
 from udrl.segments import Experience, RankedExperience, Segments
 from udrl.training import train, untrained
 from udrl.value import relative
+from udrl.weights import encode_weights
 
 SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
 IMAGES = EnvironmentSpec(
@@ -130,18 +129,6 @@ def test_a_relative_return_is_in_deviations_and_bounded() -> None:
     torch.testing.assert_close(got, torch.tensor([[1.0, 0.1], [0.0, 0.2], [2.0, 0.3], [-2.0, 0.4]]))
 
 
-@pytest.mark.parametrize("spec", [SPEC, IMAGES], ids=["vectors", "images"])
-def test_what_acts_computes_what_is_trained(spec: EnvironmentSpec) -> None:
-    behavior = initialise(settings(), spec)
-    rng = torch.Generator().manual_seed(0)
-    observation = torch.rand(16, *spec.observation_shape, generator=rng)
-    if spec.is_image:
-        observation = (255 * observation).to(torch.uint8)
-    command = torch.rand(16, 2, generator=rng)
-    assert torch.equal(behavior.frozen()(observation, command), behavior(observation, command))
-    check_batch_invariance(settings(), spec)
-
-
 def test_the_value_function_learns_what_follows() -> None:
     config = settings(n_updates_per_iter=100, learning_rate=3e-3, return_lambda=0.9)
     # What follows is written in the observation.
@@ -167,14 +154,10 @@ def test_a_restored_state_trains_on_as_if_nothing_had_happened(ema_decay: float)
     experience = ranked([episode(i, [1.0, 0.0, float(i)]) for i in range(4)], config)
     state = untrained(config, SPEC)
     train(state, experience, config)
-    restored = decode_state(
-        1, encode_weights(state.behavior), encode_optimizer(state), config, SPEC
-    )
+    restored = decode_state(1, encode_weights(state.weights), encode_optimizer(state), config, SPEC)
     for one in (state, restored):
         train(one, experience, config)
-    assert tensors_digest(state.behavior.state_dict()) == tensors_digest(
-        restored.behavior.state_dict()
-    )
+    assert arrays_digest(state.weights) == arrays_digest(restored.weights)
     assert encode_optimizer(state) == encode_optimizer(restored)
 
 
@@ -185,7 +168,7 @@ def test_the_baseline_changes_what_is_learned() -> None:
         config = settings(return_lambda=lam)
         state = untrained(config, SPEC)
         train(state, ranked(episodes, config), config)
-        digests.add(tensors_digest(state.behavior.state_dict()))
+        digests.add(arrays_digest(state.weights))
     assert len(digests) == 2
 
 

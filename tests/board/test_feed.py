@@ -25,7 +25,7 @@ from udrl_proto.messages import (
 HELLO = Hello(
     protocol=1, software="1", run_id="run", config=Config(environment="CartPole-v1"),
     environment=EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=500),
-    allow_inexact=False, exact=True,
+    graph=b"", allow_inexact=False, exact=True,
 )  # fmt: skip
 
 

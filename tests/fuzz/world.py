@@ -16,12 +16,14 @@ import numpy as np
 import zenoh
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.checkpoint import encode_optimizer, encode_weights
+from udrl.checkpoint import encode_optimizer
 from udrl.commands import Command
 from udrl.config import Budget, Config
 from udrl.errors import InvalidData
+from udrl.graph import ActingFunction, acting_graph
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained
+from udrl.weights import encode_weights
 from udrl_proto import keys
 from udrl_proto.answering import serve
 from udrl_proto.codec import decode, decode_episode, encode, encode_episode
@@ -202,6 +204,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
     world, asked = World(), []
     generator = EpisodeGenerator(CONFIG, 4)
     states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
+    graph = acting_graph(CONFIG, generator.spec)
 
     def ask(verb: str, request: Message | bytes) -> Message:
         data = request if isinstance(request, bytes) else encode(request)
@@ -217,7 +220,8 @@ def honest_questions() -> list[tuple[str, bytes]]:
         for command in commands:
             by_version.setdefault(command.weights_version, []).append(command)
         for version, together in by_version.items():
-            behavior = states[version].behavior if version else None
+            weights = states[version].weights
+            behavior = ActingFunction(graph, weights) if version else None
             for episode in generate_episodes(generator, together, behavior):
                 ask(keys.EPISODE, encode_episode(episode, "actor-1"))
 
@@ -247,7 +251,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
         states.append(_train(world, version, states))
         state = states[version]
         ask(keys.VERSION, VersionMessage(
-            learner="learner-1", version=version, weights=encode_weights(state.behavior),
+            learner="learner-1", version=version, weights=encode_weights(state.weights),
             optimizer=encode_optimizer(state), loss=state.loss, train_s=0.1))  # fmt: skip
         ask(keys.WEIGHTS, WeightsRequest(version="latest"))
         act()

@@ -16,6 +16,7 @@ from whole_run import wait_for
 
 ROOT = Path(__file__).parents[2]
 IMAGE = os.environ.get("UDRL_IMAGE", "udrl")
+LEARNER_IMAGE = f"{IMAGE}-learner"
 
 
 def _status(text: str) -> Status:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from compose_project import IMAGE, Project, run
+from compose_project import IMAGE, LEARNER_IMAGE, Project, run
+from udrl_proto import PROTOCOL
 from udrl_proto.messages import Status
 from whole_run import Cli, assert_conserved, digests, free_port, wait_for
 
@@ -34,7 +35,7 @@ def alone(cli: Callable[..., Cli], env_steps: int, run_dir: Path) -> Status:
 
 @pytest.fixture(scope="module", autouse=True)
 def image() -> None:
-    """The image of this checkout; nothing is done where there is no engine."""
+    """The images of this checkout; nothing is done where there is no engine."""
     Project("udrl-test-image", ["compose.yaml"], {}).compose("build", timeout=1800)
 
 
@@ -146,15 +147,29 @@ def test_faults_and_an_actor_from_outside_change_nothing(
     assert digests(ended) == digests(alone(cli, ended.max_env_steps, tmp_path / "alone"))
 
 
-def test_image_runs_as_nobody_special_and_holds_nothing_to_build_with() -> None:
-    inside = ["docker", "run", "--rm", "--read-only", "--entrypoint", "sh", IMAGE, "-c"]
+def inside_of(image: str) -> list[str]:
+    """Return what runs a line of shell in an image."""
+    return ["docker", "run", "--rm", "--read-only", "--entrypoint", "sh", image, "-c"]
+
+
+@pytest.mark.parametrize("image", [IMAGE, LEARNER_IMAGE])
+def test_image_runs_as_nobody_special_and_holds_nothing_to_build_with(image: str) -> None:
+    inside = inside_of(image)
     assert run(*inside, "id -u").strip() == "10001"
     tools = "for tool in cc gcc c++ ld make cmake; do command -v $tool || true; done"
     assert run(*inside, tools).strip() == ""
     assert run(*inside, "for tool in sh udrl; do command -v $tool || true; done").count("\n") == 2
     assert run(*inside, "python -c 'import pip' 2>/dev/null || echo none").strip() == "none"
+    assert run(*inside, "python -c 'import setuptools' 2>/dev/null || echo none") == "none\n"
     ours = "find /opt/udrl/lib/python3*/site-packages/udrl* /runs -name 'test_*'"
     assert run(*inside, ours).strip() == ""
+
+
+def test_torch_is_in_the_image_of_the_learner_only() -> None:
+    look = "python -c 'import torch; print(torch.__name__)' 2>/dev/null || echo none"
+    assert run(*inside_of(LEARNER_IMAGE), look) == "torch\n"
+    assert run(*inside_of(IMAGE), look) == "none\n"
+    assert run(*inside_of(IMAGE), "find / -xdev -name 'libtorch*' 2>/dev/null || true") == ""
 
 
 # What is wrong is told in the log of the container that suffers, and by its exit code.
@@ -187,9 +202,17 @@ def test_keys_that_are_not_there_are_told() -> None:
 
 
 def test_replay_service_that_does_not_come_is_told() -> None:
-    code, log = told("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
+    code, log = told(
+        "learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3", image=LEARNER_IMAGE
+    )
     assert code == 6
     assert "nobody answers at 'tcp/127.0.0.1:7447' after 3 s; start `udrl replay" in log
+
+
+def test_learner_without_torch_is_told() -> None:
+    code, log = told("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
+    assert code == 2
+    assert 'training needs torch; install it with: pip install "udrl[train]"' in log
 
 
 def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
@@ -208,7 +231,7 @@ def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
         network = ("--network", f"{project.name}_run")
         code, log = told("actor", "--connect", "tcp/replay:7447", options=network, image=tag)
         assert code == 2
-        assert "the run speaks protocol 1, this program speaks 999" in log
+        assert f"the run speaks protocol {PROTOCOL}, this program speaks 999" in log
         assert "install the same version of udrl on both sides" in log
         wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "the run to go on", 120)
     finally:

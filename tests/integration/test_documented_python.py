@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from udrl import folder
-from udrl.behavior import initialise
 from udrl.config import Config, build, preset
 from udrl.environments import make_environment, specify
+from udrl.graph import ActingFunction, acting_graph
 from udrl.policy import Policy
+from udrl.training import untrained
 
 ROOT = Path(__file__).parents[2]
 BLOCKS = re.findall(
@@ -28,9 +29,8 @@ def agent(tmp_path: Path) -> Path:
     env = make_environment(config)
     spec = specify(env, config)
     env.close()
-    policy = Policy(
-        initialise(config, spec), config, spec, desired_return=200.0, desired_horizon=300
-    )
+    behavior = ActingFunction(acting_graph(config, spec), untrained(config, spec).weights)
+    policy = Policy(behavior, config, spec, desired_return=200.0, desired_horizon=300)
     folder.save(tmp_path / "my-agent", policy, "")
     return tmp_path
 

@@ -100,8 +100,9 @@ def test_earlier_weights_have_the_evaluation_that_was_theirs(
 def test_a_model_for_onnx(ended_run: Path, tmp_path: Path) -> None:
     path = tmp_path / "agent.onnx"
     assert str(path) in export(ended_run, "--onnx", path)
-    inputs = onnxruntime.InferenceSession(str(path)).get_inputs()
-    assert [i.name for i in inputs] == ["observation", "desired_return", "desired_horizon"]
+    model = onnxruntime.InferenceSession(str(path))
+    assert [i.name for i in model.get_inputs()] == ["observation", "command"]
+    assert [o.name for o in model.get_outputs()] == ["logits"]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -12,11 +12,12 @@ import gymnasium as gym
 import msgpack
 import numpy as np
 import numpy.typing as npt
-import safetensors.torch
-import torch
+import onnx
+import onnxruntime
+import safetensors.numpy
 import zenoh
 
-Weights = Mapping[str, torch.Tensor]
+Weights = Mapping[str, npt.NDArray[np.float32]]
 MASK = 2**64 - 1
 
 
@@ -48,22 +49,31 @@ def numbers(key: bytes, n: int) -> list[float]:
 # Inference and the choice of an action.
 
 
-def logits(weights: Weights, config: dict[str, Any], s: torch.Tensor, c: torch.Tensor) -> Any:
-    """Return the logits of ``inference_rows`` rows."""
-    f = {"relu": torch.relu, "tanh": torch.tanh}[config["activation"]]
+class Network:
+    """The graph of a run with the weights of one version."""
 
-    def layer(name: str, x: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.linear(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
+    def __init__(self, graph: bytes, weights: Weights) -> None:
+        model = onnx.load_model_from_string(graph)
+        for tensor in model.graph.initializer:
+            if not tensor.raw_data:
+                assert weights[tensor.name].shape == tuple(tensor.dims)
+                tensor.raw_data = weights[tensor.name].astype("<f4").tobytes()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(model.SerializeToString(), options)
 
-    if config["baseline"] == "value":
-        v = torch.tanh(layer("value.hidden", torch.tanh(layer("value.encoder.0", s))))
-        value, deviation = layer("value.expected", v).unbind(1)
-        above = (c[:, 0] - value) / (torch.nn.functional.softplus(deviation) + 0.003)
-        c = torch.stack([above.clamp(-2, 2), c[:, 1]], 1)
-    x = f(layer("observation", s)) * torch.sigmoid(layer("command", c))
-    for i in range(len(config["hidden"]) - 1):
-        x = f(layer(f"layers.{i}", x))
-    return layer("action", x)
+    def logits(self, observation: npt.NDArray[Any], desired: list[float]) -> npt.NDArray[Any]:
+        """Return the logits of one row."""
+        row = {"observation": observation[None], "command": np.array([desired], np.float64)}
+        (found,) = self._session.run(["logits"], row)
+        logits: npt.NDArray[Any] = found[0]
+        return logits
+
+
+def seen(observations: list[npt.NDArray[Any]], stack: int) -> npt.NDArray[Any]:
+    """Return the most recent observations, oldest first; the first stands for those before it."""
+    last = len(observations) - 1
+    return np.concatenate([observations[max(last - k, 0)] for k in reversed(range(stack))])
 
 
 def choose(row: list[float], u: float, temperature: float) -> int:
@@ -76,8 +86,16 @@ def choose(row: list[float], u: float, temperature: float) -> int:
     return min(sum(c <= u * total for c in cumulative), len(row) - 1)
 
 
+def as_promised(observation: Any, spec: dict[str, Any]) -> npt.NDArray[Any]:
+    """Return an observation of an environment as a float32 vector, or as an image of bytes."""
+    array = np.asarray(observation, spec["observation_dtype"])
+    if len(spec["observation_shape"]) == 3:
+        array = np.moveaxis(array if array.ndim == 3 else array[..., None], -1, 0)
+    return array
+
+
 def run_episode(
-    command: dict[str, Any], hello: dict[str, Any], weights: Weights | None
+    command: dict[str, Any], hello: dict[str, Any], network: Network | None
 ) -> dict[str, Any]:
     """Carry out a command and return the arrays and flags of its episode."""
     config, spec = hello["config"], hello["environment"]
@@ -86,27 +104,26 @@ def run_episode(
     u = numbers(command["stream_key"], command["max_steps"])
     desired, horizon = command["desired_return"], float(command["desired_horizon"])
     observation, _ = env.reset(seed=command["environment_seed"])
-    observations: list[npt.NDArray[np.float32]] = []
+    observations: list[npt.NDArray[Any]] = []
     actions: list[int] = []
     rewards: list[np.float32] = []
     terminated = truncated = False
     while not (terminated or truncated):
         if command["kind"] == "evaluate" and spec["max_return"] is not None:
             desired = min(desired, spec["max_return"])
-        row = [0.0] * spec["n_actions"]
-        if weights is not None:
-            s = torch.zeros(config["inference_rows"], *spec["observation_shape"])
-            c = torch.zeros(config["inference_rows"], 2)
-            s[0] = torch.from_numpy(np.asarray(observation, np.float32))
-            scaled = config["return_scale"] * desired, config["horizon_scale"] * max(horizon, 1.0)
-            c[0] = torch.tensor(scaled, dtype=torch.float64)
-            row = logits(weights, config, s, c)[0].tolist()
+        observations.append(as_promised(observation, spec))
+        t = len(actions)
+        row, number = [0.0] * spec["n_actions"], u[t]
+        if network is not None:
+            stacked = seen(observations, config["frame_stack"])
+            row = network.logits(stacked, [desired, horizon]).tolist()
+        else:
+            number = u[t - t % config["warm_up_hold"]]
         first = command["hold_from"]
-        if first <= len(actions) < first + command["hold_steps"]:
+        if first <= t < first + command["hold_steps"]:
             action = int(u[first] * spec["n_actions"])
         else:
-            action = choose(row, u[len(actions)], command["temperature"])
-        observations.append(np.asarray(observation, np.float32))
+            action = choose(row, number, command["temperature"])
         actions.append(action)
         observation, reward, terminated, truncated, _ = env.step(action)
         rewards.append(np.float32(reward))
@@ -114,7 +131,7 @@ def run_episode(
         horizon -= 1
     env.close()
     return {
-        "observations": np.array(observations, "<f4"),
+        "observations": np.array(observations),
         "actions": np.array(actions, "|u1" if spec["n_actions"] <= 256 else "<i4"),
         "rewards": np.array(rewards, "<f4"),
         "terminated": terminated,
@@ -139,45 +156,45 @@ def episode_digest(command_id: int, episode: dict[str, Any]) -> bytes:
     return hashlib.sha256(flags + arrays_digest(arrays)).digest()
 
 
-def initial_weights(config: dict[str, Any], spec: dict[str, Any]) -> Weights:
-    (u,) = numbers(stream_key(config["seed"], "initialise", 0, 0), 1)
-    generator = torch.Generator().manual_seed(math.floor(u * 2**52))
-    h = config["hidden"]
-    shapes = {"observation": (h[0], *spec["observation_shape"]), "command": (h[0], 2)}
-    shapes |= {f"layers.{i}": (h[i + 1], h[i]) for i in range(len(h) - 1)}
-    shapes["action"] = (spec["n_actions"], h[-1])
-    weights: dict[str, torch.Tensor] = {}
-    if config["baseline"] == "value":
-        shapes |= {"value.encoder.0": (64, *spec["observation_shape"])}
-        shapes |= {"value.hidden": (64, 64), "value.expected": (2, 64)}
-    for name, (outputs, inputs) in shapes.items():
-        weight, bias = torch.empty(outputs, inputs), torch.zeros(outputs)
-        if config["initialisation"] == "orthogonal":
-            outer = name in ("command", "action", "value.expected")
-            gain = 1.0 if outer else torch.nn.init.calculate_gain(config["activation"])
-            torch.nn.init.orthogonal_(weight, gain, generator)
-        else:
-            bound = inputs**-0.5
-            torch.nn.init.uniform_(weight, -bound, bound, generator)
-            torch.nn.init.uniform_(bias, -bound, bound, generator)
-        weights |= {f"{name}.weight": weight, f"{name}.bias": bias}
+def probe_weights(graph: bytes) -> Weights:
+    tensors = onnx.load_model_from_string(graph).graph.initializer
+    shapes = {t.name: tuple(t.dims) for t in tensors if not t.raw_data}
+    weights = {}
+    for k, name in enumerate(sorted(shapes, key=str.encode)):
+        shape = shapes[name]
+        scale = 1 / math.sqrt(math.prod(shape[1:]))
+        drawn = numbers(stream_key(0, "probe", 0, k), math.prod(shape))
+        weights[name] = np.array([(u * 2 - 1) * scale for u in drawn], "<f4").reshape(shape)
     return weights
 
 
+def probe_rows(hello: dict[str, Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return what the network sees in 16 rows, and their commands."""
+    spec = hello["environment"]
+    first, *rest = spec["observation_shape"]
+    shape = (16, hello["config"]["frame_stack"] * first, *rest)
+    drawn = numbers(stream_key(0, "probe", 2, 0), math.prod(shape) + 32)
+    observed, desired = drawn[:-32], drawn[-32:]
+    if spec["observation_dtype"] == "uint8":
+        observation = np.array([math.floor(u * 256) for u in observed], "|u1")
+    else:
+        observation = np.array([u * 4 - 2 for u in observed], "<f4")
+    command = np.array([u * 200 - 100 for u in desired], "<f8")
+    return observation.reshape(shape), command.reshape(16, 2)
+
+
+def probe_logits(hello: dict[str, Any]) -> npt.NDArray[Any]:
+    network = Network(hello["graph"], probe_weights(hello["graph"]))
+    rows = zip(*probe_rows(hello), strict=True)
+    return np.array([network.logits(s, c.tolist()) for s, c in rows], "<f4")
+
+
 def numerics_class(hello: dict[str, Any]) -> str:
-    config, spec = hello["config"], hello["environment"]
-    weights = initial_weights(config, spec)
-
-    def rows(index: int, width: int) -> torch.Tensor:
-        n = config["inference_rows"]
-        drawn = np.array(numbers(stream_key(0, "probe", 0, index), n * width)) * 4 - 2
-        return torch.from_numpy(drawn.reshape(n, width).astype(np.float32))
-
-    found = logits(weights, config, rows(0, *spec["observation_shape"]), rows(1, 2))
+    spec = hello["environment"]
     n = min(64, spec["max_episode_steps"])
     command = {
         "kind": "explore",
-        "desired_return": 1.0 / config["return_scale"],
+        "desired_return": 1.0 / hello["config"]["return_scale"],
         "desired_horizon": n,
         "max_steps": n,
         "environment_seed": 1_000_000,
@@ -186,8 +203,9 @@ def numerics_class(hello: dict[str, Any]) -> str:
         "hold_from": 0,
         "hold_steps": 0,
     }
-    episode = run_episode(command, hello, weights)
-    digests = arrays_digest({"logits": found.numpy()}) + episode_digest(0, episode)
+    network = Network(hello["graph"], probe_weights(hello["graph"]))
+    episode = run_episode(command, hello, network)
+    digests = arrays_digest({"logits": probe_logits(hello)}) + episode_digest(0, episode)
     return hashlib.sha256(digests).hexdigest()[:16]
 
 
@@ -222,7 +240,7 @@ def act(session: zenoh.Session) -> int:
     (reply,) = session.get("udrl/*/*/hello", payload=b"\x80", timeout=3.0)
     assert reply.ok is not None
     run = str(reply.ok.key_expr).removesuffix("/hello")
-    assert run.startswith("udrl/1/")
+    assert run.startswith("udrl/2/")
     hello = msgpack.unpackb(reply.ok.payload.to_bytes())
     join = {
         "role": "actor",
@@ -238,7 +256,7 @@ def act(session: zenoh.Session) -> int:
     token = session.liveliness().declare_token(f"{run}/alive/actor/stranger")
     news = threading.Event()
     subscriber = session.declare_subscriber(f"{run}/news/weights", lambda _: news.set())
-    kept: dict[int, Weights | None] = {0: None}
+    kept: dict[int, Network | None] = {0: None}
     delivered = 0
     while True:
         reply_to = ask(session, f"{run}/commands", {"actor": "stranger", "wanted": 3})
@@ -253,7 +271,7 @@ def act(session: zenoh.Session) -> int:
             version = command["weights_version"]
             if version not in kept:
                 blob = ask(session, f"{run}/weights", {"version": version})["weights"]
-                kept[version] = safetensors.torch.load(blob)
+                kept[version] = Network(hello["graph"], safetensors.numpy.load(blob))
             episode = run_episode(command, hello, kept[version])
             for name in ("observations", "actions", "rewards"):
                 array = episode[name]

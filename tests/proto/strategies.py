@@ -38,7 +38,7 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
         case inspect.StrType(min_length=least, max_length=most):
             return st.text(min_size=least or 0, max_size=min(most or 20, 20))
         case inspect.BytesType(min_length=least, max_length=most):
-            return st.binary(min_size=least or 0, max_size=most or 20)
+            return st.binary(min_size=least or 0, max_size=min(most or 20, 20))
         case inspect.IntType(ge=ge, le=le):
             return st.integers(-(2**63) if ge is None else ge, 2**63 - 1 if le is None else le)
         case inspect.FloatType(gt=gt, ge=ge, le=le):

@@ -65,6 +65,8 @@ def described(kind: inspect.Type) -> str:
             return f"text to {longest}"
         case inspect.BytesType(min_length=int() as size):
             return f"{size} bytes"
+        case inspect.BytesType(max_length=int() as most):
+            return f"bytes, {number(most)} at most"
         case inspect.BytesType():
             return "bytes"
         case inspect.LiteralType(values=values):

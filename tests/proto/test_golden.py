@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
-import torch
 
+from tests.proto import stranger
 from tests.proto.strategies import MESSAGES
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.behavior import Acting, BehaviorFunction
 from udrl.commands import Command
 from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.graph import Commands, Logits, Observations
 from udrl.streams import Stream
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Message
@@ -55,7 +57,12 @@ def test_order_of_fields_is_free(message: Message) -> None:
 def test_files_are_those_that_the_script_writes() -> None:
     written = {path.name: path.read_bytes() for path in GOLDEN.iterdir() if path.is_file()}
     del written["make.py"]
-    assert written == MAKE["contents"]()
+    expected = MAKE["contents"]()
+    # Logits are those of the machine that wrote them, on another kind up to the last bits.
+    then, now = (json.loads(files.pop("probe.json")) for files in (written, expected))
+    np.testing.assert_allclose(then.pop("logits"), now.pop("logits"), rtol=0, atol=1e-5)
+    assert then == now
+    assert written == expected
 
 
 # Arithmetic, by slow references that follow the page.
@@ -77,6 +84,7 @@ def philox(key: bytes, n: int) -> list[int]:
 
 STREAMS: list[dict[str, Any]] = json.loads((GOLDEN / "streams.json").read_text())
 CHOICES: list[dict[str, Any]] = json.loads((GOLDEN / "choices.json").read_text())
+PROBE: dict[str, Any] = json.loads((GOLDEN / "probe.json").read_text())
 
 
 @pytest.mark.parametrize("vector", STREAMS, ids=lambda v: v["hashed"])
@@ -89,18 +97,47 @@ def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
     assert Stream(key).uniforms(9).tolist() == vector["numbers"]
 
 
+def test_probe_is_what_the_page_says() -> None:
+    hello = msgpack.unpackb((GOLDEN / "hello.msgpack").read_bytes())
+    weights = stranger.probe_weights(hello["graph"])
+    assert stranger.arrays_digest(weights).hex() == PROBE["weights"]
+    observation, command = stranger.probe_rows(hello)
+    rows = {"command": command, "observation": observation}
+    assert stranger.arrays_digest(rows).hex() == PROBE["rows"]
+    logits = stranger.probe_logits(hello)
+    assert logits.tolist() == MAKE["probe"]()["logits"]
+    np.testing.assert_allclose(logits, PROBE["logits"], rtol=0, atol=1e-5)
+
+
+def test_logits_of_the_probe_are_written_exactly() -> None:
+    logits = np.array(PROBE["logits"])
+    assert logits.shape == (16, 2)
+    assert np.array_equal(logits, logits.astype(np.float32))
+
+
+class Fixed:
+    """Acts by the same logits always."""
+
+    def __init__(self, logits: list[float], spec: EnvironmentSpec) -> None:
+        self._logits = np.array([logits], np.float32)
+        self.observation: Observations = np.zeros((1, *spec.observation_shape), np.float32)
+        self.command: Commands = np.zeros((1, 2))
+        self.logits: Logits = np.zeros_like(self._logits)
+
+    def call(self, n: int) -> "Fixed":
+        assert n == 1
+        return self
+
+    def run(self) -> None:
+        self.logits[:] = self._logits
+
+
 @pytest.mark.parametrize(("temperature", "key"), [(1.0, "action"), (0.5, "half"), (0.0, "mode")])
 @pytest.mark.parametrize("vector", CHOICES, ids=lambda v: f"{v['logits']}-{v['u']:.3f}")
 def test_actor_chooses_as_the_vectors_say(
     vector: dict[str, Any], temperature: float, key: str
 ) -> None:
-    class Fixed(BehaviorFunction):
-        def frozen(self) -> Acting:
-            logits = torch.tensor(vector["logits"])
-            return lambda observation, command: logits.expand(len(observation), -1)
-
-    config = Config(environment="Figure2-v0")
-    generator = EpisodeGenerator(config, 1)
+    generator = EpisodeGenerator(Config(environment="Figure2-v0"), 1)
     command = Command(
         id=0,
         kind="evaluate",
@@ -112,6 +149,6 @@ def test_actor_chooses_as_the_vectors_say(
         max_steps=2,
         temperature=temperature,
     )
-    (episode,) = generate_episodes(generator, [command], Fixed(generator.spec, config))
+    (episode,) = generate_episodes(generator, [command], Fixed(vector["logits"], generator.spec))
     assert episode.actions[0] == vector[key]
     generator.close()

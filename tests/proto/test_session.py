@@ -128,6 +128,7 @@ def hello(run_id: str) -> Hello:
         run_id=run_id,
         config=Config(environment="Figure2-v0"),
         environment=EnvironmentSpec(observation_shape=(4,), n_actions=3, max_episode_steps=2),
+        graph=b"",
     )
 
 

@@ -1,25 +1,31 @@
 """The page is enough: an actor that was written from it gives the same bits and serves a run."""
 
+import ast
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import msgspec
+import numpy as np
+import numpy.typing as npt
 import pytest
 import zenoh
 
 from tests.proto import stranger
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
-from udrl.behavior import initialise
 from udrl.commands import Command, Kind
 from udrl.config import Budget, Config
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
+from udrl.graph import ActingFunction, acting_graph
 from udrl.numerics import acting_class
 from udrl.streams import Purpose, stream_key
+from udrl.training import untrained
 from udrl_learner.service import LearnerService
 from udrl_proto.session import find_run
 from udrl_replay.creation import create
@@ -36,6 +42,7 @@ CONFIG = Config(
     n_episodes_per_iter=3,
     n_updates_per_iter=2,
     n_warm_up_episodes=4,
+    warm_up_hold=3,
     replay_size=8,
     eval_every=100,
     eval_episodes=2,
@@ -49,23 +56,81 @@ def generator() -> Iterator[EpisodeGenerator]:
     made.close()
 
 
+class Pixels(gym.Env[npt.NDArray[np.uint8], np.int64]):
+    """Noise of two channels, which the last action moves."""
+
+    observation_space = gym.spaces.Box(0, 255, (9, 8, 2), np.uint8)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.uint8], dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._look(0), {}
+
+    def step(
+        self, action: np.int64
+    ) -> tuple[npt.NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        return self._look(int(action)), float(action) / 3, False, False, {}
+
+    def _look(self, action: int) -> npt.NDArray[np.uint8]:
+        return self.np_random.integers(0, 200, (9, 8, 2), np.uint8) + np.uint8(action)
+
+
+@pytest.fixture
+def pixels() -> Iterator[str]:
+    """The id of an environment of images."""
+    gym.register("Pixels-v0", entry_point=lambda **_: Pixels(), max_episode_steps=20)
+    yield "Pixels-v0"
+    del gym.registry["Pixels-v0"]
+
+
+def test_it_knows_nothing_but_the_page() -> None:
+    tree = ast.parse(Path(stranger.__file__).read_text(encoding="utf-8"))
+    imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    imported |= {str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+    packages = {name.partition(".")[0] for name in imported} - sys.stdlib_module_names
+    assert packages == {
+        "gymnasium", "msgpack", "numpy", "onnx", "onnxruntime", "safetensors", "zenoh",
+    }  # fmt: skip
+
+
 def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
     plain = {"config": config, "environment": spec}
-    return {name: msgspec.to_builtins(value) for name, value in plain.items()}
+    return {name: msgspec.to_builtins(value) for name, value in plain.items()} | {
+        "graph": acting_graph(config, spec)
+    }
+
+
+def assert_same_class(config: Config) -> None:
+    generator = EpisodeGenerator(config, 1)
+    said = hello(config, generator.spec)
+    assert stranger.numerics_class(said) == acting_class(config, generator, said["graph"])
+    generator.close()
+
+
+@pytest.mark.parametrize("frame_stack", [1, 3])
+@pytest.mark.parametrize("desired_horizon", ["mean", "return"])
+@pytest.mark.parametrize("baseline", ["none", "value"])
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+def test_probe_has_the_same_digest(
+    activation: Any, baseline: Any, desired_horizon: Any, frame_stack: int
+) -> None:
+    assert_same_class(
+        msgspec.structs.replace(
+            CONFIG, activation=activation, baseline=baseline, desired_horizon=desired_horizon,
+            frame_stack=frame_stack,
+        )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
-@pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
-def test_probe_has_the_same_digest(activation: Any, initialisation: Any, baseline: Any) -> None:
-    config = msgspec.structs.replace(
-        CONFIG, activation=activation, initialisation=initialisation, baseline=baseline
+def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None:
+    assert_same_class(
+        msgspec.structs.replace(
+            CONFIG, environment=pixels, baseline=baseline, convolutions=(4, 6), frame_stack=2
+        )
     )
-    generator = EpisodeGenerator(config, 1)
-    assert stranger.numerics_class(hello(config, generator.spec)) == (
-        acting_class(config, generator)
-    )
-    generator.close()
 
 
 @pytest.mark.parametrize(
@@ -94,11 +159,15 @@ def test_episode_has_the_same_bytes(
         )
         for index in range(5)
     ]
-    behavior = initialise(CONFIG, generator.spec) if version else None
-    weights = behavior.state_dict() if behavior is not None else None
+    said = hello(CONFIG, generator.spec)
+    behavior = network = None
+    if version:
+        weights = untrained(CONFIG, generator.spec).weights
+        behavior = ActingFunction(said["graph"], weights)
+        network = stranger.Network(said["graph"], weights)
     for ours in generate_episodes(generator, commands, behavior):
         command = msgspec.to_builtins(commands[ours.command_id], builtin_types=(bytes,))
-        theirs = stranger.run_episode(command, hello(CONFIG, generator.spec), weights)
+        theirs = stranger.run_episode(command, said, network)
         assert stranger.episode_digest(ours.command_id, theirs) == episode_digest(ours)
 
 
@@ -120,6 +189,7 @@ def test_actor_written_from_the_page_serves_a_run(
         training.start()
         stack.callback(training.join)
         delivered = stranger.act(client)
+        assert delivered > 0
         expected = algorithm1(CONFIG, budget)
         progress = service.run.progress
         assert (progress.accepted, progress.rejected) == (delivered, 0)

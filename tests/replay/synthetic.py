@@ -20,8 +20,10 @@ from udrl.digests import episode_digest, replay_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.evaluation import Evaluation, summarise
+from udrl.graph import acting_graph
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
+from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
 from udrl_replay.arrival import Arrival, inspect
@@ -52,7 +54,12 @@ def config(lead: int = 0) -> Config:
 
 def hello(lead: int = 0) -> Hello:
     return Hello(
-        protocol=1, software="0", run_id="synthetic", config=config(lead), environment=SPEC
+        protocol=PROTOCOL,
+        software="0",
+        run_id="synthetic",
+        config=config(lead),
+        environment=SPEC,
+        graph=acting_graph(config(lead), SPEC),
     )
 
 

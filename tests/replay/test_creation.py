@@ -13,6 +13,7 @@ import udrl
 from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
+from udrl.graph import acting_graph
 from udrl_proto import PROTOCOL, keys
 from udrl_proto.messages import Hello
 from udrl_replay import creation
@@ -37,6 +38,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
         environment=EnvironmentSpec(
             observation_shape=(4,), n_actions=3, max_episode_steps=2, max_return=2.0
         ),
+        graph=acting_graph(TOY, hello.environment),
     )
     assert created.fact("progress", Progress) == Progress()
 

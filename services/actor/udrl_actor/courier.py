@@ -14,11 +14,11 @@ from typing import NamedTuple
 import zenoh
 
 from udrl.acting import Failure
-from udrl.behavior import BehaviorFunction
-from udrl.checkpoint import decode_weights
 from udrl.commands import Command
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage, Refused
+from udrl.graph import ActingFunction
+from udrl.weights import decode_behavior
 from udrl_actor.outbox import Outbox
 from udrl_proto import keys
 from udrl_proto.asking import Asker
@@ -47,7 +47,7 @@ class Order(NamedTuple):
     """A command and the behavior function to obey it with; None: act at random."""
 
     command: Command
-    behavior: BehaviorFunction | None
+    behavior: ActingFunction | None
 
 
 class Courier(threading.Thread):
@@ -86,7 +86,7 @@ class Courier(threading.Thread):
         self._steps = 0
         self._announced: bytes | None = None
         self._acknowledged = False
-        self._behaviors: dict[int, BehaviorFunction] = {}
+        self._behaviors: dict[int, ActingFunction] = {}
         self._newest = 0
         self.ended = False
         self.error: Exception | None = None
@@ -256,7 +256,7 @@ class Courier(threading.Thread):
                 self._held.discard(command.id)
             return None
 
-    def _behavior(self, version: int) -> BehaviorFunction | None:
+    def _behavior(self, version: int) -> ActingFunction | None:
         """Return a weights version, asking for it if it was not announced."""
         if version == 0:
             return None
@@ -276,10 +276,9 @@ class Courier(threading.Thread):
             self._learn_announced()
 
     def _learn(self, message: Weights) -> None:
-        config, spec = self._hello.config, self._hello.environment
-        self._behaviors[message.version] = decode_weights(message.weights, config, spec)
+        self._behaviors[message.version] = decode_behavior(self._hello.graph, message.weights)
         self._newest = max(self._newest, message.version)
         # Commands of lead + 1 iterations are about, each with its own version; the oldest to have
         # been learned goes first, whatever its number, since a restored run may go back.
-        while len(self._behaviors) > config.lead + 2:
+        while len(self._behaviors) > self._hello.config.lead + 2:
             del self._behaviors[next(iter(self._behaviors))]

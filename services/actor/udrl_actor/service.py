@@ -13,7 +13,7 @@ import udrl
 from udrl.acting import EpisodeGenerator, Failure
 from udrl.episode import Episode
 from udrl.errors import Interrupted
-from udrl.numerics import acting_class, check_batch_invariance, use_one_thread
+from udrl.numerics import acting_class
 from udrl_actor.courier import Courier
 from udrl_proto import keys
 from udrl_proto.asking import Asker
@@ -60,18 +60,15 @@ class ActorService:
 
         Raises:
             UnsupportedEnvironment: this machine cannot make the run's environment.
-            InexactArithmetic: a row's result depends on its neighbours here.
             Refused: the run does not want this actor.
             Unreachable: the replay service has not answered for long.
         """
-        use_one_thread()
         config, run_id = self._hello.config, self._hello.run_id
         self._arm()
         generator = EpisodeGenerator(config, self._environments)
         asker = Asker(self._session, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
-            check_batch_invariance(config, generator.spec)
             join = JoinRequest(
                 role="actor",
                 id=self._name,
@@ -79,7 +76,7 @@ class ActorService:
                 pid=os.getpid(),
                 software=udrl.__version__,
                 environments=self._environments,
-                numerics_class=acting_class(config, generator),
+                numerics_class=acting_class(config, generator, self._hello.graph),
                 environment=generator.spec,
             )
             asker.ask(keys.JOIN, join, JoinReply)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import click
 
 from udrl.errors import ConfigError
-from udrl.numerics import use_one_thread
 from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 from udrl_launch.process import GRACE_S, log_to_stderr, run_service
 
@@ -72,7 +71,6 @@ def board(
         raise ConfigError(
             "--token: expected letters, digits and . _ ~ - only, since it stands in an address"
         )
-    use_one_thread()
     log_to_stderr(logging.WARNING)
     app = make_app(Feed(source), hosts=(*_LOOPBACK, host) if is_local else (), token=token or "")
     with _listening(host, port) as listener:

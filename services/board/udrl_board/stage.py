@@ -18,7 +18,6 @@ import msgspec
 from msgspec import Meta
 from PIL import Image
 
-from udrl.checkpoint import decode_weights
 from udrl.commands import Command
 from udrl.config import Temperature
 from udrl.environments.making import Environment, make_environment
@@ -26,6 +25,7 @@ from udrl.errors import UdrlError, UnsupportedEnvironment
 from udrl.policy import Policy
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
+from udrl.weights import decode_behavior
 from udrl_board.source import Source, Wanted
 from udrl_launch.film import Picture
 from udrl_launch.playing import filmed, fps_of
@@ -274,7 +274,7 @@ class Stage(threading.Thread):
         """Return the agent of a version; named ones may be another each time."""
         if wanted not in self._policies:
             found = self._source.weights(wanted)
-            behavior = decode_weights(found.weights, hello.config, hello.environment)
+            behavior = decode_behavior(hello.graph, found.weights)
             # One is enough: whoever looks at two looks at one after the other.
             self._policies = {found.version: Policy(behavior, hello.config, hello.environment)}
             wanted = found.version

@@ -10,17 +10,16 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from udrl.acting import EpisodeGenerator, generate_episodes, iterate_episodes
-from udrl.behavior import BehaviorFunction
-from udrl.checkpoint import decode_weights
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import Evaluation, summarise
-from udrl.numerics import use_one_thread
+from udrl.graph import ActingFunction
 from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
+from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
 from udrl_replay.run import Progress
 from udrl_replay.store import Store
@@ -36,7 +35,7 @@ class Agent(NamedTuple):
     config: Config
     environment: EnvironmentSpec
     version: int
-    behavior: BehaviorFunction
+    behavior: ActingFunction
     buffer: ReplayBuffer
     iteration: int
     weights: bytes
@@ -82,7 +81,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             config=hello.config,
             environment=hello.environment,
             version=wanted,
-            behavior=decode_weights(found.weights, hello.config, hello.environment),
+            behavior=decode_behavior(hello.graph, found.weights),
             buffer=ReplayBuffer(hello.config, (p.entry for p in held)),
             iteration=progress.iteration,
             weights=found.weights,
@@ -104,7 +103,6 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
     command = outstanding[command_id]
     version = command.weights_version
     behavior = load_agent(run_dir, version).behavior if version else None
-    use_one_thread()
     faulthandler.dump_traceback_later(_SHOW_S, repeat=True)  # it may hang, in native code too
     try:
         return generate_episodes(EpisodeGenerator(config, 1), [command], behavior)[0]
@@ -199,7 +197,6 @@ def evaluate_all(
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
     """
-    use_one_thread()
     # Evaluations of the same run have the same ids; episodes are told apart by theirs.
     first = evaluations[0][0].id if evaluations else 0
     numbered = [

@@ -46,14 +46,16 @@ class EventFiles:
 
     def __init__(self, run_dir: Path) -> None:
         try:
-            from torch.utils.tensorboard import SummaryWriter
+            from tensorboard.compat.proto.event_pb2 import Event
+            from tensorboard.compat.proto.summary_pb2 import Summary
+            from tensorboard.summary.writer.event_file_writer import EventFileWriter
         except ModuleNotFoundError as error:
             raise ConfigError(
                 'event files need tensorboard; install it with: pip install "udrl[tensorboard]"'
             ) from error
         self._metrics = run_dir / "metrics.csv"
         self._folder = run_dir / FOLDER
-        self._kind: Any = SummaryWriter
+        self._kind, self._event, self._summary = EventFileWriter, Event, Summary
         self._writer: Any = None
         self._read = 0
         self._columns: list[str] = []
@@ -87,7 +89,7 @@ class EventFiles:
                 ("eval/ci95_low", found.ci95_low),
                 ("eval/ci95_high", found.ci95_high),
             ):
-                self._writer.add_scalar(tag, value, found.env_steps, at)
+                self._add(tag, value, found.env_steps, at)
         self._writer.flush()
 
     def close(self) -> None:
@@ -117,14 +119,19 @@ class EventFiles:
                 f"{self._folder}: {error.strerror}; make it a folder that you may write"
             ) from error
 
+    def _add(self, tag: str, value: float, step: int, at: float) -> None:
+        scalar = self._summary.Value(tag=tag, simple_value=value)
+        summary = self._summary(value=[scalar])
+        self._writer.add_event(self._event(wall_time=at, step=step, summary=summary))
+
     def _write(self, row: dict[str, str]) -> None:
         at = self._began + float(row["wall_s"])
         for tags, steps in ((TAGS, "env_steps"), (EVALUATION_TAGS, "eval_at_env_steps")):
             for tag, column in tags.items():
                 if row[column] and row[steps]:
-                    self._writer.add_scalar(tag, float(row[column]), int(row[steps]), at)
+                    self._add(tag, float(row[column]), int(row[steps]), at)
         now = float(row["env_steps"]), float(row["wall_s"])
         if now[1] > self._before[1]:
             speed = (now[0] - self._before[0]) / (now[1] - self._before[1])
-            self._writer.add_scalar("time/fps", speed, int(now[0]), at)
+            self._add("time/fps", speed, int(now[0]), at)
             self._before = now

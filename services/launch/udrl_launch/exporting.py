@@ -116,6 +116,19 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     write_config(folder, agent.config, budget_of(run_dir))
 
 
+def export_model(agent: Agent, path: Path) -> None:
+    """Write the graph that an agent acts with (:mod:`udrl.graph`) as an ONNX model.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(agent.behavior.model)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; name a file you may write") from error
+
+
 def export_buffer(run_dir: Path, name: str) -> int:
     """Write the replay buffer as a Minari dataset, least return first; return how many episodes.
 

@@ -1,6 +1,7 @@
 """All services of a run on this machine: a process each, or threads of this one."""
 
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Protocol
 from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_launch.settings import Settings
-from udrl_launch.supervisor import Supervisor
+from udrl_launch.supervisor import GRACE_S, Supervisor
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_replay.store import Store
@@ -101,6 +102,7 @@ class Threads:
         self._stop = threading.Event()
         self._errors: list[BaseException] = []
         self._threads: list[threading.Thread] = []
+        self._run_ended: float | None = None
         self._start(
             "replay",
             partial(
@@ -136,7 +138,11 @@ class Threads:
 
     @property
     def done(self) -> bool:
-        """Whether all have ended."""
+        """Whether all have ended, or the replay service has and the others had their time."""
+        if self._run_ended is None and not self._threads[0].is_alive():
+            self._run_ended = time.monotonic()
+        if self._run_ended is not None and time.monotonic() - self._run_ended > GRACE_S:
+            return True
         return not any(thread.is_alive() for thread in self._threads)
 
     def check(self) -> None:

@@ -6,13 +6,13 @@ import os
 import sys
 import threading
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 
 from udrl.config import Budget
-from udrl.errors import Deceived, RunFailed
+from udrl.errors import ConfigError, Deceived, RunFailed
 from udrl_actor.service import ActorService
 from udrl_launch.address import Address, connected, unique_name
-from udrl_learner.service import LearnerService
 from udrl_proto import session as sessions
 from udrl_proto.credentials import Credentials
 from udrl_replay.service import ReplayService
@@ -65,8 +65,21 @@ def replay(
                 raise (Deceived if progress.deceived else RunFailed)(progress.problem)
 
 
+def require_torch() -> None:
+    """Refuse to train without torch, which only a learner needs.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    if find_spec("torch") is None:
+        raise ConfigError('training needs torch; install it with: pip install "udrl[train]"')
+
+
 def learner(address: Address, stop: threading.Event) -> None:
     """Train the run at an address until it has ended."""
+    require_torch()
+    from udrl_learner.service import LearnerService  # the only one that needs torch
+
     with connected("learner", address, stop) as (session, hello):
         LearnerService(session, hello, unique_name("learner"), stop).run()
 

@@ -14,12 +14,13 @@ from udrl.errors import RunFailed
 log = logging.getLogger("udrl")
 
 #: Exit codes that starting again would only repeat (``docs/operations.md``).
-FINAL_CODES = frozenset({2, 4, 7, 8, 9, 10})
+FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
 #: A child that ended so often within ``_PERIOD_S`` seconds is given up.
 _MAX_RESTARTS = 5
 _PERIOD_S = 60.0
-_END_S = 4.5
+#: Seconds that services have to end when the run has ended, or when they are told to.
+GRACE_S = 4.5
 
 
 @dataclass
@@ -119,7 +120,7 @@ class Supervisor:
     @property
     def done(self) -> bool:
         """Whether all children have ended, or the first has and the others had their time."""
-        if self._first_done is not None and time.monotonic() - self._first_done > _END_S:
+        if self._first_done is not None and time.monotonic() - self._first_done > GRACE_S:
             return True
         return all(child.done for child in self.children)
 
@@ -129,7 +130,7 @@ class Supervisor:
         for process in processes:
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + _END_S
+        deadline = time.monotonic() + GRACE_S
         for process in processes:
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))

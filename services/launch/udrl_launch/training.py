@@ -14,6 +14,7 @@ from udrl.errors import Interrupted, Unreachable
 from udrl_launch.address import Address, connected
 from udrl_launch.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
+from udrl_launch.roles import require_torch
 from udrl_launch.settings import Settings
 from udrl_proto import keys as verbs
 from udrl_proto import session as sessions
@@ -105,6 +106,7 @@ def train(
         UdrlError: the run cannot be started or cannot go on.
         Interrupted: ``stop`` was set.
     """
+    require_torch()
     config, budget, _ = settings
     endpoint = listen or f"{'tls' if keys else 'tcp'}/127.0.0.1:{free_port()}"
     sessions.check_endpoint(endpoint, secure=keys is not None)

@@ -14,11 +14,12 @@ from typing import Any
 import zenoh
 
 import udrl
-from udrl.checkpoint import decode_state, encode_optimizer, encode_weights
+from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.errors import Interrupted, Refused
-from udrl.numerics import training_class, use_one_thread
 from udrl.segments import Experience
-from udrl.training import TrainingState, train, untrained
+from udrl.training import TrainingState, train, untrained, use_one_thread
+from udrl.training_class import training_class
+from udrl.weights import encode_weights
 from udrl_proto import keys
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode
@@ -155,7 +156,7 @@ class LearnerService:
             missing = missing[len(page.episodes) :]
 
     def _deliver(self, state: TrainingState, train_s: float) -> None:
-        weights = encode_weights(state.behavior)
+        weights = encode_weights(state.weights)
         message = VersionMessage(
             learner=self._name,
             version=state.version,

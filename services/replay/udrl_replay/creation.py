@@ -15,6 +15,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
 from udrl.episode import Episode
 from udrl.errors import OtherConfiguration, StoreError
+from udrl.graph import acting_graph
 from udrl.numerics import environment_replays, settle, settle_as
 from udrl.offline import settle_dataset
 from udrl.strategies import make_strategy
@@ -75,6 +76,7 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         run_id=_run_id(run_dir),
         config=config,
         environment=generator.spec,
+        graph=acting_graph(config, generator.spec),
         allow_inexact=allow_inexact,
         exact=exact,
     )

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import msgspec
 import zenoh
 
-from udrl.checkpoint import decode_state
 from udrl.config import Budget
-from udrl.digests import tensors_digest
+from udrl.digests import arrays_digest
 from udrl.errors import InvalidData, InvalidMessage, Refused
+from udrl.graph import weight_shapes
+from udrl.weights import decode_weights, optimizer_shapes
 from udrl_proto import keys
 from udrl_proto.answering import Question, Verb, serve
 from udrl_proto.codec import LARGEST, PAGE, encode
@@ -183,10 +184,11 @@ class ReplayService:
 
     def _verbs(self) -> dict[str, Verb]:
         config, spec = self.run.config, self.run.hello.environment
+        shapes = weight_shapes(self.run.hello.graph)
 
         def check(message: VersionMessage) -> _Delivery:
-            state = decode_state(message.version, message.weights, message.optimizer, config, spec)
-            digest = tensors_digest(state.behavior.state_dict())
+            digest = arrays_digest(decode_weights(message.weights, shapes))
+            decode_weights(message.optimizer, optimizer_shapes(shapes, config))
             version = Version(
                 message.version, digest, message.loss, message.weights, message.optimizer
             )
@@ -300,12 +302,13 @@ class ReplayService:
             self._store.set_fact("hello", self.run.hello)
         elif known != request.numerics_class:
             if not hello.allow_inexact:
+                library = "onnxruntime" if request.role == "actor" else "torch"
                 raise Refused(
                     "other_numerics",
                     f"the run's {request.role}s round like class {known}, this machine like "
                     f"{request.numerics_class}, so results would depend on who computes them; use "
-                    f"a machine with the same kind of processor and the same versions of torch and "
-                    f"numpy, or create the run with --allow-inexact",
+                    f"a machine with the same kind of processor and the same versions of {library} "
+                    f"and numpy, or create the run with --allow-inexact",
                 )
             self.run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
         if request.role == "actor":

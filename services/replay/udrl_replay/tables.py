@@ -8,7 +8,7 @@ columns are documented in ``docs/operations.md``.
 import hashlib
 from collections.abc import Iterable
 
-SCHEMA = 4
+SCHEMA = 5
 
 #: SQLite writes a whole row anew when a column changes its size; so an episode's body, which may
 #: be a megabyte and never changes, has a table of its own. Elsewhere large columns stand last:

@@ -5,10 +5,9 @@ from pathlib import Path
 import click
 
 from udrl.errors import ConfigError
-from udrl.onnx_model import export_onnx
 from udrl_launch.agents import load_agent
 from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
-from udrl_launch.exporting import export_buffer, export_folder
+from udrl_launch.exporting import export_buffer, export_folder, export_model
 from udrl_launch.obedience import kept_of
 
 
@@ -20,8 +19,8 @@ from udrl_launch.obedience import kept_of
 )  # fmt: skip
 @click.option(
     "--onnx", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-    help="The agent as an ONNX model; inputs: observation, desired_return, desired_horizon; "
-    "output: logits.",
+    help="The agent as an ONNX model; inputs: observation and command (desired return, desired "
+    "horizon); output: logits.",
 )  # fmt: skip
 @click.option(
     "--minari", metavar="NAME",
@@ -52,6 +51,6 @@ def export(
                 err=True,
             )
     if onnx is not None:
-        export_onnx(agent.policy, onnx)
+        export_model(agent, onnx)
         click.echo(f"ONNX model: {onnx}")
     return 0

@@ -5,7 +5,6 @@ from pathlib import Path
 import click
 import msgspec
 
-from udrl.numerics import use_one_thread
 from udrl_launch.agents import evaluation_commands, load_agent
 from udrl_launch.commands.options import (
     RETURN,
@@ -68,7 +67,6 @@ def play(
     )
     if seed is not None:
         commands = with_seed(commands, seed)
-    use_one_thread()
     told = commands[0]
     if not as_json:
         click.echo(

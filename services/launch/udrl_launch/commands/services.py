@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -11,8 +10,7 @@ from typing import Any
 
 import click
 
-from udrl.errors import ConfigError, InexactArithmetic
-from udrl.numerics import STRICT_MKL
+from udrl.errors import ConfigError
 from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
@@ -152,9 +150,4 @@ def actor(
     """
     os.nice(nice)
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
-    code = _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))
-    if code == InexactArithmetic.exit_code and not STRICT_MKL.items() <= os.environ.items():
-        log.warning("starting again with slower arithmetic that is exact")
-        command = [sys.executable, "-m", "udrl_launch", *sys.argv[1:]]
-        os.execve(sys.executable, command, os.environ | STRICT_MKL)  # noqa: S606 - ourselves
-    return code
+    return _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))

@@ -1,0 +1,198 @@
+"""The acting graph: the same function as in torch, row by row, and what is refused."""
+
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl import graph as module
+from udrl.behavior import BehaviorFunction, initialise
+from udrl.config import Config, build
+from udrl.environments.making import EnvironmentSpec
+from udrl.errors import InvalidWeights
+from udrl.graph import (
+    ActingFunction,
+    acting_graph,
+    is_exact_together,
+    probe_rows,
+    probe_weights,
+    weight_shapes,
+)
+from udrl.training import weights_of
+
+VECTOR = EnvironmentSpec(observation_shape=(4,), n_actions=3, max_episode_steps=500)
+IMAGE = EnvironmentSpec(
+    observation_shape=(1, 16, 16), observation_dtype="uint8", n_actions=3, max_episode_steps=500
+)
+KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
+    (VECTOR, {}),
+    (VECTOR, {"hidden": [32]}),
+    (VECTOR, {"desired_horizon": "return", "activation": "tanh"}),
+    (VECTOR, {"frame_stack": 3}),
+    (VECTOR, {"baseline": "value"}),
+    (VECTOR, {"baseline": "value", "desired_horizon": "return"}),
+    (IMAGE, {}),
+    (IMAGE, {"frame_stack": 4, "activation": "tanh"}),
+    (IMAGE, {"frame_stack": 4, "baseline": "value"}),
+]
+each_kind = pytest.mark.parametrize(("spec", "values"), KINDS)
+
+
+def settings(**values: Any) -> Config:
+    small = {"environment": "Any-v0", "hidden": [16, 32], "convolutions": [4, 8]}
+    return build(Config, small | {"return_scale": 0.02} | values)
+
+
+def acting(config: Config, behavior: BehaviorFunction, spec: EnvironmentSpec) -> ActingFunction:
+    return ActingFunction(acting_graph(config, spec), weights_of(behavior))
+
+
+def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """What the network reads of a command (2.3.2, 3.1), one number at a time."""
+    rows = []
+    for desired_return, desired_horizon in command.tolist():
+        if config.desired_horizon == "return":
+            horizon, least = float(np.floor(desired_return)), 1.0
+        else:
+            horizon, least = desired_horizon, -np.inf
+        rows.append(
+            [
+                max(desired_return, least) * config.return_scale,
+                max(horizon, 1.0) * config.horizon_scale,
+            ]
+        )
+    return np.array(rows, np.float32)
+
+
+@pytest.mark.parametrize("weights", ["initial", "far from it"])
+@each_kind
+def test_it_is_the_function_that_is_trained(
+    spec: EnvironmentSpec, values: dict[str, Any], weights: str
+) -> None:
+    config = settings(**values)
+    behavior = initialise(config, spec)
+    if weights == "far from it":
+        torch.manual_seed(1)
+        with torch.no_grad():
+            for parameter in behavior.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+    function = acting(config, behavior, spec)
+    seen, command = probe_rows(function, 64)
+    found = function.logits(seen, command)
+    with torch.inference_mode():
+        expected = behavior(torch.tensor(seen), torch.tensor(read(config, command))).numpy()
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    assert np.ptp(found, axis=0).min() > 0.01, "rows that are all alike prove little"
+
+
+@each_kind
+def test_its_weights_are_those_of_the_network(
+    spec: EnvironmentSpec, values: dict[str, Any]
+) -> None:
+    config = settings(**values)
+    expected = {n: t.shape for n, t in weights_of(initialise(config, spec)).items()}
+    assert weight_shapes(acting_graph(config, spec)) == expected
+
+
+@each_kind
+def test_the_model_is_valid_and_says_the_same_elsewhere(
+    spec: EnvironmentSpec, values: dict[str, Any]
+) -> None:
+    config = settings(**values)
+    function = acting(config, initialise(config, spec), spec)
+    model = onnx.load_from_string(function.model)
+    onnx.checker.check_model(model, full_check=True)
+    assert (model.ir_version, model.opset_import[0].version) == (7, 13)
+    seen, command = probe_rows(function, 5)
+    (found,) = onnxruntime.InferenceSession(function.model).run(
+        None, {"observation": seen, "command": command}
+    )
+    np.testing.assert_allclose(found, function.logits(seen, command), rtol=1e-5, atol=1e-6)
+
+
+@each_kind
+def test_a_row_has_the_same_bits_in_any_company(
+    spec: EnvironmentSpec, values: dict[str, Any]
+) -> None:
+    config = settings(**values)
+    function = acting(config, initialise(config, spec), spec)
+    seen, command = probe_rows(function, 40)
+    alone = function.logits(seen, command)
+    rng = np.random.default_rng(1)
+    for n in (1, 2, 3, 7, 16, 33, 40):
+        rows = rng.permutation(40)[:n]
+        call = function.call(n)
+        call.observation[:], call.command[:] = seen[rows], command[rows]
+        call.run()
+        assert np.array_equal(call.logits, alone[rows]), n
+
+
+def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = settings()
+    graph = acting_graph(config, VECTOR)
+    asked = []
+
+    def never(graph: bytes, n: int) -> bool:
+        asked.append(n)
+        return False
+
+    monkeypatch.setattr(module, "is_exact_together", never)
+    function = ActingFunction(graph, probe_weights(graph))
+    seen, command = probe_rows(function, 6)
+    call = function.call(6)
+    assert isinstance(call, module._OneByOne)
+    for rows in ([0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0]):
+        call.observation[:], call.command[:] = seen[rows], command[rows]
+        call.run()
+        assert np.array_equal(call.logits, function.logits(seen[rows], command[rows]))
+    assert asked == [6]
+
+
+def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = settings(seed=3, hidden=[48])
+    graph = acting_graph(config, VECTOR)
+    run = module._Together.run
+
+    def last_differs(self: module._Together) -> None:
+        run(self)
+        if len(self.logits) > 1:
+            self.logits[-1] = np.nextafter(self.logits[-1], np.float32(np.inf))
+
+    is_exact_together.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(module._Together, "run", last_differs)
+        assert not is_exact_together(graph, 4)
+    is_exact_together.cache_clear()
+    assert is_exact_together(graph, 4)
+
+
+def test_a_graph_is_a_function_of_settings_and_spaces() -> None:
+    assert acting_graph(settings(), VECTOR) == acting_graph(settings(), VECTOR)
+    assert acting_graph(settings(), VECTOR) != acting_graph(settings(hidden=[8]), VECTOR)
+
+
+def test_probe_weights_are_bounded_by_the_inputs_of_a_unit() -> None:
+    weights = probe_weights(acting_graph(settings(), VECTOR))
+    assert np.abs(weights["layers.0.weight"]).max() <= 0.25
+    assert np.abs(weights["layers.0.weight"]).max() > 0.2
+    assert {w.dtype for w in weights.values()} == {np.dtype(np.float32)}
+
+
+@given(st.binary(min_size=1, max_size=200))
+def test_garbage_is_no_graph(garbage: bytes) -> None:
+    with pytest.raises(InvalidWeights, match="acting graph"):
+        ActingFunction(garbage, {})
+
+
+def test_a_graph_without_all_weights_is_refused() -> None:
+    graph = acting_graph(settings(), VECTOR)
+    weights = dict(probe_weights(graph))
+    del weights["action.bias"]
+    with pytest.raises(InvalidWeights, match=r"action\.bias"):
+        ActingFunction(graph, weights)

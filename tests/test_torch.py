@@ -1,0 +1,48 @@
+"""Only a learner needs torch: everything else is imported where there is none."""
+
+import subprocess
+import sys
+
+import pytest
+
+#: What actors, the replay service, lookers-on and users of a trained agent import.
+MODULES = (
+    "udrl.folder", "udrl.graph", "udrl.obedience", "udrl.policy", "udrl.rollout",
+    "udrl_actor.service", "udrl_replay.service", "udrl_board.app", "udrl_board.command",
+    "udrl_launch.agents", "udrl_launch.api", "udrl_launch.cli", "udrl_launch.commands.exporting",
+    "udrl_launch.commands.obedience", "udrl_launch.commands.playing",
+    "udrl_launch.commands.services", "udrl_launch.commands.training", "udrl_launch.event_files",
+    "udrl_launch.exporting", "udrl_launch.roles",
+)  # fmt: skip
+
+WITHOUT = "import sys; sys.modules['torch'] = None; "
+
+
+def python(program: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT + program],
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+
+
+def test_only_the_learner_needs_torch() -> None:
+    program = "import importlib; [importlib.import_module(n) for n in sys.argv[1:]]"
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT + program, *MODULES],
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "torch" in python("import udrl_learner.service").stderr
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import udrl; udrl.train('CartPole-v1', run_dir=sys.argv[-1] + '/never')",
+        "from udrl_launch.roles import learner; learner(None, None)",
+    ],
+)
+def test_training_without_torch_names_the_extra(program: str) -> None:
+    done = python(program)
+    assert done.returncode == 1
+    assert 'training needs torch; install it with: pip install "udrl[train]"' in done.stderr

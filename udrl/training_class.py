@@ -1,0 +1,44 @@
+"""The numerics class of training: machines of one class make the same weights, bit for bit."""
+
+import math
+
+import msgspec
+import numpy as np
+
+from udrl.config import Config
+from udrl.digests import arrays_digest
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Episode, action_dtype
+from udrl.numerics import PROBE_STEPS
+from udrl.segments import Experience
+from udrl.streams import Purpose, Stream, stream_key
+from udrl.training import train, untrained
+
+#: Index of the probe's stream that the episode is made of.
+_EPISODE = 1000
+
+
+def training_class(config: Config, spec: EnvironmentSpec) -> str:
+    """Return the digest of the weights after two updates on an episode of noise."""
+    small = msgspec.structs.replace(
+        config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1
+    )
+    stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
+    length = min(PROBE_STEPS, spec.max_episode_steps)
+    shape = (length, *spec.observation_shape)
+    noise = stream.uniforms(math.prod(shape)).reshape(shape)
+    episode = Episode(
+        command_id=0,
+        observations=(
+            (noise * 256).astype(np.uint8) if spec.is_image else (noise * 4 - 2).astype(np.float32)
+        ),
+        actions=stream.integers(length, 0, spec.n_actions).astype(action_dtype(spec.n_actions)),
+        rewards=stream.uniforms(length).astype(np.float32),
+        terminated=True,
+        truncated=False,
+    )
+    experience = Experience(small, msgspec.structs.replace(spec, max_episode_steps=length))
+    experience.add(episode)
+    state = untrained(small, spec)
+    train(state, experience.by_rank([0]), small)
+    return arrays_digest(state.weights).hex()[:16]
