@@ -18,7 +18,7 @@ from udrl.graph import acting_graph
 from udrl.policy import Policy
 from udrl.weights import decode_behavior, encode_weights
 
-FORMAT = 1
+FORMAT = 2
 
 _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
 #: Weights of more than this nobody has trained with this project.
@@ -41,6 +41,12 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     environment: EnvironmentSpec
     desired_return: float
     desired_horizon: int
+
+
+class _Format(msgspec.Struct, frozen=True):
+    """What folders of all formats have."""
+
+    format: int
 
 
 def save(folder: Path, policy: Policy, card: str) -> None:
@@ -91,16 +97,17 @@ def load(folder: str | Path) -> Policy:
     folder = Path(folder)
     described, weights = (_read(folder / name) for name in (_DESCRIPTION, _WEIGHTS))
     try:
+        found = msgspec.json.decode(described, type=_Format).format
+        if found != FORMAT:
+            raise InvalidData(
+                f"{folder / _DESCRIPTION}: format {found}, this version of udrl reads {FORMAT}; "
+                f"export the run again"
+            )
         description = msgspec.json.decode(described, type=Description)
-    except (msgspec.ValidationError, msgspec.DecodeError, UdrlError) as error:
+    except (msgspec.ValidationError, msgspec.DecodeError, ConfigError) as error:
         raise InvalidData(
             f"{folder / _DESCRIPTION}: {error}; export the run again, with this version of udrl"
         ) from error
-    if description.format != FORMAT:
-        raise InvalidData(
-            f"{folder / _DESCRIPTION}: format {description.format}, this version of udrl reads "
-            f"{FORMAT}; export the run again"
-        )
     graph = acting_graph(description.config, description.environment)
     behavior = decode_behavior(graph, weights)
     return Policy(
@@ -117,7 +124,7 @@ def _refuse_others(folder: Path) -> None:
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     try:
-        msgspec.json.decode(_read(folder / _DESCRIPTION), type=Description)
+        msgspec.json.decode(_read(folder / _DESCRIPTION), type=_Format)
     except (msgspec.DecodeError, UdrlError) as error:
         raise ConfigError(
             f"{folder} holds something else than an exported agent; name a new folder"

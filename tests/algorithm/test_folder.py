@@ -63,8 +63,8 @@ def test_a_policy_makes_the_environment_that_it_knows(policy: Policy) -> None:
     ("changed", "says"),
     [
         (b"{", "export the run again"),
-        (b'{"format": 1}', "missing required field"),
-        (b'{"format": 1, "surplus": 2}', "export the run again"),
+        (b'{"format": 2}', "missing required field"),
+        (b'{"format": 2, "surplus": 2}', "export the run again"),
     ],
 )
 def test_descriptions_that_are_not_what_was_written(
@@ -75,11 +75,16 @@ def test_descriptions_that_are_not_what_was_written(
         udrl.load(written)
 
 
-def test_a_format_of_another_version(written: Path) -> None:
+def test_a_format_of_another_version_is_named_and_may_be_written_over(
+    policy: Policy, written: Path
+) -> None:
     description = json.loads((written / "config.json").read_text())
-    (written / "config.json").write_text(json.dumps(description | {"format": 2}))
-    with pytest.raises(InvalidData, match="format 2, this version of udrl reads 1"):
+    of_another = description | {"format": 1, "surplus": 2}
+    (written / "config.json").write_text(json.dumps(of_another))
+    with pytest.raises(InvalidData, match="format 1, this version of udrl reads 2"):
         udrl.load(written)
+    folder.save(written, policy, "# A card\n")
+    assert udrl.load(written).desired_return == policy.desired_return
 
 
 def test_weights_of_another_architecture(written: Path) -> None:
