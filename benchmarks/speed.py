@@ -39,7 +39,8 @@ from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
-from udrl.graph import ActingFunction, acting_graph, probe_weights
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction, probe_weights
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained, use_one_thread

@@ -7,7 +7,7 @@ import pytest
 
 #: What actors, the replay service, lookers-on and users of a trained agent import.
 MODULES = (
-    "udrl.folder", "udrl.graph", "udrl.obedience", "udrl.policy", "udrl.rollout",
+    "udrl.folder", "udrl.inference", "udrl.obedience", "udrl.policy", "udrl.rollout",
     "udrl_actor.service", "udrl_replay.service", "udrl_board.app", "udrl_board.command",
     "udrl_launch.agents", "udrl_launch.api", "udrl_launch.cli", "udrl_launch.commands.exporting",
     "udrl_launch.commands.obedience", "udrl_launch.commands.playing",

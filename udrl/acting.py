@@ -10,8 +10,8 @@
             ...  # an Episode, or a Failure
 
 The behavior function is evaluated for all environments in one call. Which rows stand beside it does
-not change a row's result (:class:`udrl.graph.ActingFunction`), so an episode depends on its command
-alone. With a ``frame_stack`` of more than 1 it sees the episode's most recent observations
+not change a row's result (:class:`udrl.inference.ActingFunction`), so an episode depends on its
+command alone. With a ``frame_stack`` of more than 1 it sees the episode's most recent observations
 (:func:`udrl.episode.recent`).
 """
 
@@ -35,7 +35,7 @@ from udrl.environments.making import (
 )
 from udrl.episode import Episode, action_dtype, recent
 from udrl.errors import EnvironmentFault
-from udrl.graph import Acting, Call
+from udrl.inference import Acting, Call
 from udrl.streams import Stream
 
 #: Failures under the same command after which it is hopeless.

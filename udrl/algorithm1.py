@@ -13,7 +13,8 @@ from udrl.digests import Digest, arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer

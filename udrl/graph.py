@@ -2,23 +2,21 @@
 
 Everything that acts computes this graph in ONNX Runtime; :mod:`udrl.behavior` is the same function
 in torch, for training. A graph without values belongs to a run and says what its weights are; with
-the weights of one version it becomes an :class:`ActingFunction`.
+the weights of one version it becomes an :class:`udrl.inference.ActingFunction`.
 
 Inputs: ``observation``, what the network sees ([batch, *stacked_shape], float32 vectors or uint8
 images), and ``command``, desired return and desired horizon, neither bounded nor scaled (float64
 [batch, 2]). Output: ``logits`` of P(a | s, c), float32 [batch, n_actions].
 """
 
-import functools
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import onnx
-import onnxruntime
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
@@ -36,14 +34,9 @@ from udrl.architecture import (
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
-from udrl.streams import Purpose, Stream, stream_key
 
 #: The tensors of a weights version by name, float32.
 Weights = Mapping[str, npt.NDArray[np.float32]]
-
-Observations = npt.NDArray[np.generic]
-Commands = npt.NDArray[np.float64]
-Logits = npt.NDArray[np.float32]
 
 # As old as the operators below allow, so that old runtimes can read an exported agent.
 _OPSET, _IR_VERSION = 13, 7
@@ -211,149 +204,6 @@ class _Builder:
         return output
 
 
-class Call(Protocol):
-    """The rows of one call: fill in the inputs, run, read the logits; again and again.
-
-    Attributes:
-        observation: [n, *stacked_shape].
-        command: desired return and desired horizon, float64 [n, 2].
-        logits: float32 [n, n_actions], what the last run returned.
-    """
-
-    observation: Observations
-    command: Commands
-    logits: Logits
-
-    def run(self) -> None:
-        """Compute the logits."""
-        ...
-
-
-class Acting(Protocol):
-    """What :mod:`udrl.acting` asks for actions: an :class:`ActingFunction`, or a stand-in."""
-
-    def call(self, n: int) -> Call:
-        """Return a call of ``n`` rows."""
-        ...
-
-
-class ActingFunction:
-    """B(s, c; theta) of one weights version, ready to act.
-
-    A row's logits are by definition those of a call with this row alone. Several rows go in one
-    call where that gives the same bits, which is tried out once per process and number of rows.
-
-    Args:
-        graph: of the run (:func:`acting_graph`).
-        weights: of the version.
-
-    Raises:
-        InvalidWeights: the bytes are no graph, or the weights are not those of the graph.
-    """
-
-    def __init__(self, graph: bytes, weights: Weights) -> None:
-        self._graph = graph
-        self.weights = weights
-        self.model = _with_weights(graph, weights)
-        self._session = _session(self.model)
-        self._calls: dict[int, Call] = {}
-
-    def call(self, n: int) -> Call:
-        """Return a call of ``n`` rows. It is not for several threads at once."""
-        if n not in self._calls:
-            together = n == 1 or is_exact_together(self._graph, n)
-            rows = _Together if together else _OneByOne
-            self._calls[n] = rows(self._session, n)
-        return self._calls[n]
-
-    def logits(self, observation: Observations, command: Commands) -> Logits:
-        """Return the logits of rows, float32 [n, n_actions]; for any thread."""
-        rows = [
-            self._session.run(None, {"observation": s[None], "command": c[None]})[0]
-            for s, c in zip(observation, command, strict=True)
-        ]
-        return np.concatenate(rows)
-
-
-class _Together:
-    """All rows in one run of the session, with inputs and output bound to arrays."""
-
-    def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
-        observation, command = session.get_inputs()
-        (logits,) = session.get_outputs()
-        seen = np.uint8 if observation.type == "tensor(uint8)" else np.float32
-        self.observation: Observations = np.zeros((n, *observation.shape[1:]), seen)
-        self.command = np.zeros((n, *command.shape[1:]))
-        self.logits = np.zeros((n, *logits.shape[1:]), np.float32)
-        self._session = session
-        self._binding = session.io_binding()
-        self._binding.bind_cpu_input("observation", self.observation)
-        self._binding.bind_cpu_input("command", self.command)
-        self._binding.bind_output(
-            "logits", "cpu", 0, np.float32, self.logits.shape, self.logits.ctypes.data
-        )
-
-    def run(self) -> None:
-        self._session.run_with_iobinding(self._binding)
-
-
-class _OneByOne:
-    """A run of the session for each row, on machines where company changes a row's bits."""
-
-    def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
-        self._one = one = _Together(session, 1)
-        self.observation = np.repeat(one.observation, n, axis=0)
-        self.command = np.repeat(one.command, n, axis=0)
-        self.logits = np.repeat(one.logits, n, axis=0)
-
-    def run(self) -> None:
-        one = self._one
-        for row in range(len(self.logits)):
-            one.observation[0], one.command[0] = self.observation[row], self.command[row]
-            one.run()
-            self.logits[row] = one.logits[0]
-
-
-@functools.cache
-def is_exact_together(graph: bytes, n: int) -> bool:
-    """Say whether a call of ``n`` rows gives each the bits that a call for it alone gives."""
-    function = _probe(graph)
-    rows = _Together(function._session, n)
-    rows.observation[:], rows.command[:] = probe_rows(function, n)
-    rows.run()
-    return np.array_equal(rows.logits, function.logits(rows.observation, rows.command))
-
-
-@functools.lru_cache(maxsize=1)
-def _probe(graph: bytes) -> ActingFunction:
-    return ActingFunction(graph, probe_weights(graph))
-
-
-def probe_weights(graph: bytes) -> Weights:
-    """Return weights to try a machine's arithmetic with, which need no torch to be made.
-
-    Tensor k, in the order of names, has the numbers of stream (0, probe, 0, k), mapped to +-1 /
-    sqrt(inputs of a unit) and rounded to float32.
-    """
-    weights = {}
-    for k, (name, shape) in enumerate(sorted(weight_shapes(graph).items())):
-        numbers = Stream(stream_key(0, Purpose.PROBE, 0, k)).uniforms(math.prod(shape))
-        bound = 1 / math.sqrt(math.prod(shape[1:]))  # rounded alike everywhere, as a power is not
-        weights[name] = ((numbers * 2 - 1) * bound).astype(np.float32).reshape(shape)
-    return weights
-
-
-def probe_rows(function: ActingFunction, n: int) -> tuple[Observations, Commands]:
-    """Return noise to look at: observations in [-2, 2) or bytes, commands in [-100, 100)."""
-    like = function.call(1).observation
-    stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
-    numbers = stream.uniforms(n * like[0].size).reshape(n, *like.shape[1:])
-    is_image = like.dtype == np.uint8
-    seen = (numbers * 256 if is_image else numbers * 4 - 2).astype(like.dtype)
-    command = stream.uniforms(2 * n).reshape(n, 2) * 200 - 100
-    return seen, command
-
-
 def _parse(graph: bytes) -> onnx.ModelProto:
     try:
         model: onnx.ModelProto = onnx.ModelProto.FromString(graph)
@@ -362,7 +212,7 @@ def _parse(graph: bytes) -> onnx.ModelProto:
     return model
 
 
-def _with_weights(graph: bytes, weights: Weights) -> bytes:
+def with_weights(graph: bytes, weights: Weights) -> bytes:
     """Return a graph with values."""
     model = _parse(graph)
     for tensor in model.graph.initializer:
@@ -377,24 +227,3 @@ def _with_weights(graph: bytes, weights: Weights) -> bytes:
             tensor.raw_data = np.ascontiguousarray(values, "<f4").tobytes()
     serialised: bytes = model.SerializeToString(deterministic=True)
     return serialised
-
-
-def _session(model: bytes) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    # More threads would only wait for each other in calls this small, and might sum otherwise.
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what it would print is in the error
-    try:
-        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no base of their own
-        raise InvalidWeights(
-            f"acting graph: ONNX Runtime cannot read it: {error}; install the versions of onnx "
-            f"and onnxruntime that the run was created with"
-        ) from error
-    names = [[one.name for one in ends] for ends in (session.get_inputs(), session.get_outputs())]
-    if names != [["observation", "command"], ["logits"]]:
-        raise InvalidWeights(
-            f"acting graph: from {names[0]} to {names[1]}, expected from observation and command "
-            f"to logits; the run was created by another version of udrl"
-        )
-    return session

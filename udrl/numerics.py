@@ -16,7 +16,7 @@ from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
 from udrl.digests import arrays_digest, episode_digest
 from udrl.episode import Episode
-from udrl.graph import Acting, ActingFunction, probe_rows, probe_weights
+from udrl.inference import Acting, ActingFunction, probe_rows, probe_weights
 from udrl.streams import Purpose, stream_key
 
 #: Steps of an episode of the probe, and rows of its logits.

@@ -13,7 +13,7 @@ from udrl.architecture import stacked_shape
 from udrl.config import Config
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
-from udrl.graph import ActingFunction
+from udrl.inference import ActingFunction
 
 
 class Policy:

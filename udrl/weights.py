@@ -14,7 +14,8 @@ import safetensors.numpy
 
 from udrl.config import Config
 from udrl.errors import InvalidWeights
-from udrl.graph import ActingFunction, Weights, weight_shapes
+from udrl.graph import Weights, weight_shapes
+from udrl.inference import ActingFunction
 
 #: Adam's state of a tensor of the same shape.
 MOMENTS = ("exp_avg", "exp_avg_sq")

@@ -19,7 +19,8 @@ from udrl.config import Config
 from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.graph import ActingFunction, acting_graph, probe_rows, probe_weights
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction, probe_rows, probe_weights
 from udrl.numerics import PROBE_ROWS
 from udrl.streams import Purpose, Stream, stream_key
 from udrl_proto import PROTOCOL

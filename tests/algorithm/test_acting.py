@@ -26,7 +26,8 @@ from udrl.environments import (
 )
 from udrl.episode import Episode, action_dtype
 from udrl.errors import EnvironmentFault
-from udrl.graph import ActingFunction, Call, Observations, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction, Call, Observations
 from udrl.replay import Entry, ReplayBuffer
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import weights_of

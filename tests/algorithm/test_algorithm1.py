@@ -10,7 +10,8 @@ from udrl.config import Budget, Config, build
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import summarise
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.replay import Entry, ReplayBuffer
 from udrl.segments import Experience
 from udrl.training import train, untrained

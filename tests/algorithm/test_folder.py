@@ -12,7 +12,8 @@ from udrl import folder
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.errors import ConfigError, InvalidData, InvalidWeights
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.training import untrained
 

@@ -14,7 +14,8 @@ from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.episode import Episode, recent
-from udrl.graph import ActingFunction, Call, acting_graph, probe_weights
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction, Call, probe_weights
 from udrl.segments import Experience, Segments
 from udrl.streams import Purpose, stream_key
 

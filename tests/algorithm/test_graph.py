@@ -10,19 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl import graph as module
+from udrl import inference as module
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
-from udrl.graph import (
-    ActingFunction,
-    acting_graph,
-    is_exact_together,
-    probe_rows,
-    probe_weights,
-    weight_shapes,
-)
+from udrl.graph import acting_graph, weight_shapes
+from udrl.inference import ActingFunction, is_exact_together, probe_rows, probe_weights
 from udrl.training import weights_of
 
 VECTOR = EnvironmentSpec(observation_shape=(4,), n_actions=3, max_episode_steps=500)

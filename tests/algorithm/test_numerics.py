@@ -13,7 +13,8 @@ from udrl.config import Config, build
 from udrl.environments import Environment, EnvironmentSpec
 from udrl.environments.obedience import Obedience
 from udrl.errors import EnvironmentFault
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.numerics import acting_class, environment_replays
 from udrl.training_class import training_class
 

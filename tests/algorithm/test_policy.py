@@ -7,7 +7,8 @@ import pytest
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.errors import InvalidData
-from udrl.graph import ActingFunction, acting_graph, probe_weights
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction, probe_weights
 from udrl.policy import Policy, choose, probabilities
 
 

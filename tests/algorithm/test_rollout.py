@@ -11,7 +11,8 @@ from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.environments import Environment, make_environment, specify
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key

@@ -20,7 +20,8 @@ from udrl.checkpoint import encode_optimizer
 from udrl.commands import Command
 from udrl.config import Budget, Config
 from udrl.errors import InvalidData
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights

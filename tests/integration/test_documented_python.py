@@ -11,7 +11,8 @@ import pytest
 from udrl import folder
 from udrl.config import Config, build, preset
 from udrl.environments import make_environment, specify
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.training import untrained
 

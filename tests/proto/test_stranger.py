@@ -22,7 +22,8 @@ from udrl.commands import Command, Kind
 from udrl.config import Budget, Config
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
-from udrl.graph import ActingFunction, acting_graph
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
 from udrl.numerics import acting_class
 from udrl.streams import Purpose, stream_key
 from udrl.training import untrained

@@ -17,7 +17,7 @@ from udrl.acting import Failure
 from udrl.commands import Command
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage, Refused
-from udrl.graph import ActingFunction
+from udrl.inference import ActingFunction
 from udrl.weights import decode_behavior
 from udrl_actor.outbox import Outbox
 from udrl_proto import keys

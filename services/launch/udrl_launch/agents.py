@@ -16,7 +16,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import Evaluation, summarise
-from udrl.graph import ActingFunction
+from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
 from udrl.weights import decode_behavior
