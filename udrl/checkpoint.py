@@ -1,6 +1,5 @@
 """The state of training as weights and optimizer (:mod:`udrl.weights`), and back."""
 
-import copy
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,20 +10,18 @@ from udrl.behavior import BehaviorFunction
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
-from udrl.training import TrainingState, make_optimizer, weights_of
+from udrl.training import TrainingState, make_optimizer
 from udrl.weights import MOMENTS, decode_weights, encode_weights, optimizer_shapes
 
 
 def encode_optimizer(state: TrainingState) -> bytes:
     """Return Adam's state as safetensors; empty at version 0, when there is none."""
     tensors: dict[str, npt.NDArray[np.float32]] = {}
-    for name, parameter in state.trained.named_parameters():
+    for name, parameter in state.behavior.named_parameters():
         held = state.optimizer.state.get(parameter)
         if held:
             for key in (*MOMENTS, "step"):
                 tensors[f"{key}.{name}"] = held[key].detach().cpu().numpy()
-    if tensors and state.trained is not state.behavior:
-        tensors |= {f"trained.{n}": t for n, t in weights_of(state.trained).items()}
     return encode_weights(tensors)
 
 
@@ -40,17 +37,13 @@ def decode_state(
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items()}
     behavior.load_state_dict(_tensors(decode_weights(weights, shapes)))
     behavior.to(config.device)
-    tensors = _tensors(decode_weights(optimizer, optimizer_shapes(shapes, config)))
-    trained = behavior
-    if config.ema_decay:
-        trained = copy.deepcopy(behavior)
-        trained.load_state_dict({n: tensors[f"trained.{n}"] for n in shapes})
-    adam = make_optimizer(trained, config)
-    for name, parameter in trained.named_parameters():
+    tensors = _tensors(decode_weights(optimizer, optimizer_shapes(shapes)))
+    adam = make_optimizer(behavior, config)
+    for name, parameter in behavior.named_parameters():
         adam.state[parameter] = {
             k: tensors[f"{k}.{name}"].to(config.device) for k in ("step", *MOMENTS)
         }
-    return TrainingState(version, trained, behavior, adam)
+    return TrainingState(version, behavior, adam)
 
 
 def _tensors(weights: Weights) -> Mapping[str, torch.Tensor]:

@@ -54,8 +54,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             (:mod:`udrl.strategies`).
         dataset: a Minari dataset whose episodes take the place of the warm-up's; None: none.
         dataset_sha256: digest of these; empty: whatever they are when the run is created.
-        ema_decay: weights that act are an exponential moving average of the trained ones, with this
-            decay per update; 0, as in the paper: the trained weights act.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
@@ -113,7 +111,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
     desired_horizon: Literal["mean", "return"] = "mean"
-    ema_decay: Annotated[float, Meta(ge=0, le=0.9999)] = 0.0
     held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
     hold_steps: PositiveInt = 30
     horizon_scale: Scale = 0.01

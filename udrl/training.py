@@ -1,7 +1,6 @@
 """Section 2.3.3: a fixed number of Adam updates turns weights version v-1 into version v."""
 
 import contextlib
-import copy
 import math
 import os
 from collections.abc import Iterator
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
@@ -31,14 +29,10 @@ class TrainingState:
 
     Attributes:
         version: v; 0 is untrained.
-        trained: what the optimizer updates.
-        behavior: what acts: the moving average of ``trained``, or the same object where
-            ``ema_decay`` is 0.
         loss: mean cross-entropy, in nats, over the updates that made this version; NaN at 0.
     """
 
     version: int
-    trained: BehaviorFunction
     behavior: BehaviorFunction
     optimizer: torch.optim.Adam
     loss: float = float("nan")
@@ -64,9 +58,8 @@ def use_one_thread() -> None:
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
     """Return version 0, a function of the seed."""
-    trained = initialise(config, spec).to(config.device)
-    behavior = copy.deepcopy(trained) if config.ema_decay else trained
-    return TrainingState(0, trained, behavior, make_optimizer(trained, config))
+    behavior = initialise(config, spec).to(config.device)
+    return TrainingState(0, behavior, make_optimizer(behavior, config))
 
 
 def make_optimizer(behavior: BehaviorFunction, config: Config) -> torch.optim.Adam:
@@ -97,19 +90,15 @@ def _update(
     state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
-    batches = _Batches(config, state.trained)
+    batches = _Batches(config, state.behavior)
     losses = torch.zeros((), dtype=torch.float64, device=config.device)
     one = torch.ones((), device=config.device)
-    parameters = list(state.trained.parameters())
-    averages = list(state.behavior.parameters())
-    average = get_ema_multi_avg_fn(config.ema_decay)
-    if state.trained.value is not None:
-        _learn_value(state, state.trained.value, experience, segments, config, batches)
+    parameters = list(state.behavior.parameters())
+    if state.behavior.value is not None:
+        _learn_value(state, state.behavior.value, experience, segments, config, batches)
     for observation, command, action in batches.gather(experience, segments):
-        loss = functional.cross_entropy(state.trained(observation, command), action)
+        loss = functional.cross_entropy(state.behavior(observation, command), action)
         _step(state.optimizer, parameters, loss, one)
-        if config.ema_decay:
-            average(averages, parameters, None)
         losses += loss.detach()
     return float(losses)
 
@@ -123,7 +112,7 @@ def _learn_value(
     batches: "_Batches",
 ) -> None:
     """Bring V to the lambda-returns, one update for each row, then label the examples anew."""
-    parameters = list(state.trained.parameters())
+    parameters = list(state.behavior.parameters())
     one = torch.ones((), device=config.device)
     _label(value, experience, config)
     for observation, command, _ in batches.gather(experience, segments):

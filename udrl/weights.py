@@ -1,9 +1,8 @@
 """Weights and optimizer state as safetensors; never pickle.
 
 A version's weights are one blob with its tensors by name; its optimizer is another, with Adam's two
-moments of each tensor and its step count, and with the trained weights where their moving average
-acts. What comes from outside is validated for names, shapes, dtypes and finite values before it is
-used.
+moments of each tensor and its step count. What comes from outside is validated for names, shapes,
+dtypes and finite values before it is used.
 """
 
 from collections.abc import Mapping
@@ -12,7 +11,6 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from udrl.config import Config
 from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes
 from udrl.inference import ActingFunction
@@ -71,17 +69,14 @@ def decode_behavior(graph: bytes, blob: bytes) -> ActingFunction:
     return ActingFunction(graph, decode_weights(blob, weight_shapes(graph)))
 
 
-def optimizer_shapes(shapes: Shapes, config: Config) -> dict[str, tuple[int, ...]]:
+def optimizer_shapes(shapes: Shapes) -> dict[str, tuple[int, ...]]:
     """Return the shape of each tensor of an optimizer's state, by name.
 
     Args:
         shapes: of the weights.
-        config: ``ema_decay``.
     """
     expected: dict[str, tuple[int, ...]] = {}
     for name, shape in shapes.items():
         expected |= {f"{moment}.{name}": shape for moment in MOMENTS}
         expected[f"step.{name}"] = ()
-        if config.ema_decay:
-            expected[f"trained.{name}"] = shape
     return expected

@@ -17,7 +17,7 @@ from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.segments import Experience, RankedExperience
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import TrainingState, train, untrained, use_one_thread, weights_of
+from udrl.training import TrainingState, train, untrained, use_one_thread
 
 SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
 
@@ -85,18 +85,12 @@ def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Conf
                 [desired_return * config.return_scale, desired_horizon * config.horizon_scale]
             )
             actions.append(int(episode.actions[t1]))
-        logits = state.trained(torch.tensor(states), torch.tensor(commands, dtype=torch.float32))
+        logits = state.behavior(torch.tensor(states), torch.tensor(commands, dtype=torch.float32))
         loss = functional.cross_entropy(logits, torch.tensor(actions))
         state.optimizer.zero_grad()
         loss.backward()
         state.optimizer.step()
         losses.append(loss.item())
-        if config.ema_decay:
-            with torch.no_grad():
-                for average, weight in zip(
-                    state.behavior.parameters(), state.trained.parameters(), strict=True
-                ):
-                    average.copy_(config.ema_decay * average + (1 - config.ema_decay) * weight)
     return float(np.mean(losses))
 
 
@@ -108,20 +102,6 @@ def test_training_equals_a_loop_over_single_examples(segments: str) -> None:
     loss = train_one_by_one(slow, EPISODES, config)
     assert digest(fast) == digest(slow)
     assert fast.loss == pytest.approx(loss)
-
-
-def test_what_acts_is_a_moving_average_of_what_is_trained() -> None:
-    config = settings(ema_decay=0.9)
-    fast, slow, plain = (untrained(c, SPEC) for c in (config, config, settings()))
-    train(fast, ranked(config, EPISODES), config)
-    train_one_by_one(slow, EPISODES, config)
-    train(plain, ranked(config, EPISODES), settings())
-    trained = fast.trained.state_dict()
-    # The average does not change what is trained, and lags behind it.
-    assert arrays_digest(weights_of(fast.trained)) == digest(plain) != digest(fast)
-    for name, tensor in fast.behavior.state_dict().items():
-        torch.testing.assert_close(tensor, slow.behavior.state_dict()[name])
-        assert not torch.equal(tensor, trained[name])
 
 
 def test_version_0_is_untrained_and_every_training_makes_the_next() -> None:

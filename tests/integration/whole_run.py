@@ -29,7 +29,6 @@ SMALL: dict[str, Any] = {
     "batch_size": 64,
     "hidden": [16, 16],
     "learning_rate": 3e-3,
-    "ema_decay": 0.9,
     "n_warm_up_episodes": 12,
     "warm_up_hold": 2,
     "n_episodes_per_iter": 6,

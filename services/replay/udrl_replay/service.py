@@ -183,12 +183,12 @@ class ReplayService:
                     return
 
     def _verbs(self) -> dict[str, Verb]:
-        config, spec = self.run.config, self.run.hello.environment
+        spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
 
         def check(message: VersionMessage) -> _Delivery:
             digest = arrays_digest(decode_weights(message.weights, shapes))
-            decode_weights(message.optimizer, optimizer_shapes(shapes, config))
+            decode_weights(message.optimizer, optimizer_shapes(shapes))
             version = Version(
                 message.version, digest, message.loss, message.weights, message.optimizer
             )
