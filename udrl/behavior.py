@@ -5,7 +5,6 @@ an image by convolutions. The command, scaled by fixed factors, passes a fully c
 layer and is multiplied element-wise with the embedding; fully connected layers follow.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -16,7 +15,6 @@ from udrl.config import Config
 from udrl.encoders import (
     ACTIVATIONS,
     PRECISIONS,
-    Layers,
     convolutions,
     encode,
     fully_connected,
@@ -70,29 +68,21 @@ class BehaviorFunction(nn.Module):
             with torch.no_grad():
                 expected = self.value(observation)
             command = relative(command, expected)
-        return self._logits(self._tensors(), observation, command)
-
-    def _tensors(self) -> list[tuple[Tensor, Tensor]]:
-        return tensors((*self._encoder, self.command, *self.layers, self.action), self._precision)
-
-    @property
-    def _encoder(self) -> Sequence[nn.Module]:
-        return tuple(self.convolutions) if self.is_convolutional else (self.observation,)
-
-    @property
-    def is_convolutional(self) -> bool:
-        """Whether observations are images."""
-        return len(self.observation_shape) > 1
-
-    def _logits(self, layers: Layers, observation: Tensor, command: Tensor) -> Tensor:
-        n = len(self._encoder)
-        (gate_weight, gate_bias), *hidden, (action_weight, action_bias) = layers[n:]
-        features = encode(layers[:n], observation, self._activation)
+        encoder = tuple(self.convolutions) if self.is_convolutional else (self.observation,)
+        features = encode(tensors(encoder, self._precision), observation, self._activation)
+        (gate_weight, gate_bias), *hidden, (action_weight, action_bias) = tensors(
+            (self.command, *self.layers, self.action), self._precision
+        )
         gate = torch.sigmoid(torch.addmm(gate_bias, command.to(self._precision), gate_weight))
         features = features * gate
         for weight, bias in hidden:
             features = self._activation(torch.addmm(bias, features, weight))
         return torch.addmm(action_bias, features, action_weight).float()
+
+    @property
+    def is_convolutional(self) -> bool:
+        """Whether observations are images."""
+        return len(self.observation_shape) > 1
 
 
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
+from udrl.episode import Observations
 from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes, with_weights
 from udrl.streams import Purpose, Stream, stream_key
 
-Observations = npt.NDArray[np.generic]
 Commands = npt.NDArray[np.float64]
 Logits = npt.NDArray[np.float32]
 
@@ -60,9 +60,13 @@ class ActingFunction:
     def __init__(self, graph: bytes, weights: Weights) -> None:
         self._graph = graph
         self.weights = weights
-        self.model = with_weights(graph, weights)
         self._session = _session(self.model)
         self._calls: dict[int, Call] = {}
+
+    @property
+    def model(self) -> bytes:
+        """The graph with the weights: an ONNX model of its own."""
+        return with_weights(self._graph, self.weights)
 
     def call(self, n: int) -> Call:
         """Return a call of ``n`` rows. It is not for several threads at once."""
@@ -108,9 +112,9 @@ class _OneByOne:
 
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
         self._one = one = _Together(session, 1)
-        self.observation = np.repeat(one.observation, n, axis=0)
-        self.command = np.repeat(one.command, n, axis=0)
-        self.logits = np.repeat(one.logits, n, axis=0)
+        self.observation: Observations = one.observation.repeat(n, axis=0)
+        self.command = one.command.repeat(n, axis=0)
+        self.logits = one.logits.repeat(n, axis=0)
 
     def run(self) -> None:
         one = self._one
@@ -150,14 +154,18 @@ def probe_weights(graph: bytes) -> Weights:
 
 
 def probe_rows(function: ActingFunction, n: int) -> tuple[Observations, Commands]:
-    """Return noise to look at: observations in [-2, 2) or bytes, commands in [-100, 100)."""
+    """Return observations of noise, and commands in [-100, 100)."""
     like = function.call(1).observation
     stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
-    numbers = stream.uniforms(n * like[0].size).reshape(n, *like.shape[1:])
-    is_image = like.dtype == np.uint8
-    seen = (numbers * 256 if is_image else numbers * 4 - 2).astype(like.dtype)
+    seen = noise(stream, (n, *like.shape[1:]), is_image=like.dtype == np.uint8)
     command = stream.uniforms(2 * n).reshape(n, 2) * 200 - 100
     return seen, command
+
+
+def noise(stream: Stream, shape: tuple[int, ...], *, is_image: bool) -> Observations:
+    """Return observations made of the next numbers of a stream: bytes, or float32 in [-2, 2)."""
+    numbers = stream.uniforms(math.prod(shape)).reshape(shape)
+    return (numbers * 256).astype(np.uint8) if is_image else (numbers * 4 - 2).astype(np.float32)
 
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:

@@ -124,9 +124,8 @@ def _learn_value(
 def _label(value: ValueFunction, experience: RankedExperience, config: Config) -> None:
     """Label all steps of the buffer with lambda-returns."""
     with torch.inference_mode():
-        act = value.frozen()
         expected = [
-            act(torch.from_numpy(part).clone().to(config.device))[:, 0].cpu().numpy()
+            value(torch.from_numpy(part).clone().to(config.device))[:, 0].cpu().numpy()
             for part in experience.observations()
         ]
     experience.label(np.concatenate(expected) / config.return_scale, config.return_lambda)

@@ -1,7 +1,5 @@
 """The numerics class of training: machines of one class make the same weights, bit for bit."""
 
-import math
-
 import msgspec
 import numpy as np
 
@@ -9,6 +7,7 @@ from udrl.config import Config
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode, action_dtype
+from udrl.inference import noise
 from udrl.numerics import PROBE_STEPS
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
@@ -25,13 +24,9 @@ def training_class(config: Config, spec: EnvironmentSpec) -> str:
     )
     stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
     length = min(PROBE_STEPS, spec.max_episode_steps)
-    shape = (length, *spec.observation_shape)
-    noise = stream.uniforms(math.prod(shape)).reshape(shape)
     episode = Episode(
         command_id=0,
-        observations=(
-            (noise * 256).astype(np.uint8) if spec.is_image else (noise * 4 - 2).astype(np.float32)
-        ),
+        observations=noise(stream, (length, *spec.observation_shape), is_image=spec.is_image),
         actions=stream.integers(length, 0, spec.n_actions).astype(action_dtype(spec.n_actions)),
         rewards=stream.uniforms(length).astype(np.float32),
         terminated=True,

@@ -12,8 +12,6 @@ returns deviate from it. They serve twice:
   all states. In acting it asks for better or worse than usual, until V(s) is what is desired.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -26,7 +24,7 @@ from udrl.architecture import (
     stacked_shape,
 )
 from udrl.config import Config
-from udrl.encoders import PRECISIONS, Layers, convolutions, encode, fully_connected, tensors
+from udrl.encoders import PRECISIONS, convolutions, encode, fully_connected, tensors
 from udrl.environments.making import EnvironmentSpec
 
 
@@ -57,17 +55,7 @@ class ValueFunction(nn.Module):
         Args:
             observation: s, [batch, *observation_shape]: float32 vectors or uint8 images.
         """
-        return self._expected(self._tensors(), observation)
-
-    def frozen(self) -> Callable[[Tensor], Tensor]:
-        """Return :meth:`forward`, the same bits, without gradients or nn.Module."""
-        layers = [(w.detach(), b.detach()) for w, b in self._tensors()]
-        return lambda observation: self._expected(layers, observation)
-
-    def _tensors(self) -> list[tuple[Tensor, Tensor]]:
-        return tensors((*self.encoder, self.hidden, self.expected), self._precision)
-
-    def _expected(self, layers: Layers, observation: Tensor) -> Tensor:
+        layers = tensors((*self.encoder, self.hidden, self.expected), self._precision)
         *encoder, (weight, bias), (out_weight, out_bias) = layers
         features = encode(encoder, observation, torch.tanh_)
         features = torch.tanh_(torch.addmm(bias, features, weight))

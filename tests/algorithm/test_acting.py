@@ -24,10 +24,10 @@ from udrl.environments import (
     make_environment,
     specify,
 )
-from udrl.episode import Episode, action_dtype
+from udrl.episode import Episode, Observations, action_dtype
 from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
-from udrl.inference import ActingFunction, Call, Observations
+from udrl.inference import ActingFunction, Call
 from udrl.replay import Entry, ReplayBuffer
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import weights_of

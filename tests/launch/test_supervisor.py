@@ -73,7 +73,7 @@ def test_child_that_keeps_dying_is_given_up(supervisor: Supervisor) -> None:
 def test_end_kills_a_child_that_does_not_listen(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "GRACE_S", 0.2)
+    monkeypatch.setattr(module, "END_S", 0.2)
     ready = supervisor._log_dir / "child.log"
     start(
         supervisor,
@@ -99,7 +99,7 @@ def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) 
 def test_who_does_not_end_after_the_first_is_not_waited_for(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "GRACE_S", 0.2)
+    monkeypatch.setattr(module, "END_S", 0.2)
     start(supervisor, "first", "pass")
     start(supervisor, "other", WAIT)
     check_until(supervisor, lambda: supervisor.done)

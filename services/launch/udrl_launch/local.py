@@ -10,7 +10,7 @@ from typing import Protocol
 from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_launch.settings import Settings
-from udrl_launch.supervisor import GRACE_S, Supervisor
+from udrl_launch.supervisor import END_S, Supervisor
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_replay.store import Store
@@ -141,7 +141,7 @@ class Threads:
         """Whether all have ended, or the replay service has and the others had their time."""
         if self._run_ended is None and not self._threads[0].is_alive():
             self._run_ended = time.monotonic()
-        if self._run_ended is not None and time.monotonic() - self._run_ended > GRACE_S:
+        if self._run_ended is not None and time.monotonic() - self._run_ended > END_S:
             return True
         return not any(thread.is_alive() for thread in self._threads)
 

@@ -19,8 +19,8 @@ FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 #: A child that ended so often within ``_PERIOD_S`` seconds is given up.
 _MAX_RESTARTS = 5
 _PERIOD_S = 60.0
-#: Seconds that services have to end when the run has ended, or when they are told to.
-GRACE_S = 4.5
+#: Seconds that services have to end after the run has ended or after SIGTERM.
+END_S = 4.5
 
 
 @dataclass
@@ -120,7 +120,7 @@ class Supervisor:
     @property
     def done(self) -> bool:
         """Whether all children have ended, or the first has and the others had their time."""
-        if self._first_done is not None and time.monotonic() - self._first_done > GRACE_S:
+        if self._first_done is not None and time.monotonic() - self._first_done > END_S:
             return True
         return all(child.done for child in self.children)
 
@@ -130,7 +130,7 @@ class Supervisor:
         for process in processes:
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + GRACE_S
+        deadline = time.monotonic() + END_S
         for process in processes:
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
