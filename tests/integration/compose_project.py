@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import pytest
@@ -53,6 +53,8 @@ def compose_command() -> list[str]:
 class Project:
     """``compose.yaml`` and its overrides, under a name of their own.
 
+    A context: when it is left nothing remains, and a failure tells what the services logged.
+
     Args:
         name: of the project; what an earlier one of that name left is removed.
         files: in the repository's root.
@@ -65,6 +67,15 @@ class Project:
         self._command = [*compose_command(), "--project-name", name]
         for file in files:
             self._command += ["--file", str(ROOT / file)]
+        self.down()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if error is not None:
+            error.add_note(self.compose("ps"))
+            error.add_note(self.compose("logs", "--no-color", "--timestamps", "--tail", "50"))
         self.down()
 
     def give(self, **variables: str) -> None:

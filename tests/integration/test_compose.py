@@ -71,8 +71,7 @@ def test_down_and_up_go_on_and_no_port_is_published(
     cli: Callable[..., Cli], tmp_path: Path
 ) -> None:
     variables = {"ENV": "CartPole-v1", "ARGS": arguments(ENDLESS)}
-    project = Project("udrl-test-plain", ["compose.yaml"], variables)
-    try:
+    with Project("udrl-test-plain", ["compose.yaml"], variables) as project:
         project.compose("up", "--detach")
         wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "some iterations", 120)
         for service in ("replay", "learner", "actor"):
@@ -84,8 +83,6 @@ def test_down_and_up_go_on_and_no_port_is_published(
             assert set(project.exit_codes(service)) <= {0, 143}, service
         project.compose("down")
         ended = finished(project)
-    finally:
-        project.down()
     assert digests(ended) == digests(alone(cli, ended.max_env_steps, tmp_path / "alone"))
 
 
@@ -94,14 +91,14 @@ def test_faults_and_an_actor_from_outside_change_nothing(
 ) -> None:
     port = free_port()
     variables = {"ENV": "CartPole-v1", "ARGS": arguments(ENDLESS), "UDRL_HOST": GATEWAY}
-    project = Project("udrl-test-secure", SECURE, variables | {"UDRL_PORT": str(port)})
+    secure = Project("udrl-test-secure", SECURE, variables | {"UDRL_PORT": str(port)})
 
     def goes_on(what: str, actors: int | None = None) -> None:
         """Wait until two more iterations are done, with so many actors."""
         first: list[int] = []
 
         def further() -> bool:
-            status = project.live(*WITH_KEYS)
+            status = secure.live(*WITH_KEYS)
             if status is None or actors not in (None, len(status.actors)):
                 return False
             first.append(status.iteration)
@@ -109,7 +106,7 @@ def test_faults_and_an_actor_from_outside_change_nothing(
 
         wait_for(further, f"the run to go on {what}", 120)
 
-    try:
+    with secure as project:
         project.compose("up", "--detach")
         goes_on("at the start", 2)
         project.scale(4)
@@ -142,8 +139,6 @@ def test_faults_and_an_actor_from_outside_change_nothing(
             assert run("docker", "wait", stranger, timeout=60).strip() == "0"
         finally:
             run("docker", "rm", "--force", stranger)
-    finally:
-        project.down()
     assert digests(ended) == digests(alone(cli, ended.max_env_steps, tmp_path / "alone"))
 
 
@@ -223,10 +218,8 @@ def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
         "udrl_proto/__init__.py\nUSER udrl\n"
     )
     run("docker", "build", "--tag", tag, str(tmp_path))
-    project = Project(
-        "udrl-test-other", ["compose.yaml"], {"ENV": "CartPole-v1", "ARGS": arguments(ENDLESS)}
-    )
-    try:
+    variables = {"ENV": "CartPole-v1", "ARGS": arguments(ENDLESS)}
+    with Project("udrl-test-other", ["compose.yaml"], variables) as project:
         project.compose("up", "--detach")
         network = ("--network", f"{project.name}_run")
         code, log = told("actor", "--connect", "tcp/replay:7447", options=network, image=tag)
@@ -234,6 +227,4 @@ def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
         assert f"the run speaks protocol {PROTOCOL}, this program speaks 999" in log
         assert "install the same version of udrl on both sides" in log
         wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "the run to go on", 120)
-    finally:
-        project.down()
-        run("docker", "image", "rm", tag)
+    run("docker", "image", "rm", tag)
