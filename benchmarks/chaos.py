@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from faults import FAULTS, Fault
 from severed_link import SeveredLink
 from udrl.commands import CommandSampler
 from udrl.config import Config
+from udrl.environments.making import make_environment, specify
 from udrl.errors import RunFailed
 from udrl.replay import Entry, ReplayBuffer
 from udrl_launch.settings import Settings, gather
@@ -205,7 +207,8 @@ def _curse(config: Config, chance: random.Random) -> int:
     """Return the environment seed of an exploratory command, early in a run."""
     any_buffer = ReplayBuffer(config)  # the seeds do not depend on what is in it
     any_buffer.admit([Entry(0.0, 0, 1)])
-    sampler = CommandSampler(config, config.max_episode_steps or 1)
+    with closing(make_environment(config)) as env:
+        sampler = CommandSampler(config, specify(env, config))
     commands = sampler.explore(chance.randint(3, 10), any_buffer)
     return chance.choice(commands).environment_seed
 

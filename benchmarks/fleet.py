@@ -221,8 +221,8 @@ def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
     rng = np.random.default_rng(seed)
     episode = Episode(
         command_id=0,
-        observations=rng.normal(size=(steps, *spec.observation_shape)).astype(np.float32),
-        actions=rng.integers(0, spec.n_actions, steps).astype(np.uint8),
+        observations=rng.normal(size=(steps, *spec.observation_space.shape)).astype(np.float32),
+        actions=rng.integers(0, spec.action_space.n, steps).astype(spec.action_space.dtype),
         rewards=rng.normal(size=steps).astype(np.float32),
         terminated=True,
         truncated=False,

@@ -27,11 +27,13 @@ import msgspec
 import numpy as np
 
 from fleet import RUN, Load, Measured
+from udrl.actions import Categorical
 from udrl.checkpoint import encode_optimizer
 from udrl.config import Budget, Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import Interrupted
 from udrl.graph import acting_graph
+from udrl.spaces import Vector
 from udrl.training import untrained, use_one_thread
 from udrl.weights import encode_weights
 from udrl_launch.training import free_port
@@ -60,7 +62,9 @@ def spec_of(kilobytes: int) -> EnvironmentSpec:
     """Return an environment whose longest episode has so many kilobytes."""
     size = 8 if kilobytes < 100 else 256
     return EnvironmentSpec(
-        observation_shape=(size,), n_actions=4, max_episode_steps=kilobytes * 1000 // (4 * size + 5)
+        observation_space=Vector(size=size),
+        action_space=Categorical(n=4),
+        max_episode_steps=kilobytes * 1000 // (4 * size + 5),
     )
 
 

@@ -41,6 +41,7 @@ from udrl.episode import Episode
 from udrl.errors import UdrlError
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
+from udrl.memory import FrameStack
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained, use_one_thread
@@ -278,9 +279,10 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
 def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
     """Return the seconds of forward, backward and step on tensors that are in memory already."""
     state, n = untrained(config, spec), config.batch_size
-    shape = state.behavior.observation_shape
-    observation = (torch.rand(n, *shape) * 255).to(getattr(torch, spec.observation_dtype))
-    command, action = torch.rand(n, 2), torch.randint(spec.n_actions, (n,))
+    seen = spec.observation_space
+    shape = FrameStack(seen, config).shape
+    observation = (torch.rand(n, *shape) * 255).to(getattr(torch, seen.dtype.name))
+    command, action = torch.rand(n, 2), torch.randint(spec.action_space.n, (n,))
 
     def update() -> None:
         loss = functional.cross_entropy(state.behavior(observation, command), action)

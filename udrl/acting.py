@@ -11,11 +11,9 @@
 
 The behavior function is evaluated for all environments in one call. Which rows stand beside it does
 not change a row's result (:class:`udrl.inference.ActingFunction`), so an episode depends on its
-command alone. With a ``frame_stack`` of more than 1 it sees the episode's most recent observations
-(:func:`udrl.episode.recent`).
+command alone.
 """
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
@@ -23,51 +21,23 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from udrl.architecture import stacked_shape
+from udrl.actions import Actions
 from udrl.commands import Command
 from udrl.config import Config
-from udrl.environments.making import (
-    Environment,
-    EnvironmentSpec,
-    limit_steps,
-    make_environment,
-    specify,
-)
-from udrl.episode import Episode, action_dtype, recent
+from udrl.environments.making import Environment, make_environment
+from udrl.episode import Episode, fault
 from udrl.errors import EnvironmentFault
 from udrl.inference import Acting, Call
-from udrl.streams import Stream
+from udrl.memory import FrameStack
+from udrl.recording import Recording
+from udrl.rows import Rows
+from udrl.targets import ReturnInTime
 
 #: Failures under the same command after which it is hopeless.
 MAX_FAILURES = 3
 
-_FIRST_CAPACITY = 1024
-_FIRST_BYTES = 64 << 20
 #: A round that does not come.
 _NEVER = np.iinfo(np.int64).max
-
-_Rows = npt.NDArray[np.int64]
-
-
-def sample(
-    logits: npt.NDArray[np.float64],
-    temperature: npt.NDArray[np.float64],
-    uniforms: npt.NDArray[np.float64],
-) -> npt.NDArray[np.int64]:
-    """Return one action for each row, by inverse CDF.
-
-    Args:
-        logits: of P(a | s, c), float64 [n, n_actions].
-        temperature: logits are divided by it, float64 [n, 1], more than 0.
-        uniforms: float64 [n] in [0, 1).
-    """
-    below = logits - np.maximum.reduce(logits, axis=1, keepdims=True)
-    weights = np.exp(below / temperature)
-    cumulative = np.add.accumulate(weights, axis=1)
-    threshold = uniforms * cumulative[:, -1]
-    actions: npt.NDArray[np.int64] = np.add.reduce(cumulative <= threshold[:, None], axis=1)
-    np.minimum(actions, logits.shape[1] - 1, out=actions)
-    return actions
 
 
 class Failure(NamedTuple):
@@ -85,6 +55,9 @@ class EpisodeGenerator:
         n_environments: episodes that can run at the same time.
         make: makes one environment.
 
+    Attributes:
+        spec: of the environments.
+
     Raises:
         UnsupportedEnvironment: the environment cannot be made or is not supported.
     """
@@ -95,44 +68,30 @@ class EpisodeGenerator:
         n_environments: int,
         make: Callable[[Config], Environment] = make_environment,
     ) -> None:
-        self._config = config
-        self._frame_stack = config.frame_stack
-        self._make = make
-        self._envs = [make(config) for _ in range(n_environments)]
-        self.spec: EnvironmentSpec = specify(self._envs[0], config)
-        self._stacked_shape = stacked_shape(self.spec, config)
-        self._limits = [self.spec.max_episode_steps] * n_environments
+        self._rows = Rows(config, n_environments, make)
+        self.spec = self._rows.spec
+        self._memory = FrameStack(self.spec.observation_space, config)
+        self._target = ReturnInTime(config)
+        self._recording = Recording(self.spec, n_environments)
         self._commands: list[Command | None] = [None] * n_environments
         self._behaviors: list[Acting | None] = [None] * n_environments
-        self._calls: list[tuple[Call, _Rows]] | None = None
+        # Rows that are acting, those that take the mode, and the calls that answer for all:
+        # planned anew when an episode begins or ends.
+        self._active: list[int] = []
         self._greedy: list[int] = []
-        # The rounds from and before which a row's action is held, and how many rows have such.
-        self._hold_from = np.full(n_environments, _NEVER)
-        self._hold_until = np.full(n_environments, _NEVER)
-        self._n_holding = 0
+        self._calls: list[tuple[Call, npt.NDArray[np.int64]]] = []
+        self._planned = True
 
-        # s_t, c_t = (dr_t, dh_t), r_t, and the logits of P(a | s_t, c_t).
-        dtype = np.dtype(self.spec.observation_dtype)
-        self._observation = np.zeros((n_environments, *self.spec.observation_shape), dtype)
-        self._desired = np.zeros((n_environments, 2))
-        self._reward = np.zeros(n_environments, np.float32)
-        self._logits = np.zeros((n_environments, self.spec.n_actions))
-        self._temperature = np.ones((n_environments, 1))
+        # Of each row: c_t = (dr_t, dh_t), the parameters of P(a | s_t, c_t), and what the command
+        # says of choosing.
+        self._desired = np.zeros((n_environments, self._target.size))
         self._cap = np.full(n_environments, np.inf)
-
-        # A ring of rounds: round k of all environments is kept at k % capacity, until the longest
-        # running episode needs more.
-        self._round = 0
-        self._began = np.zeros(n_environments, np.int64)
-        round_bytes = n_environments * self.spec.step_bytes
-        self._capacity = min(
-            self.spec.max_episode_steps, _FIRST_CAPACITY, max(64, _FIRST_BYTES // round_bytes)
-        )
-        shape = (self._capacity, n_environments)
-        self._observations = np.zeros((*shape, *self.spec.observation_shape), dtype)
-        self._actions = np.zeros(shape, action_dtype(self.spec.n_actions))
-        self._rewards = np.zeros(shape, np.float32)
-        self._uniforms = np.zeros(shape)
+        self._parameters = np.zeros((n_environments, self.spec.action_space.n_parameters))
+        self._temperature = np.ones((n_environments, 1))
+        # The rounds from and before which its actions are random, and how many rows have such.
+        self._random_from = np.full(n_environments, _NEVER)
+        self._random_until = np.full(n_environments, _NEVER)
+        self._n_random = 0
 
     @property
     def free(self) -> int:
@@ -149,190 +108,111 @@ class EpisodeGenerator:
 
         Args:
             command: c_0, and all else that the episode depends on.
-            behavior: the version that the command names; None in the warm-up: act at random.
+            behavior: the version that the command names; None in the warm-up, which needs none.
 
         Returns:
             A failure when the environment could not be reset, else None.
         """
         row = self._commands.index(None)
-        try:
-            if self._limits[row] != command.max_steps:
-                limit_steps(self._envs[row], command.max_steps)
-                self._limits[row] = command.max_steps
-            observation, _ = self._envs[row].reset(seed=command.environment_seed)
-            self._observation[row] = observation
-        except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
-            self._rebuild(row)
-            return Failure(command, _fault("reset", command, error))
+        error = self._rows.reset(row, command.environment_seed, command.max_steps)
+        if error is not None:
+            self._rows.replace(row)
+            return _failure("reset", command, error)
         self._commands[row] = command
         self._behaviors[row] = behavior
-        self._calls = None
-        if command.temperature == 0:
-            self._greedy.append(row)
-        self._temperature[row] = command.temperature or 1.0
+        self._planned = False
+        self._recording.begin(row, command)
         self._desired[row] = command.desired_return, command.desired_horizon
-        self._cap[row] = np.inf
-        if command.kind == "evaluate" and self.spec.max_return is not None:
-            self._cap[row] = self.spec.max_return
-        self._logits[row] = 0.0
-        self._began[row] = self._round
-        if command.hold_steps:
-            self._hold_from[row] = self._round + command.hold_from
-            self._hold_until[row] = self._hold_from[row] + command.hold_steps
-            self._n_holding += 1
-        self._lay_out_uniforms(row, command)
+        self._cap[row] = np.inf if command.cap is None else command.cap
+        self._target.bound(self._desired, self._cap)
+        self._parameters[row] = 0.0
+        self._temperature[row] = command.temperature or 1.0
+        if command.random_steps:
+            self._random_from[row] = self._recording.round + command.random_from
+            self._random_until[row] = self._random_from[row] + command.random_steps
+            self._n_random += 1
         return None
 
     def step(self) -> list[Episode | Failure]:
         """Advance every running episode by one step and return those that ended, in any order."""
-        self._make_room()
-        over: list[tuple[int, bool, bool]] = []
-        failed: list[tuple[int, EnvironmentFault]] = []
-        observation, reward, envs = self._observation, self._reward, self._envs
-        at = self._round % self._capacity
-        self._observations[at] = observation
-        self._actions[at] = actions = self._choose_actions(self._uniforms[at])
-        chosen = actions.tolist()
-        for row, command in enumerate(self._commands):
-            if command is None:
-                continue
-            try:
-                observation[row], reward[row], terminated, truncated, _ = envs[row].step(
-                    chosen[row]
-                )
-            except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
-                failed.append((row, _fault("step", command, error)))
-                continue
-            if terminated or truncated:
-                over.append((row, bool(terminated), bool(truncated)))
-        self._rewards[at] = reward
+        rows, recording = self._rows, self._recording
+        if not self._planned:
+            self._plan()
+        uniforms = recording.begin_round(rows.observation)
+        self._evaluate()
+        actions = self._choose(uniforms)
+        over, broken = rows.step(self._active, actions)
+        recording.end_round(actions, rows.reward)
         # Lines 8, 9 and 11 of Algorithm 2; nobody reads the rows of idle environments.
-        self._desired[:, 0] -= reward
-        self._desired[:, 1] -= 1.0
-        self._round += 1
-
+        self._target.advance(self._desired, rows.reward, self._cap)
         outcomes: list[Episode | Failure] = [self._finish(*ended) for ended in over]
-        for row, fault in failed:
-            outcomes.append(Failure(self._command_of(row), fault))
-            self._release(row)
-            self._rebuild(row)
-        return outcomes
+        return outcomes + [self._give_up(row, "step", error) for row, error in broken]
 
     def close(self) -> None:
         """Close all environments."""
-        for env in self._envs:
-            env.close()
+        self._rows.close()
 
-    def _choose_actions(self, uniforms: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Sample a_t ~ P(a | s_t, c_t) for every row, by inverse CDF in float64."""
-        desired, logits = self._desired, self._logits
-        if self.spec.max_return is not None:
-            np.minimum(desired[:, 0], self._cap, out=desired[:, 0])
-        if self._calls is None:
-            self._calls = self._plan_calls()
-        observation = self._observation if self._frame_stack == 1 else self._stacks()
-        for call, rows in self._calls:
-            observation.take(rows, axis=0, out=call.observation, mode="clip")
-            desired.take(rows, axis=0, out=call.command, mode="clip")
-            call.run()
-            logits[rows] = call.logits
-        actions = sample(logits, self._temperature, uniforms)
-        if self._greedy:
-            actions[self._greedy] = logits[self._greedy].argmax(axis=1)
-        if self._n_holding:
-            held = (self._hold_from <= self._round) & (self._round < self._hold_until)
-            actions[held] = (uniforms[held] * logits.shape[1]).astype(np.int64)
-        return actions
-
-    def _stacks(self) -> npt.NDArray[np.generic]:
-        """Return what the network sees now in every environment."""
-        t = recent(self._round - self._began, self._frame_stack)
-        rounds = (self._began[:, None] + t) % self._capacity
-        frames = self._observations[rounds, np.arange(len(rounds))[:, None]]
-        stacks: npt.NDArray[np.generic] = frames.reshape(len(frames), *self._stacked_shape)
-        return stacks
-
-    def _plan_calls(self) -> list[tuple[Call, _Rows]]:
+    def _plan(self) -> None:
         """Gather the rows of each weights version into a call."""
+        self._active = [row for row, c in enumerate(self._commands) if c is not None]
+        self._greedy = [row for row in self._active if self._command_of(row).temperature == 0]
         rows_of: dict[Acting, list[int]] = {}
-        for row, behavior in enumerate(self._behaviors):
+        for row in self._active:
+            behavior = self._behaviors[row]
             if behavior is not None:
                 rows_of.setdefault(behavior, []).append(row)
-        return [(b.call(len(rows)), np.array(rows)) for b, rows in rows_of.items()]
+        self._calls = [(b.call(len(rows)), np.array(rows)) for b, rows in rows_of.items()]
+        self._planned = True
+
+    def _evaluate(self) -> None:
+        """Compute the parameters of P(a | s_t, c_t) in every row."""
+        if not self._calls:
+            return
+        memory = self._memory
+        if memory.length == 1:
+            seen = memory.join(self._rows.observation)
+        else:
+            seen = self._recording.stacks(memory)
+        for call, rows in self._calls:
+            seen.take(rows, axis=0, out=call.observation, mode="clip")
+            self._desired.take(rows, axis=0, out=call.command, mode="clip")
+            call.run()
+            self._parameters[rows] = call.logits
+
+    def _choose(self, uniforms: npt.NDArray[np.float64]) -> Actions:
+        """Choose a_t in every row: sampled, the mode, or random, as its command says."""
+        space = self.spec.action_space
+        actions = space.sample(self._parameters, self._temperature, uniforms)
+        if self._greedy:
+            actions[self._greedy] = space.mode(self._parameters[self._greedy])
+        if self._n_random:
+            now = self._recording.round
+            random = (self._random_from <= now) & (now < self._random_until)
+            actions[random] = space.uniform(uniforms[random])
+        return actions
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
-        command = self._command_of(row)
-        began = int(self._began[row])
-        places = self._places(began, self._round - began)
-        episode = Episode(
-            command_id=command.id,
-            observations=self._observations[places, row],
-            actions=self._actions[places, row],
-            rewards=self._rewards[places, row],
-            terminated=terminated,
-            truncated=truncated,
-        )
-        self._release(row)
-        if not (np.isfinite(episode.observations).all() and np.isfinite(episode.rewards).all()):
-            self._rebuild(row)
-            fault = ValueError("an observation or reward is NaN, infinite, or beyond float32")
-            return Failure(command, _fault("step", command, fault))
+        episode = self._recording.end(row, terminated=terminated, truncated=truncated)
+        command = self._release(row)
+        if found := fault(episode, self.spec):
+            self._rows.replace(row)
+            return _failure("step", command, ValueError(found))
         return episode
 
-    def _release(self, row: int) -> None:
-        self._commands[row] = self._behaviors[row] = self._calls = None
-        if row in self._greedy:
-            self._greedy.remove(row)
-        if self._hold_from[row] != _NEVER:
-            self._hold_from[row] = _NEVER
-            self._n_holding -= 1
-        self._reward[row] = self._desired[row] = 0.0
+    def _give_up(self, row: int, where: str, error: Exception) -> Failure:
+        self._recording.drop(row)
+        command = self._release(row)
+        self._rows.replace(row)
+        return _failure(where, command, error)
 
-    def _rebuild(self, row: int) -> None:
-        """Replace an environment that can no longer be trusted."""
-        with contextlib.suppress(Exception):  # it is broken already, and goes
-            self._envs[row].close()
-        self._envs[row] = self._make(self._config)
-        self._limits[row] = self.spec.max_episode_steps
-
-    def _places(self, first: int, count: int) -> _Rows:
-        """Return where ``count`` rounds from ``first`` on lie in the ring."""
-        return np.arange(first, first + count) % self._capacity
-
-    def _lay_out_uniforms(self, row: int, command: Command) -> None:
-        """Put number t of the command's stream where step t of its episode will look.
-
-        Numbers of the warm-up are used ``warm_up_hold`` times, and so are the actions they choose;
-        number ``hold_from`` of a command is used for ``hold_steps`` steps.
-        """
-        numbers = Stream(command.stream_key).uniforms(self._capacity)
-        if command.kind == "warm_up":
-            hold = self._config.warm_up_hold
-            numbers = numbers[np.arange(self._capacity) // hold * hold]
-        if command.hold_steps:
-            first, last = command.hold_from, command.hold_from + command.hold_steps
-            numbers[first:last] = Stream(command.stream_key).number(first)
-        self._uniforms[self._places(int(self._began[row]), self._capacity), row] = numbers
-
-    def _make_room(self) -> None:
-        """Make the ring twice as long if an episode would overwrite its own beginning."""
-        if self._capacity >= self.spec.max_episode_steps:
-            return
-        running = [(row, c) for row, c in enumerate(self._commands) if c is not None]
-        first = self._round - self._capacity
-        if not any(self._began[row] == first for row, _ in running):
-            return
-        count = self._capacity
-        old = self._places(first, count)
-        self._capacity *= 2
-        new = self._places(first, count)
-        for name in ("_observations", "_actions", "_rewards", "_uniforms"):
-            ring = getattr(self, name)
-            longer = np.zeros((self._capacity, *ring.shape[1:]), ring.dtype)
-            longer[new] = ring[old]
-            setattr(self, name, longer)
-        for row, command in running:
-            self._lay_out_uniforms(row, command)
+    def _release(self, row: int) -> Command:
+        command = self._command_of(row)
+        self._commands[row] = self._behaviors[row] = None
+        self._planned = False
+        if command.random_steps:
+            self._random_from[row] = _NEVER
+            self._n_random -= 1
+        return command
 
     def _command_of(self, row: int) -> Command:
         command = self._commands[row]
@@ -340,13 +220,13 @@ class EpisodeGenerator:
         return command
 
 
-def _fault(where: str, command: Command, error: Exception) -> EnvironmentFault:
+def _failure(where: str, command: Command, error: Exception) -> Failure:
     fault = EnvironmentFault(
         f"the environment failed in {where}() under command {command.id} "
         f"(seed {command.environment_seed}): {type(error).__name__}: {error}"
     )
     fault.__cause__ = error
-    return fault
+    return Failure(command, fault)
 
 
 def generate_episodes(

@@ -87,7 +87,7 @@ def algorithm1(
     config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
-    sample = CommandSampler(config, generator.spec.max_episode_steps)
+    sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config, generator.spec)
 
     # 1: initialise replay buffer with warm-up episodes using random actions (or others')

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 
 from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.spaces import Image, ObservationSpace
 
 # Appendix B.2.
 FILTER, STRIDE, PADDING = 3, 2, 1
@@ -27,15 +27,21 @@ SQUAREPLUS = 2.0
 DEVIATIONS = 2.0
 
 
-def stacked_shape(spec: EnvironmentSpec, config: Config) -> tuple[int, ...]:
-    """Return the shape of what the network observes: the most recent frames, one after another."""
-    first, *rest = spec.observation_shape
-    return (config.frame_stack * first, *rest)
+def layer_widths(space: ObservationSpace, config: Config) -> tuple[int, ...]:
+    """Return the widths of the behavior function: of its encoder, and of the layers that follow.
+
+    An image's convolutions stand before all layers of ``hidden``, any other encoder is the first.
+    """
+    if isinstance(space, Image):
+        return (n_features(space, config.convolutions, 0), *config.hidden)
+    return config.hidden
 
 
-def image_features(shape: tuple[int, ...], channels: Sequence[int]) -> int:
-    """Return how many features the convolutions make of an image of shape [channels, h, w]."""
-    _, *size = shape
+def n_features(space: ObservationSpace, channels: Sequence[int], width: int) -> int:
+    """Return how many features an encoder makes: of an image what its convolutions leave."""
+    if not isinstance(space, Image):
+        return width
+    size = [space.height, space.width]
     for _ in channels:
         size = [(n + 2 * PADDING - FILTER) // STRIDE + 1 for n in size]
     return channels[-1] * math.prod(size)

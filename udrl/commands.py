@@ -9,13 +9,17 @@ from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 from msgspec import Meta
 
 from udrl.config import COMMANDS_PER_ITERATION, Config, Temperature
+from udrl.environments.making import EnvironmentSpec
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
 from udrl.strategies import Best, CommandStrategy, ask, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
+from udrl.targets import ReturnInTime
 
 Kind = Literal["warm_up", "explore", "evaluate"]
 
@@ -36,26 +40,31 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         kind: what the episode is for.
         desired_return: initial desired return; 0 in the warm-up, where nothing reads it.
         desired_horizon: initial desired horizon in steps; likewise.
+        cap: the greatest desired return at any step; None: there is none.
         environment_seed: what the environment is reset with.
         stream_key: 16 bytes, the key of the stream whose number t decides action t.
         weights_version: the behavior function to act with; 0 in the warm-up: act at random.
         max_steps: the episode is truncated after so many steps.
         temperature: logits are divided by it before an action is sampled; 0: take the mode.
-        hold_from: the step whose action is drawn uniformly at random and then held.
-        hold_steps: for how many steps, that one included; 0: no action is held.
+        random_from: the first of the steps whose actions are uniformly random, whatever the
+            behavior function says.
+        random_steps: how many there are of them, one after another.
+        random_hold: for how many of them each of their actions is held.
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
     kind: Kind
     desired_return: float
     desired_horizon: Annotated[int, Meta(ge=0, le=2**31)]
+    cap: float | None = None
     environment_seed: Annotated[int, Meta(ge=0, le=2**31)]
     stream_key: Annotated[bytes, Meta(min_length=16, max_length=16)]
     weights_version: Annotated[int, Meta(ge=0, le=2**62)]
     max_steps: Annotated[int, Meta(ge=1, le=2**31)]
     temperature: Temperature = 1.0
-    hold_from: Annotated[int, Meta(ge=0, le=2**31)] = 0
-    hold_steps: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    random_from: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    random_steps: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    random_hold: Annotated[int, Meta(ge=1, le=2**31)] = 1
 
     @property
     def iteration(self) -> int:
@@ -67,19 +76,35 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """The command's number within its iteration."""
         return self.id % COMMANDS_PER_ITERATION
 
+    def is_random(self, t: int) -> bool:
+        """Whether the action at step ``t`` is uniformly random."""
+        return 0 <= t - self.random_from < self.random_steps
+
+    def decisive(self, t: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return which number of the command's stream decides each step's action, int64 [n].
+
+        It is number ``t``; where an action is held, the one that it was chosen by.
+        """
+        since = t - self.random_from
+        held = (since >= 0) & (since < self.random_steps)
+        numbers: npt.NDArray[np.int64] = np.where(held, t - since % self.random_hold, t)
+        return numbers
+
 
 class CommandSampler:
     """Draws the commands of a run, iteration by iteration.
 
     Args:
         config: the run's settings.
-        max_episode_steps: the environment's time limit.
+        spec: of the environment: its time limit and greatest return.
     """
 
-    def __init__(self, config: Config, max_episode_steps: int) -> None:
+    def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         self._config = config
-        self._max_episode_steps = max_episode_steps
-        self._max_train_steps = min(max_episode_steps, config.max_train_steps or max_episode_steps)
+        self._spec = spec
+        self._target = ReturnInTime(config)
+        longest = spec.max_episode_steps
+        self._max_train_steps = min(longest, config.max_train_steps or longest)
 
     @cached_property
     def _strategy(self) -> CommandStrategy:
@@ -88,7 +113,11 @@ class CommandSampler:
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
         n = self._config.n_warm_up_episodes
-        return self._commands("warm_up", 0, 0, [(0.0, 0)] * n, TRAINING_SEEDS)
+        commands = self._commands("warm_up", 0, 0, [(0.0, 0)] * n, TRAINING_SEEDS)
+        hold = self._config.warm_up_hold
+        return [
+            msgspec.structs.replace(c, random_steps=c.max_steps, random_hold=hold) for c in commands
+        ]
 
     def explore(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's exploratory commands (section 2.3.4).
@@ -104,13 +133,14 @@ class CommandSampler:
         best = buffer.best(self._config.last_few)
         n = self._config.n_episodes_per_iter
         u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
-        desired = [self.desired(*ask(self._strategy, best, number)) for number in u]
+        desired = [self._target.settle(*ask(self._strategy, best, number)) for number in u]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
             msgspec.structs.replace(
                 c,
-                hold_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon)),
-                hold_steps=self._config.hold_steps,
+                random_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon)),
+                random_steps=self._config.hold_steps,
+                random_hold=self._config.hold_steps,
             )
             if w[k] < self._config.held_actions
             else c
@@ -129,16 +159,20 @@ class CommandSampler:
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
         best = Best.of(buffer.best(self._config.last_few))
-        desired = [self.desired(best.mean, best.horizon)] * self._config.eval_episodes
+        c0 = self._target.settle(best.mean, best.horizon)
         seeds = EVALUATION_SEEDS if self._config.eval_seeds == "final" else SEARCH_SEEDS
-        return self._commands("evaluate", iteration, first, desired, seeds)
-
-    def desired(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
-        """Return c_0 as it is said; section 3.1: in TakeCover both are the same integer."""
-        if self._config.desired_horizon == "return":
-            desired_horizon = max(1, min(math.floor(desired_return), 2**31))
-            desired_return = float(desired_horizon)
-        return desired_return, max(1, desired_horizon)
+        commands = self._commands(
+            "evaluate", iteration, first, [c0] * self._config.eval_episodes, seeds
+        )
+        return [
+            msgspec.structs.replace(
+                c,
+                cap=self._spec.max_return,
+                max_steps=self._spec.max_episode_steps,
+                temperature=self._config.eval_temperature,
+            )
+            for c in commands
+        ]
 
     def _stream(self, iteration: int, index: int = -1) -> Stream:
         return Stream(stream_key(self._config.seed, Purpose.COMMANDS, iteration, index))
@@ -152,8 +186,6 @@ class CommandSampler:
         seeds: tuple[int, int],
     ) -> list[Command]:
         environment_seeds = self._stream(iteration, first).integers(len(desired), *seeds)
-        evaluation = kind == "evaluate"
-
         return [
             Command(
                 id=iteration * COMMANDS_PER_ITERATION + index,
@@ -163,8 +195,7 @@ class CommandSampler:
                 environment_seed=seed,
                 stream_key=stream_key(self._config.seed, Purpose.EPISODE, iteration, index),
                 weights_version=weights_version(iteration, self._config.lead),
-                max_steps=self._max_episode_steps if evaluation else self._max_train_steps,
-                temperature=self._config.eval_temperature if evaluation else 1.0,
+                max_steps=self._max_train_steps,
             )
             for index, ((desired_return, desired_horizon), seed) in enumerate(
                 zip(desired, environment_seeds.tolist(), strict=True), start=first

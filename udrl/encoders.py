@@ -1,11 +1,11 @@
-"""From an observation to a vector of features (section 3.2, Appendix B.2).
+"""From what is observed to a vector of features (section 3.2, Appendix B.2).
 
-A vector passes one fully connected layer; an image passes convolutions, each with a 3x3 filter and
-a stride of 2. The behavior function and the value function (:mod:`udrl.value`) each have an
-encoder of their own.
+A vector passes one fully connected layer, a category has an embedding, an image passes
+convolutions, each with a 3x3 filter and a stride of 2. The behavior function and the value function
+(:mod:`udrl.value`) each have an encoder of their own. :mod:`udrl.graph` has the same for acting.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from udrl.architecture import FILTER, PADDING, STRIDE
-
-#: Weight and bias of each layer, those of fully connected layers transposed.
-Layers = Sequence[tuple[Tensor, Tensor]]
+from udrl.config import Config
+from udrl.memory import FrameStack
+from udrl.spaces import Category, Image, ObservationSpace
 
 Activation = Callable[[Tensor], Tensor]
 
@@ -31,45 +31,108 @@ def fully_connected(n_in: int, n_out: int) -> nn.Linear:
     return layer
 
 
-def convolutions(shape: tuple[int, ...], channels: Sequence[int]) -> nn.ModuleList:
-    """Return an image encoder's layers, for images of ``shape`` (channels, height, width)."""
-    return nn.ModuleList(
-        nn.utils.skip_init(nn.Conv2d, i, o, FILTER, STRIDE, PADDING)
-        for i, o in pairwise((shape[0], *channels))
-    )
+def apply(layer: nn.Linear, features: Tensor) -> Tensor:
+    """Return a layer's output, [batch, n_out], computed in the precision of the features."""
+    dtype = features.dtype
+    return torch.addmm(layer.bias.to(dtype), features, layer.weight.to(dtype).t())
 
 
-def tensors(layers: Sequence[nn.Module], precision: torch.dtype) -> list[tuple[Tensor, Tensor]]:
-    """Return weights and biases as the functions below use them."""
-    pairs = []
-    for layer in layers:
-        assert isinstance(layer, nn.Conv2d | nn.Linear)
-        assert layer.bias is not None
-        weight, bias = layer.weight.to(precision), layer.bias.to(precision)
-        if isinstance(layer, nn.Conv2d):
-            weight = weight.contiguous(memory_format=torch.channels_last)
-        else:
-            weight = weight.t()
-        pairs.append((weight, bias))
-    return pairs
-
-
-def encode(layers: Layers, observation: Tensor, activation: Activation) -> Tensor:
-    """Return the features of observations.
+class Encoder(nn.Module):
+    """Features of observations of one kind.
 
     Args:
-        layers: of the encoder.
-        observation: [batch, *shape]: float32 vectors or uint8 images.
         activation: after each layer.
-
-    Returns:
-        [batch, n_features], in the layers' dtype.
+        precision: that it computes in.
     """
-    features = observation.to(layers[0][0].dtype)
-    if observation.dim() == 2:
-        ((weight, bias),) = layers
-        return activation(torch.addmm(bias, features, weight))
-    features = (features * (1 / 255)).contiguous(memory_format=torch.channels_last)
-    for weight, bias in layers:
-        features = activation(functional.conv2d(features, weight, bias, STRIDE, PADDING))
-    return features.flatten(1)
+
+    def __init__(self, activation: Activation, precision: torch.dtype) -> None:
+        super().__init__()
+        self._activation = activation
+        self._precision = precision
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return features, [batch, n_features], of observations as the networks see them."""
+        raise NotImplementedError
+
+
+class VectorEncoder(Encoder):
+    """One fully connected layer."""
+
+    def __init__(
+        self, size: int, width: int, activation: Activation, precision: torch.dtype
+    ) -> None:
+        super().__init__(activation, precision)
+        self.layer = fully_connected(size, width)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return features, [batch, width], of float32 [batch, size]."""
+        return self._activation(apply(self.layer, observation.to(self._precision)))
+
+
+class CategoryEncoder(Encoder):
+    """A learned vector for each category, at each place of the stack; their sum."""
+
+    def __init__(
+        self, n: int, length: int, width: int, activation: Activation, precision: torch.dtype
+    ) -> None:
+        super().__init__(activation, precision)
+        self.embedding = nn.utils.skip_init(nn.Embedding, length * n, width)
+        self.bias = nn.Parameter(torch.zeros(width))
+        self.register_buffer("first", torch.arange(length) * n, persistent=False)
+        self.first: Tensor
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return features, [batch, width], of int32 [batch, length]."""
+        vectors: Tensor = self.embedding(observation + self.first)
+        return self._activation((vectors.sum(1) + self.bias).to(self._precision))
+
+
+class ImageEncoder(Encoder):
+    """Convolutions."""
+
+    def __init__(
+        self,
+        n_channels: int,
+        channels: tuple[int, ...],
+        activation: Activation,
+        precision: torch.dtype,
+    ) -> None:
+        super().__init__(activation, precision)
+        self.layers = nn.ModuleList(
+            nn.utils.skip_init(nn.Conv2d, i, o, FILTER, STRIDE, PADDING)
+            for i, o in pairwise((n_channels, *channels))
+        )
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return features, [batch, n_features], of uint8 [batch, channels, height, width]."""
+        features = observation.to(self._precision) * (1 / 255)
+        features = features.contiguous(memory_format=torch.channels_last)
+        for layer in self.layers:
+            assert isinstance(layer, nn.Conv2d)
+            assert layer.bias is not None
+            weight, bias = layer.weight.to(self._precision), layer.bias.to(self._precision)
+            weight = weight.contiguous(memory_format=torch.channels_last)
+            convolved = functional.conv2d(features, weight, bias, STRIDE, PADDING)
+            features = self._activation(convolved)
+        return features.flatten(1)
+
+
+def make_encoder(
+    space: ObservationSpace, config: Config, width: int, activation: Activation
+) -> Encoder:
+    """Return an encoder of a kind of observations.
+
+    Args:
+        space: of single observations.
+        config: ``frame_stack``, ``convolutions``, ``precision``.
+        width: of the features; what an image's convolutions leave is as wide as it is.
+        activation: after each layer.
+    """
+    precision = PRECISIONS[config.precision]
+    shape = FrameStack(space, config).shape
+    match space:
+        case Image():
+            return ImageEncoder(shape[0], config.convolutions, activation, precision)
+        case Category(n=n):
+            return CategoryEncoder(n, shape[0], width, activation, precision)
+    return VectorEncoder(shape[0], width, activation, precision)

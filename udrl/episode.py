@@ -2,34 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-Observations = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
-Actions = npt.NDArray[np.integer[Any]]
+from udrl.actions import Actions
+from udrl.environments.making import EnvironmentSpec
+from udrl.spaces import Observations
+
 Rewards = npt.NDArray[np.float32]
-
-
-def action_dtype(n_actions: int) -> type[np.uint8] | type[np.int32]:
-    """Return the dtype that actions are kept in: the smaller of the two that holds them."""
-    return np.uint8 if n_actions <= 256 else np.int32
-
-
-def recent(t: npt.NDArray[np.int64], frame_stack: int) -> npt.NDArray[np.int64]:
-    """Return the times of the observations that the network sees at times ``t``.
-
-    Args:
-        t: int64 [n].
-        frame_stack: how many.
-
-    Returns:
-        int64 [n, frame_stack]: t - frame_stack + 1 to t; 0 for those before the episode, so that
-        its first observation stands in for what was not observed.
-    """
-    times: npt.NDArray[np.int64] = np.maximum(t[:, None] - np.arange(frame_stack)[::-1], 0)
-    return times
 
 
 def cumulative(rewards: Rewards) -> npt.NDArray[np.float64]:
@@ -46,10 +27,9 @@ class Episode:
 
     Attributes:
         command_id: the id of the command that it answers, and its own.
-        observations: what the environment showed at each step, [T, *observation_shape]: float32
-            vectors or uint8 images. With ``frame_stack`` 1 they are the s_t; else s_t is built of
-            them by :func:`recent`.
-        actions: a_t, uint8 or int32 [T].
+        observations: what the environment showed at each step, elements of the observation space,
+            one observation and no stack each (:mod:`udrl.memory`).
+        actions: a_t, elements of the action space.
         rewards: r_t, float32 [T], rounded once, at the environment.
         terminated: the environment reached a terminal state.
         truncated: a time limit ended it.
@@ -76,3 +56,22 @@ class Episode:
     def episode_return(self) -> float:
         """The sum of all rewards."""
         return float(self.cumulative_rewards[-1])
+
+
+def fault(episode: Episode, spec: EnvironmentSpec) -> str | None:
+    """Say in what way an episode cannot be one of an environment, or None."""
+    rewards, n = episode.rewards, len(episode.rewards) if episode.rewards.ndim == 1 else -1
+    if rewards.dtype != np.float32 or not 1 <= n <= spec.max_episode_steps:
+        return (
+            f"rewards are {rewards.dtype} {rewards.shape}, expected float32, one dimension of 1 to "
+            f"{spec.max_episode_steps} steps"
+        )
+    if not np.isfinite(rewards).all():
+        return "rewards are not all finite numbers"
+    if found := spec.observation_space.fault(episode.observations, n):
+        return f"observations are {found}"
+    if found := spec.action_space.fault(episode.actions, n):
+        return f"actions are {found}"
+    if not (episode.terminated or episode.truncated):
+        return "it neither terminated nor was truncated"
+    return None

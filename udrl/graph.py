@@ -4,12 +4,11 @@ Everything that acts computes this graph in ONNX Runtime; :mod:`udrl.behavior` i
 in torch, for training. A graph without values belongs to a run and says what its weights are; with
 the weights of one version it becomes an :class:`udrl.inference.ActingFunction`.
 
-Inputs: ``observation``, what the network sees ([batch, *stacked_shape], float32 vectors or uint8
-images), and ``command``, desired return and desired horizon, neither bounded nor scaled (float64
-[batch, 2]). Output: ``logits`` of P(a | s, c), float32 [batch, n_actions].
+Inputs: ``observation``, what the networks see ([batch, *shape], :mod:`udrl.memory`), and
+``command``, desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
+Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters].
 """
 
-import math
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
@@ -28,12 +27,15 @@ from udrl.architecture import (
     SQUAREPLUS,
     STRIDE,
     VALUE_WIDTH,
-    image_features,
-    stacked_shape,
+    layer_widths,
+    n_features,
 )
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
+from udrl.memory import FrameStack
+from udrl.spaces import Category, Image
+from udrl.targets import ReturnInTime
 
 #: The tensors of a weights version by name, float32.
 Weights = Mapping[str, npt.NDArray[np.float32]]
@@ -65,25 +67,29 @@ class _Builder:
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         self._config = config
-        self._spec = spec
-        self._shape = stacked_shape(spec, config)
+        self._seen = spec.observation_space
+        self._shape = FrameStack(self._seen, config).shape
+        self._n_parameters = spec.action_space.n_parameters
+        self._target = ReturnInTime(config)
         self._nodes: list[onnx.NodeProto] = []
         self._tensors: list[onnx.TensorProto] = []
 
     def model(self) -> bytes:
         """Return the model, with what was appended last as its output."""
-        seen = TensorProto.UINT8 if self._spec.is_image else TensorProto.FLOAT
+        seen = helper.np_dtype_to_tensor_dtype(self._seen.dtype)
         self._nodes[-1].output[0] = "logits"
         graph = helper.make_graph(
             self._nodes,
             "behavior_function",
             [
                 helper.make_tensor_value_info("observation", seen, ["batch", *self._shape]),
-                helper.make_tensor_value_info("command", TensorProto.DOUBLE, ["batch", 2]),
+                helper.make_tensor_value_info(
+                    "command", TensorProto.DOUBLE, ["batch", self._target.size]
+                ),
             ],
             [
                 helper.make_tensor_value_info(
-                    "logits", TensorProto.FLOAT, ["batch", self._spec.n_actions]
+                    "logits", TensorProto.FLOAT, ["batch", self._n_parameters]
                 )
             ],
             self._tensors,
@@ -99,52 +105,35 @@ class _Builder:
 
     def logits(self) -> str:
         """Append the network of section 3.2; see :class:`udrl.behavior.BehaviorFunction`."""
-        config, spec = self._config, self._spec
+        config = self._config
         activation = _OPERATORS[config.activation]
         command = self._command()
         if config.baseline == "value":
             command = self._relative(command)
-        if spec.is_image:
-            features = self._convolutions("convolutions", activation)
-            first = image_features(self._shape, config.convolutions)
-            widths = (first, *config.hidden)
-        else:
-            first, *_ = widths = config.hidden
-            features = self._append(
-                activation, self._layer("observation", "observation", self._shape[0], first)
-            )
-        gate = self._append("Sigmoid", self._layer("command", command, 2, first))
+        first, *_ = widths = layer_widths(self._seen, config)
+        features = self._encode("encoder", activation, first)
+        gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
         features = self._append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self._append(activation, self._layer(f"layers.{k}", features, n_in, n_out))
-        return self._layer("action", features, widths[-1], spec.n_actions)
+        return self._layer("action", features, widths[-1], self._n_parameters)
 
     def _command(self) -> str:
-        """Append what is read of a command: bounded and scaled (sections 2.3.2 and 3.1)."""
-        command, least = "command", [-math.inf, 1.0]
-        if self._config.desired_horizon == "return":
+        """Append what is read of a command: bounded and scaled (:mod:`udrl.targets`)."""
+        command, target = "command", self._target
+        if target.horizon_follows:
             desired_return = self._column(command, 0)
             horizon = self._append("Floor", desired_return)
-            command, least = self._append("Concat", desired_return, horizon, axis=1), [1.0, 1.0]
-        scales = [self._config.return_scale, self._config.horizon_scale]
-        bounded = self._append("Max", command, self._constant(np.array([least])))
-        scaled = self._append("Mul", bounded, self._constant(np.array([scales])))
+            command = self._append("Concat", desired_return, horizon, axis=1)
+        bounded = self._append("Max", command, self._constant(np.array([target.least])))
+        scaled = self._append("Mul", bounded, self._constant(np.array([target.scales])))
         return self._append("Cast", scaled, to=TensorProto.FLOAT)
 
     def _relative(self, command: str) -> str:
         """Append the desired return relative to V(s) and D(s); see :mod:`udrl.value`."""
-        if self._spec.is_image:
-            features = self._convolutions("value.encoder", "Tanh")
-            n_features = image_features(self._shape, self._config.convolutions)
-        else:
-            n_features = VALUE_WIDTH
-            features = self._append(
-                "Tanh",
-                self._layer("value.encoder.0", "observation", self._shape[0], n_features),
-            )
-        features = self._append(
-            "Tanh", self._layer("value.hidden", features, n_features, VALUE_WIDTH)
-        )
+        features = self._encode("value.encoder", "Tanh", VALUE_WIDTH)
+        width = n_features(self._seen, self._config.convolutions, VALUE_WIDTH)
+        features = self._append("Tanh", self._layer("value.hidden", features, width, VALUE_WIDTH))
         expected = self._layer("value.expected", features, VALUE_WIDTH, 2)
         d = self._column(expected, 1)
         root = self._append("Mul", d, d)
@@ -160,8 +149,26 @@ class _Builder:
         )
         return self._append("Concat", bounded, self._column(command, 1), axis=1)
 
+    def _encode(self, name: str, activation: str, width: int) -> str:
+        """Append an encoder; see :func:`udrl.encoders.make_encoder`."""
+        match self._seen:
+            case Image():
+                return self._convolutions(f"{name}.layers", activation)
+            case Category(n=n):
+                features = self._embedding(name, n, width)
+            case _:
+                features = self._layer(f"{name}.layer", "observation", self._shape[0], width)
+        return self._append(activation, features)
+
+    def _embedding(self, name: str, n: int, width: int) -> str:
+        length = self._shape[0]
+        table = self._weight(f"{name}.embedding.weight", length * n, width)
+        first = self._constant(np.arange(length, dtype=np.int32) * n)
+        vectors = self._append("Gather", table, self._append("Add", "observation", first))
+        features = self._append("ReduceSum", vectors, self._constant(np.array([1])), keepdims=0)
+        return self._append("Add", features, self._weight(f"{name}.bias", width))
+
     def _convolutions(self, name: str, activation: str) -> str:
-        """Append an image encoder; see :func:`udrl.encoders.encode`."""
         features = self._append("Cast", "observation", to=TensorProto.FLOAT)
         features = self._append("Mul", features, self._number(1 / 255))
         channels = pairwise((self._shape[0], *self._config.convolutions))

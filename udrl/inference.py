@@ -2,16 +2,23 @@
 
 import functools
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
-from udrl.episode import Observations
 from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes, with_weights
+from udrl.spaces import Observations, noise
 from udrl.streams import Purpose, Stream, stream_key
+
+#: Of what can be observed, by ONNX Runtime's names.
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "tensor(float)": np.dtype(np.float32),
+    "tensor(uint8)": np.dtype(np.uint8),
+    "tensor(int32)": np.dtype(np.int32),
+}
 
 Commands = npt.NDArray[np.float64]
 Logits = npt.NDArray[np.float32]
@@ -21,9 +28,9 @@ class Call(Protocol):
     """The rows of one call: fill in the inputs, run, read the logits; again and again.
 
     Attributes:
-        observation: [n, *stacked_shape].
+        observation: as the networks see it (:mod:`udrl.memory`), [n, *shape].
         command: desired return and desired horizon, float64 [n, 2].
-        logits: float32 [n, n_actions], what the last run returned.
+        logits: float32 [n, n_parameters], what the last run returned.
     """
 
     observation: Observations
@@ -77,7 +84,7 @@ class ActingFunction:
         return self._calls[n]
 
     def logits(self, observation: Observations, command: Commands) -> Logits:
-        """Return the logits of rows, float32 [n, n_actions]; for any thread."""
+        """Return the logits of rows, float32 [n, n_parameters]; for any thread."""
         rows = [
             self._session.run(None, {"observation": s[None], "command": c[None]})[0]
             for s, c in zip(observation, command, strict=True)
@@ -91,7 +98,7 @@ class _Together:
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
         observation, command = session.get_inputs()
         (logits,) = session.get_outputs()
-        seen = np.uint8 if observation.type == "tensor(uint8)" else np.float32
+        seen = _DTYPES[observation.type]
         self.observation: Observations = np.zeros((n, *observation.shape[1:]), seen)
         self.command = np.zeros((n, *command.shape[1:]))
         self.logits = np.zeros((n, *logits.shape[1:]), np.float32)
@@ -157,15 +164,9 @@ def probe_rows(function: ActingFunction, n: int) -> tuple[Observations, Commands
     """Return observations of noise, and commands in [-100, 100)."""
     like = function.call(1).observation
     stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
-    seen = noise(stream, (n, *like.shape[1:]), is_image=like.dtype == np.uint8)
+    seen = noise(stream, like.dtype, (n, *like.shape[1:]))
     command = stream.uniforms(2 * n).reshape(n, 2) * 200 - 100
     return seen, command
-
-
-def noise(stream: Stream, shape: tuple[int, ...], *, is_image: bool) -> Observations:
-    """Return observations made of the next numbers of a stream: bytes, or float32 in [-2, 2)."""
-    numbers = stream.uniforms(math.prod(shape)).reshape(shape)
-    return (numbers * 256).astype(np.uint8) if is_image else (numbers * 4 - 2).astype(np.float32)
 
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:

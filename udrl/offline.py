@@ -12,12 +12,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from udrl.config import Config
 from udrl.digests import episode_digest, replay_digest
 from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Episode, action_dtype
+from udrl.episode import Episode, fault
 from udrl.errors import ConfigError
+from udrl.spaces import Space
 
 
 def _minari() -> Any:
@@ -90,35 +92,29 @@ def _episode(number: int, data: Any, name: str, spec: EnvironmentSpec) -> Episod
             f"that are one array"
         )
     rewards = np.asarray(data.rewards, np.float32)
-    actions = np.asarray(data.actions)
-    observations = np.asarray(data.observations)[: len(rewards)]
-    expected = (len(rewards), *spec.observation_shape)
-    fits = observations.shape == expected and (not spec.is_image or observations.dtype == np.uint8)
-    if not fits or actions.shape != (len(rewards),) or actions.dtype.kind not in "iu":
-        raise ConfigError(
-            f"dataset {name!r}, episode {number}: observations {observations.dtype} "
-            f"{observations.shape} and actions {actions.dtype} {actions.shape}; the run's "
-            f"environment has {spec.observation_dtype} {expected} and one whole number a step; "
-            f"name a dataset of that environment"
-        )
-    if actions.min() < 0 or actions.max() >= spec.n_actions:
-        raise ConfigError(
-            f"dataset {name!r}, episode {number}: actions from {actions.min()} to "
-            f"{actions.max()}, the run's environment has 0 to {spec.n_actions - 1}"
-        )
-    if not (np.isfinite(observations).all() and np.isfinite(rewards).all()):
-        raise ConfigError(
-            f"dataset {name!r}, episode {number}: an observation or reward is not a finite number"
-        )
     terminated = bool(data.terminations[-1])
-    return Episode(
+    episode = Episode(
         command_id=number,
-        observations=observations.astype(spec.observation_dtype),
-        actions=actions.astype(action_dtype(spec.n_actions)),
+        observations=_as(spec.observation_space, data.observations[: len(rewards)]),
+        actions=_as(spec.action_space, data.actions),
         rewards=rewards,
         terminated=terminated,
         truncated=not terminated,
     )
+    if found := fault(episode, spec):
+        raise ConfigError(
+            f"dataset {name!r}, episode {number}: {found}; name a dataset of the run's environment"
+        )
+    return episode
+
+
+def _as(space: Space, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return values in the dtype of a space, if none changes by more than rounding."""
+    if values.dtype.kind not in "biuf":
+        return values
+    converted = values.astype(space.dtype)
+    whole = values.dtype.kind in "iu" and bool((converted == values).all())
+    return converted if whole or space.dtype.kind == "f" else values
 
 
 def dataset_digest(episodes: Sequence[Episode]) -> str:
@@ -146,7 +142,6 @@ def write_dataset(
             f"{config.environment.split('-')[0].split(':')[-1]}/mine-v0"
         )
     minari = _minari()
-    from gymnasium import spaces
     from minari.data_collector import EpisodeBuffer
 
     buffers = [
@@ -160,20 +155,14 @@ def write_dataset(
         )
         for number, e in enumerate(episodes)
     ]
-    shape = spec.observation_shape
-    observations = (
-        spaces.Box(0, 255, shape, np.uint8)
-        if spec.is_image
-        else spaces.Box(-np.inf, np.inf, shape, np.float32)
-    )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of what only its author can tell
             minari.create_dataset_from_buffers(
                 name,
                 buffers,
-                observation_space=observations,
-                action_space=spaces.Discrete(spec.n_actions),
+                observation_space=spec.observation_space.gymnasium,
+                action_space=spec.action_space.gymnasium,
                 algorithm_name="Upside-Down Reinforcement Learning",
                 description=f"Episodes of a udrl run on {config.environment}, seed {config.seed}; "
                 f"the last observation of each is there twice.",

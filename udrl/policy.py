@@ -8,12 +8,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from udrl.acting import sample
-from udrl.architecture import stacked_shape
 from udrl.config import Config
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 from udrl.inference import ActingFunction
+from udrl.memory import FrameStack
 
 
 class Policy:
@@ -46,7 +45,8 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        self.observation_shape = stacked_shape(spec, config)
+        memory = FrameStack(spec.observation_space, config)
+        self.observation_shape = memory.shape if memory.length > 1 else spec.observation_space.shape
         self._rng = rng or np.random.default_rng()
 
     def make_environment(self, **kwargs: Any) -> Environment:
@@ -80,15 +80,15 @@ class Policy:
                 horizon follows from the return (``desired_horizon = "return"``).
 
         Returns:
-            float64 [n_actions].
+            float64 [n_parameters].
 
         Raises:
             InvalidData: the observation has another shape than those it was trained on, or
                 something is not finite, or the temperature less than 0.
         """
         seen = np.asarray(observation)
-        stacks = (self.config.frame_stack, *self.spec.observation_shape)
-        if seen.shape not in (self.observation_shape, stacks):
+        space, n = self.spec.observation_space, self.config.frame_stack
+        if seen.shape not in (self.observation_shape, (n, *space.shape)):
             raise InvalidData(
                 f"an observation of shape {seen.shape}: expected {self.observation_shape}; show "
                 f"the policy what it was trained on ({self.config.environment})"
@@ -99,9 +99,9 @@ class Policy:
                 f"desired return {desired_return}, desired horizon {desired_horizon}: these and "
                 f"the observation must be finite numbers"
             )
-        observation = seen.reshape(1, *self.observation_shape)
-        seen = observation.astype(self.spec.observation_dtype)
-        logits: npt.NDArray[np.float64] = self.behavior.logits(seen, desired)[0].astype(np.float64)
+        stacks = FrameStack(space, self.config).join(seen.reshape(1, n, *space.shape))
+        row = self.behavior.logits(stacks.astype(space.dtype), desired)[0]
+        logits: npt.NDArray[np.float64] = row.astype(np.float64)
         return logits
 
     def probabilities(
@@ -111,7 +111,7 @@ class Policy:
         desired_horizon: float,
         temperature: float = 1.0,
     ) -> npt.NDArray[np.float64]:
-        """Return P(a | s, c), float64 [n_actions]; arguments and errors as of :meth:`logits`.
+        """Return P(a | s, c), float64 [n]; arguments and errors as of :meth:`logits`.
 
         Args:
             observation: see :meth:`logits`.
@@ -121,7 +121,7 @@ class Policy:
         """
         _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
-        return probabilities(logits, temperature)
+        return self.spec.action_space.probabilities(logits, temperature)
 
     def predict(
         self,
@@ -146,32 +146,11 @@ class Policy:
         """
         _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
-        return choose(logits, 0.0 if deterministic else temperature, self._rng.random())
+        return self.spec.action_space.choose(
+            logits, 0.0 if deterministic else temperature, self._rng.random()
+        )
 
 
 def _check(temperature: float) -> None:
     if not 0 <= temperature < math.inf:
         raise InvalidData(f"temperature {temperature}: expected a finite number from 0 on")
-
-
-def probabilities(logits: npt.NDArray[np.float64], temperature: float) -> npt.NDArray[np.float64]:
-    """Return the distribution over actions, float64 [n_actions], for logits of the same shape."""
-    weights = np.exp((logits - logits.max()) / (temperature or 1.0))
-    if temperature == 0:
-        weights = np.eye(len(logits))[logits.argmax()]
-    shares: npt.NDArray[np.float64] = weights / weights.sum()
-    return shares
-
-
-def choose(logits: npt.NDArray[np.float64], temperature: float, uniform: float) -> int:
-    """Return the action that Algorithm 2 takes for logits, float64 [n_actions].
-
-    Args:
-        logits: of P(a | s, c).
-        temperature: logits are divided by it; 0: take the mode.
-        uniform: the number in [0, 1) that decides.
-    """
-    if temperature == 0:
-        return int(logits.argmax())
-    divisor: Any = np.array([[temperature]])
-    return int(sample(logits[None], divisor, np.array([uniform]))[0])

@@ -15,13 +15,14 @@ import numpy.typing as npt
 from udrl.commands import Command
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
-from udrl.policy import Policy, choose, probabilities
+from udrl.policy import Policy
 from udrl.streams import Stream
+from udrl.targets import ReturnInTime
 
 Result = TypeVar("Result")
 
-#: Random numbers that are drawn at once.
-_AT_A_TIME = 256
+#: By so many steps the random numbers are drawn further, from the first on.
+_AT_A_TIME = 1024
 
 
 class Rollout:
@@ -33,8 +34,6 @@ class Rollout:
         command: the order, the seeds and the temperature.
 
     Attributes:
-        desired_return: what is still to be obtained, after the countdown.
-        desired_horizon: the steps that are left for it.
         temperature: of the next actions; may be set.
         steps: taken so far.
         episode_return: obtained so far, a sequential sum in float64.
@@ -55,10 +54,9 @@ class Rollout:
         self.action: int | None = None
         self._policy = policy
         self._env = env
-        self._cap = policy.spec.max_return if command.kind == "evaluate" else None
-        self._stream = Stream(command.stream_key)
-        self._uniforms: deque[float] = deque()
-        self._held = 0.0
+        self._target = ReturnInTime(policy.config)
+        self._cap = np.array([math.inf if command.cap is None else command.cap])
+        self._numbers = np.empty(0)
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.frame_stack
@@ -72,14 +70,25 @@ class Rollout:
 
     @property
     def probabilities(self) -> npt.NDArray[np.float64]:
-        """P(a | s_t, c_t), float64 [n_actions]: what the next action is sampled from."""
-        return probabilities(self._logits(), self.temperature)
+        """P(a | s_t, c_t), float64 [n]: what the next action is sampled from."""
+        return self._policy.spec.action_space.probabilities(self._logits(), self.temperature)
 
     def tell(self, desired_return: float, desired_horizon: int) -> None:
         """Give another order from here on."""
-        self.desired_return = desired_return
-        self.desired_horizon = desired_horizon
-        self._bound()
+        self._desired = np.array([[desired_return, desired_horizon]], np.float64)
+        self._target.bound(self._desired, self._cap)
+
+    @property
+    def desired_return(self) -> float:
+        """What is still to be obtained, after the countdown."""
+        return float(self._desired[0, 0])
+
+    @property
+    def desired_horizon(self) -> int:
+        """The steps that are left for it."""
+        if self._target.horizon_follows:
+            return math.floor(self.desired_return)
+        return int(self._desired[0, 1])
 
     def step(self) -> float:
         """Take one action and return its reward; the episode must not be over.
@@ -88,27 +97,21 @@ class Rollout:
             EnvironmentFault: the environment raised an exception.
         """
         assert not self.over
-        if not self._uniforms:
-            self._uniforms.extend(self._stream.uniforms(_AT_A_TIME).tolist())
-        uniform = self._uniforms.popleft()
-        held_for = self.steps - self.command.hold_from
-        if 0 <= held_for < self.command.hold_steps:
-            self._held = uniform if held_for == 0 else self._held
-            action = int(self._held * self._policy.spec.n_actions)
+        space, uniform = self._policy.spec.action_space, self._uniform()
+        if self.command.is_random(self.steps):
+            action = int(space.uniform(np.array([uniform]))[0])
         else:
-            action = choose(self._logits(), self.temperature, uniform)
+            action = space.choose(self._logits(), self.temperature, uniform)
         self.action = action
         observation, reward, self.terminated, self.truncated, _ = self._carefully(
             "step", lambda: self._env.step(action)
         )
         self._recent.append(self._plain(observation))
-        reward = float(np.float32(reward))
+        rounded = np.float32(reward)
         self.steps += 1
-        self.episode_return += reward
-        self.desired_return -= reward
-        self.desired_horizon -= 1
-        self._bound()
-        return reward
+        self.episode_return += float(rounded)
+        self._target.advance(self._desired, np.array([rounded]), self._cap)
+        return float(rounded)
 
     def picture(self) -> npt.NDArray[np.uint8]:
         """Return what a spectator sees now, uint8 [height, width, 3].
@@ -131,11 +134,14 @@ class Rollout:
             )
         return picture
 
-    def _bound(self) -> None:
-        if self._cap is not None:
-            self.desired_return = min(self.desired_return, self._cap)
-        if self._policy.config.desired_horizon == "return":
-            self.desired_horizon = math.floor(self.desired_return)
+    def _uniform(self) -> float:
+        """Return the number that decides this step's action."""
+        t = self.steps
+        if t == len(self._numbers):
+            longer = t + _AT_A_TIME
+            numbers = Stream(self.command.stream_key).uniforms(longer)
+            self._numbers = numbers[self.command.decisive(np.arange(longer))]
+        return float(self._numbers[t])
 
     def _logits(self) -> npt.NDArray[np.float64]:
         return self._policy.logits(
@@ -144,7 +150,7 @@ class Rollout:
 
     def _plain(self, observation: Any) -> npt.NDArray[Any]:
         """Return an observation of one's own, in the dtype that the network was trained on."""
-        return np.array(observation, self._policy.spec.observation_dtype)
+        return np.array(observation, self._policy.spec.observation_space.dtype)
 
     def _carefully(self, where: str, call: Callable[[], Result]) -> Result:
         try:

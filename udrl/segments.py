@@ -6,14 +6,18 @@ sum(r[t1..t2-1]) in the desired horizon t2 - t1? The answer is a_t1. Trailing se
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from udrl.actions import Actions
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Actions, Episode, Observations, action_dtype, recent
+from udrl.episode import Episode
+from udrl.memory import FrameStack
+from udrl.spaces import Observations
+from udrl.targets import Desired, ReturnInTime
 
 _PAGE = 64
 
@@ -33,16 +37,14 @@ class Examples(NamedTuple):
     """Inputs and targets of the behavior function, one per row.
 
     Attributes:
-        observation: s_t1, [n, *stacked_shape]: float32 vectors or uint8 images.
-        desired_return: what the segment returned, or its label
-            (:meth:`RankedExperience.label`), float64 [n].
-        desired_horizon: int64 [n], in steps.
-        action: a_t1, uint8 or int32 [n].
+        observation: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape].
+        command: what the segment returned, or its label (:meth:`RankedExperience.label`), and in
+            how many steps, float64 [n, 2].
+        action: a_t1, elements of the action space.
     """
 
     observation: Observations
-    desired_return: Numbers
-    desired_horizon: Indices
+    command: Desired
     action: Actions
 
 
@@ -89,9 +91,10 @@ class Experience:
         n_episodes = config.replay_size + config.recent_size
         n_pages = n_episodes * pages_per_episode
         steps = n_pages * _PAGE
-        self._frame_stack = config.frame_stack
-        self._observations = np.empty((steps, *spec.observation_shape), spec.observation_dtype)
-        self._actions = np.empty(steps, action_dtype(spec.n_actions))
+        seen, acted = spec.observation_space, spec.action_space
+        self._memory = FrameStack(seen, config)
+        self._observations = np.empty((steps, *seen.shape), seen.dtype)
+        self._actions = np.empty((steps, *acted.shape), acted.dtype)
         self._earned = np.empty(steps)  # P[t]: rewards earned before step t
         self._page_table = np.zeros((n_episodes, pages_per_episode), np.int64)
         self._lengths = np.zeros(n_episodes, np.int64)
@@ -140,12 +143,16 @@ class RankedExperience:
 
     Attributes:
         lengths: of the episodes, by rank.
+        observation_shape: of one, as the networks see it.
+        observation_dtype: likewise.
     """
 
     def __init__(self, experience: Experience, slots: Indices) -> None:
         self._experience = experience
         self._slots = slots
         self._labels: Numbers | None = None
+        self.observation_shape = experience._memory.shape
+        self.observation_dtype: np.dtype[Any] = experience._observations.dtype
         self.lengths: Indices = experience._lengths[slots]
         self._first_step: Indices = np.cumsum(self.lengths) - self.lengths
 
@@ -162,12 +169,9 @@ class RankedExperience:
             if len(inner):
                 earned_at_t2[inner] = held._earned[self._row(slot[inner], segments.t2[inner])]
             desired_return = earned_at_t2 - held._earned[row]
-        return Examples(
-            observation=self._observed(slot, segments.t1),
-            desired_return=desired_return,
-            desired_horizon=segments.t2 - segments.t1,
-            action=held._actions[row],
-        )
+        command = np.empty((len(row), ReturnInTime.size))
+        command[:, 0], command[:, 1] = desired_return, segments.t2 - segments.t1
+        return Examples(self._observed(slot, segments.t1), command, held._actions[row])
 
     def observations(self, at_once: int = 4096) -> Iterator[Observations]:
         """Yield what the network sees at every step, episode by episode."""
@@ -211,11 +215,10 @@ class RankedExperience:
     def _observed(self, slot: Indices, t: Indices) -> Observations:
         """Return what the network sees at times t: single observations, or stacks of them."""
         held = self._experience
-        if held._frame_stack == 1:
-            return held._observations[self._row(slot, t)]
-        frames = held._observations[self._row(slot[:, None], recent(t, held._frame_stack))]
-        n, stack, first, *rest = frames.shape
-        return frames.reshape(n, stack * first, *rest)
+        memory = held._memory
+        if memory.length == 1:
+            return memory.join(held._observations[self._row(slot, t)])
+        return memory.join(held._observations[self._row(slot[:, None], memory.times(t))])
 
     def _row(self, slot: Indices, t: Indices) -> Indices:
         page = self._experience._page_table[slot, t // _PAGE]

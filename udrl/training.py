@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
@@ -17,6 +16,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Purpose, Stream, stream_key
+from udrl.targets import ReturnInTime
 from udrl.value import ValueFunction, value_loss
 
 #: Bytes of observations that are gathered at once for the next updates.
@@ -90,14 +90,14 @@ def _update(
     state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
-    batches = _Batches(config, state.behavior)
+    batches = _Batches(config, experience)
     losses = torch.zeros((), dtype=torch.float64, device=config.device)
     one = torch.ones((), device=config.device)
     parameters = list(state.behavior.parameters())
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
-    for observation, command, action in batches.gather(experience, segments):
-        loss = functional.cross_entropy(state.behavior(observation, command), action)
+    for observation, command, action in batches.gather(segments):
+        loss = state.behavior.loss(state.behavior(observation, command), action)
         _step(state.optimizer, parameters, loss, one)
         losses += loss.detach()
     return float(losses)
@@ -115,7 +115,7 @@ def _learn_value(
     parameters = list(state.behavior.parameters())
     one = torch.ones((), device=config.device)
     _label(value, experience, config)
-    for observation, command, _ in batches.gather(experience, segments):
+    for observation, command, _ in batches.gather(segments):
         loss = value_loss(value(observation), command[:, 0])
         _step(state.optimizer, parameters, loss, one)
     _label(value, experience, config)
@@ -159,34 +159,31 @@ class _Batches:
     rounding of a matrix product may depend on alignment.
     """
 
-    def __init__(self, config: Config, behavior: BehaviorFunction) -> None:
-        shape = behavior.observation_shape
-        dtype = torch.uint8 if behavior.is_convolutional else torch.float32
+    def __init__(self, config: Config, experience: RankedExperience) -> None:
+        self._experience = experience
+        shape, dtype = experience.observation_shape, experience.observation_dtype
         bytes_each = config.batch_size * math.prod(shape) * dtype.itemsize
         self._at_once = max(1, min(config.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
         n = self._at_once, config.batch_size
         self._tensors = (
-            torch.empty(*n, *shape, dtype=dtype),
-            torch.empty(*n, 2),
+            torch.empty(*n, *shape, dtype=getattr(torch, dtype.name)),
+            torch.empty(*n, ReturnInTime.size),
             torch.empty(n, dtype=torch.int64),
         )
         self._device = config.device
-        self._scales = np.array([config.return_scale, config.horizon_scale])
+        self._scales = np.array(ReturnInTime(config).scales)
 
-    def gather(
-        self, experience: RankedExperience, segments: Segments
-    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def gather(self, segments: Segments) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield observations, scaled commands and actions of each update, where the network is."""
         n_updates = len(segments.rank)
         for first in range(0, n_updates, self._at_once):
             part = Segments(*(s[first : first + self._at_once] for s in segments))
             n = len(part.rank)
             observation, command, action = (t[:n].numpy() for t in self._tensors)
-            examples = experience.examples(Segments(*(s.reshape(-1) for s in part)))
+            examples = self._experience.examples(Segments(*(s.reshape(-1) for s in part)))
             observation[:] = examples.observation.reshape(observation.shape)
-            command[:, :, 0] = (examples.desired_return * self._scales[0]).reshape(n, -1)
-            command[:, :, 1] = (examples.desired_horizon * self._scales[1]).reshape(n, -1)
-            action[:] = examples.action.reshape(n, -1)
+            command[:] = (examples.command * self._scales).reshape(command.shape)
+            action[:] = examples.action.reshape(action.shape)
             for k in range(n):
                 observed, commanded, acted = (t[k].to(self._device) for t in self._tensors)
                 yield observed, commanded, acted

@@ -6,10 +6,10 @@ import numpy as np
 from udrl.config import Config
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
-from udrl.episode import Episode, action_dtype
-from udrl.inference import noise
+from udrl.episode import Episode
 from udrl.numerics import PROBE_STEPS
 from udrl.segments import Experience
+from udrl.spaces import noise
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 
@@ -24,10 +24,11 @@ def training_class(config: Config, spec: EnvironmentSpec) -> str:
     )
     stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
     length = min(PROBE_STEPS, spec.max_episode_steps)
+    seen, acted = spec.observation_space, spec.action_space
     episode = Episode(
         command_id=0,
-        observations=noise(stream, (length, *spec.observation_shape), is_image=spec.is_image),
-        actions=stream.integers(length, 0, spec.n_actions).astype(action_dtype(spec.n_actions)),
+        observations=noise(stream, seen.dtype, (length, *seen.shape)),
+        actions=acted.uniform(stream.uniforms(length)).astype(acted.dtype),
         rewards=stream.uniforms(length).astype(np.float32),
         terminated=True,
         truncated=False,

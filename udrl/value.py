@@ -15,16 +15,9 @@ returns deviate from it. They serve twice:
 import torch
 from torch import Tensor, nn
 
-from udrl.architecture import (
-    DEVIATIONS,
-    LEAST_DEVIATION,
-    SQUAREPLUS,
-    VALUE_WIDTH,
-    image_features,
-    stacked_shape,
-)
+from udrl.architecture import DEVIATIONS, LEAST_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.config import Config
-from udrl.encoders import PRECISIONS, convolutions, encode, fully_connected, tensors
+from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 
 
@@ -32,34 +25,27 @@ class ValueFunction(nn.Module):
     """V(s) and D(s): the scaled return to expect, and its mean absolute deviation.
 
     Args:
-        spec: size of the observation space.
+        spec: observation space.
         config: ``frame_stack``, ``convolutions`` (of images), ``precision``.
     """
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
-        self._precision = PRECISIONS[config.precision]
-        shape = stacked_shape(spec, config)
-        if spec.is_image:
-            self.encoder = convolutions(shape, config.convolutions)
-            features = image_features(shape, config.convolutions)
-        else:
-            self.encoder = nn.ModuleList([fully_connected(shape[0], VALUE_WIDTH)])
-            features = VALUE_WIDTH
-        self.hidden = fully_connected(features, VALUE_WIDTH)
+        space = spec.observation_space
+        self.encoder = make_encoder(space, config, VALUE_WIDTH, torch.tanh_)
+        self.hidden = fully_connected(
+            n_features(space, config.convolutions, VALUE_WIDTH), VALUE_WIDTH
+        )
         self.expected = fully_connected(VALUE_WIDTH, 2)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return (V(s), D(s)), float32 [batch, 2].
 
         Args:
-            observation: s, [batch, *observation_shape]: float32 vectors or uint8 images.
+            observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
         """
-        layers = tensors((*self.encoder, self.hidden, self.expected), self._precision)
-        *encoder, (weight, bias), (out_weight, out_bias) = layers
-        features = encode(encoder, observation, torch.tanh_)
-        features = torch.tanh_(torch.addmm(bias, features, weight))
-        value, d = torch.addmm(out_bias, features, out_weight).float().unbind(1)
+        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
+        value, d = apply(self.expected, features).float().unbind(1)
         deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
         return torch.stack([value, deviation], dim=1)
 

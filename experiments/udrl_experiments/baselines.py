@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.architecture import stacked_shape
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue
 from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
+from udrl.memory import FrameStack
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments.records import Evaluated
@@ -139,6 +139,7 @@ def run(
         policies.explore_for(model, state.exploration_steps)
         generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.eval_episodes))
         opened.callback(generator.close)
+        shape = FrameStack(generator.spec.observation_space, config).shape
         while (env_steps := model.num_timesteps) < max_env_steps:
             due = (env_steps // config.eval_every + 1) * config.eval_every
             model.learn(
@@ -148,7 +149,7 @@ def run(
             )
             if stop.is_set():
                 raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
-            behavior = policies.InPlaceOfBehavior(model, stacked_shape(generator.spec, config))
+            behavior = policies.InPlaceOfBehavior(model, shape)
             commands = _commands(baseline, generator, len(rows) + 1)
             episodes = generate_episodes(generator, commands, behavior)
             evaluation = summarise([episode.episode_return for episode in episodes])
@@ -179,7 +180,7 @@ def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> l
     config = baseline.config
     if baseline.algorithm == "DQN":
         config = msgspec.structs.replace(config, eval_temperature=0.0)
-    sampler = CommandSampler(config, generator.spec.max_episode_steps)
+    sampler = CommandSampler(config, generator.spec)
     return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
 
 

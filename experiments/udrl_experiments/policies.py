@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
-from udrl.episode import Observations
 from udrl.inference import Call
+from udrl.spaces import Observations
 from udrl.streams import Purpose, Stream, stream_key
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from udrl.actions import Categorical
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.digests import arrays_digest
@@ -22,6 +23,7 @@ from udrl.episode import Episode
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_rows, probe_weights
 from udrl.numerics import PROBE_ROWS
+from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode, encode_array, encode_episode
@@ -91,7 +93,10 @@ CONFIG = Config(
     eval_every=20_000,
 )
 ENVIRONMENT = EnvironmentSpec(
-    observation_shape=(4,), n_actions=2, max_episode_steps=500, max_return=500.0
+    observation_space=Vector(size=4),
+    action_space=Categorical(n=2),
+    max_episode_steps=500,
+    max_return=500.0,
 )
 GRAPH = acting_graph(CONFIG, ENVIRONMENT)
 EPISODE = Episode(

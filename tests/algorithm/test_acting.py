@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-from udrl import acting
+from udrl import recording
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
 from udrl.behavior import initialise
 from udrl.commands import Command, CommandSampler
@@ -24,11 +24,12 @@ from udrl.environments import (
     make_environment,
     specify,
 )
-from udrl.episode import Episode, Observations, action_dtype
+from udrl.episode import Episode
 from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
 from udrl.replay import Entry, ReplayBuffer
+from udrl.spaces import Observations
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import weights_of
 
@@ -71,31 +72,31 @@ def algorithm2(
     spec = specify(env, config)
     limit_steps(env, command.max_steps)
     stream = Stream(command.stream_key)
-    capped = command.kind == "evaluate" and spec.max_return is not None
     dr, dh = command.desired_return, command.desired_horizon
     s, _ = env.reset(seed=command.environment_seed)
-    s = np.asarray(s, np.float32)
+    dtype, shape = spec.observation_space.dtype, spec.observation_space.shape
+    s = np.asarray(s, dtype)
 
-    u = 0.0
     episode: list[tuple[Any, int, np.float32]] = []  # 1: E <- {}
     over = terminated = truncated = False
     while not over:  # 3
-        if capped:
-            dr = min(dr, spec.max_return or 0.0)
+        if command.cap is not None:
+            dr = min(dr, command.cap)
         # 4: compute P(a_t | s_t, c_t) = B(s_t, c_t; theta)
         if behavior is None:
-            logits = [0.0] * spec.n_actions
+            logits = [0.0] * spec.action_space.n
         else:
-            logits = behavior.logits(s[None], np.array([[dr, dh]], np.float64))[0].tolist()
+            logits = behavior.logits(
+                s.reshape(1, *(shape or (1,))), np.array([[dr, dh]], np.float64)
+            )[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
         number = float(stream.uniforms(1)[0])
-        holds = command.hold_from <= len(episode) < command.hold_from + command.hold_steps
-        if holds and len(episode) > command.hold_from:
-            pass  # the same number again
-        elif command.kind != "warm_up" or len(episode) % config.warm_up_hold == 0:
-            u = number
-        if holds:
-            a = int(u * spec.n_actions)
+        since = len(episode) - command.random_from
+        is_random = 0 <= since < command.random_steps
+        if not is_random or since % command.random_hold == 0:
+            u = number  # else the same number again
+        if is_random:
+            a = int(u * spec.action_space.n)
         elif command.temperature == 0:
             a = logits.index(max(logits))
         else:
@@ -107,7 +108,7 @@ def algorithm2(
         next_s, reward, terminated, truncated, _ = env.step(a)
         r = np.float32(reward)
         episode.append((s, a, r))  # 6: append (s_t, a_t, r_t) to E
-        s = np.asarray(next_s, np.float32)  # 7: update state
+        s = np.asarray(next_s, dtype)  # 7: update state
         dr -= float(r)  # 8: update desired reward
         dh -= 1  # 9: update desired horizon
         over = terminated or truncated
@@ -115,8 +116,8 @@ def algorithm2(
     observations, actions, rewards = zip(*episode, strict=True)
     return Episode(
         command_id=command.id,
-        observations=np.array(observations, np.float32),
-        actions=np.array(actions, action_dtype(spec.n_actions)),
+        observations=np.array(observations, dtype),
+        actions=np.array(actions, spec.action_space.dtype),
         rewards=np.array(rewards, np.float32),
         terminated=terminated,
         truncated=truncated,
@@ -159,7 +160,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     spec = specify(env, config)
     one, other = (behavior_of(settings(environment, seed=seed), spec) for seed in (1, 2))
     buffer = ReplayBuffer(config, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
-    sample = CommandSampler(config, spec.max_episode_steps)
+    sample = CommandSampler(config, spec)
     evaluation = sample.evaluate(2, buffer)
     orders: list[Order] = []
     orders += [(command, None) for command in sample.warm_up()]
@@ -279,7 +280,7 @@ class Spy:
     """Gives the same logits for whatever it is asked, and remembers what it was asked."""
 
     def __init__(self, generator: EpisodeGenerator, logits: list[float]) -> None:
-        self.shape = generator.spec.observation_shape
+        self.shape = generator.spec.observation_space.shape
         self.logits = logits
         self.commands: list[list[float]] = []  # of the first row
         self.rows: list[int] = []
@@ -307,21 +308,19 @@ def act(world: World, commands: list[Command], n_environments: int = 1) -> list[
 
 
 @pytest.mark.parametrize(
-    ("kind", "max_return", "seen"),
+    ("cap", "seen"),
     [
-        ("explore", None, [[3, 2], [2, 1], [4, 0], [0, -1]]),
-        ("explore", 2.5, [[3, 2], [2, 1], [4, 0], [0, -1]]),
-        ("evaluate", None, [[3, 2], [2, 1], [4, 0], [0, -1]]),
-        ("evaluate", 2.5, [[2.5, 2], [1.5, 1], [2.5, 0], [-1.5, -1]]),
+        (None, [[3, 2], [2, 1], [4, 0], [0, -1]]),
+        (2.5, [[2.5, 2], [1.5, 1], [2.5, 0], [-1.5, -1]]),
     ],
 )
 def test_the_graph_is_given_what_is_left_of_the_command(
-    kind: str, max_return: float | None, seen: list[list[float]]
+    cap: float | None, seen: list[list[float]]
 ) -> None:
-    config = settings(max_return=max_return)
+    config = settings()
     generator = EpisodeGenerator(config, 1, World().make)
     spy = Spy(generator, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(1, kind=kind, desired_horizon=2)], spy)
+    generate_episodes(generator, [order(1, cap=cap, desired_horizon=2)], spy)
     assert spy.commands == seen
 
 
@@ -372,7 +371,7 @@ class Edges:
 def test_an_action_of_probability_zero_is_never_taken(
     logits: list[float], actions: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(acting, "Stream", Edges)
+    monkeypatch.setattr(recording, "Stream", Edges)
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 3).make)
     (episode,) = generate_episodes(generator, [order(1)], Spy(generator, logits))
@@ -475,17 +474,17 @@ def test_episodes_longer_than_the_first_storage_are_whole(n_environments: int) -
 
 # --- Faults ---------------------------------------------------------------------------------------
 
-NOT_FINITE = "ValueError: an observation or reward is NaN, infinite, or beyond float32"
+NOT_FINITE = "not all finite numbers"
 FAULTS = {
     "raises in reset": "RuntimeError: no more worlds",
     "raises in step": "RuntimeError: the world has ended",
     "returns four values": "ValueError: not enough values to unpack",
     "observes a matrix": "ValueError: could not broadcast",
-    "observes NaN": NOT_FINITE,
-    "observes infinity": NOT_FINITE,
-    "rewards nan": NOT_FINITE,
-    "rewards inf": NOT_FINITE,
-    "rewards 1e300": NOT_FINITE,
+    "observes NaN": f"ValueError: observations are {NOT_FINITE}",
+    "observes infinity": f"ValueError: observations are {NOT_FINITE}",
+    "rewards nan": f"ValueError: rewards are {NOT_FINITE}",
+    "rewards inf": f"ValueError: rewards are {NOT_FINITE}",
+    "rewards 1e300": f"ValueError: rewards are {NOT_FINITE}",
 }
 
 

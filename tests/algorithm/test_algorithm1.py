@@ -99,7 +99,7 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
         return sorted({*best, *newest}, key=lambda e: (e.episode_return, e.command_id))
 
     generator = EpisodeGenerator(config, n_environments=1)
-    sample = CommandSampler(config, generator.spec.max_episode_steps)
+    sample = CommandSampler(config, generator.spec)
     # 1, 2: warm-up episodes; a behavior function
     seen = generate_episodes(generator, sample.warm_up(), None)
     env_steps, evaluations = sum(e.length for e in seen), {}

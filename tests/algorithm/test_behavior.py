@@ -6,11 +6,15 @@ import numpy.typing as npt
 import pytest
 import torch
 
+from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
+from udrl.spaces import Vector
 
-LANDER = EnvironmentSpec(observation_shape=(8,), n_actions=4, max_episode_steps=1000)
+LANDER = EnvironmentSpec(
+    observation_space=Vector(size=8), action_space=Categorical(n=4), max_episode_steps=1000
+)
 
 # Appendix B.1, and the references' [32 gated, 128, 128, 128].
 ARCHITECTURES = [
@@ -60,7 +64,7 @@ def section_3_2(
         gate = [1 / (1 + np.exp(-x)) for x in affine("command", c)]
         # and then multiplied element-wise with an embedding of the observed inputs (after the
         # first layer for fully-connected networks ...)."
-        x = [g * f(e) for g, e in zip(gate, affine("observation", s), strict=True)]
+        x = [g * f(e) for g, e in zip(gate, affine("encoder.layer", s), strict=True)]
         for i in range(len(behavior.layers)):
             x = [f(y) for y in affine(f"layers.{i}", x)]
         logits.append(affine("action", x))
@@ -76,7 +80,7 @@ def test_logits_are_those_of_section_3_2(hidden: tuple[int, ...], activation: st
     with torch.inference_mode():
         logits = behavior(observation, command)
     assert logits.dtype == torch.float32
-    assert logits.shape == (5, LANDER.n_actions)
+    assert logits.shape == (5, LANDER.action_space.n)
     expected = section_3_2(
         behavior,
         observation.numpy().astype(np.float64),
@@ -91,7 +95,7 @@ def test_layers_have_the_widths_asked_for(hidden: tuple[int, ...]) -> None:
     behavior = initialise(settings(hidden=hidden), LANDER)
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items() if "weight" in n}
     assert shapes == {
-        "observation.weight": (hidden[0], 8),
+        "encoder.layer.weight": (hidden[0], 8),
         "command.weight": (hidden[0], 2),
         **{f"layers.{i}.weight": (hidden[i + 1], hidden[i]) for i in range(len(hidden) - 1)},
         "action.weight": (4, hidden[-1]),
@@ -133,7 +137,7 @@ def test_orthogonal_initialisation_scales_hidden_layers_by_their_gain(
             assert not tensor.any()
             continue
         matrix = tensor if tensor.shape[0] <= tensor.shape[1] else tensor.T
-        scale = gain if name.startswith(("observation", "layers")) else 1.0
+        scale = gain if name.startswith(("encoder", "layers")) else 1.0
         torch.testing.assert_close(
             matrix @ matrix.T, scale**2 * torch.eye(len(matrix)), atol=1e-5, rtol=1e-5
         )
@@ -141,7 +145,7 @@ def test_orthogonal_initialisation_scales_hidden_layers_by_their_gain(
 
 def test_uniform_initialisation_is_pytorchs_default() -> None:
     tensors = initialise(settings(hidden=(64, 128), initialisation="uniform"), LANDER).state_dict()
-    for layer, inputs in [("observation", 8), ("command", 2), ("layers.0", 64), ("action", 128)]:
+    for layer, inputs in [("encoder.layer", 8), ("command", 2), ("layers.0", 64), ("action", 128)]:
         for tensor in (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]):
             assert tensor.abs().max() <= inputs**-0.5
         spread = tensors[f"{layer}.weight"].std().item()

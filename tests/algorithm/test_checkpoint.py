@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from udrl.actions import Categorical
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.config import Config, build
 from udrl.digests import arrays_digest
@@ -18,6 +19,7 @@ from udrl.episode import Episode
 from udrl.errors import InvalidWeights
 from udrl.graph import acting_graph, weight_shapes
 from udrl.segments import Experience, RankedExperience
+from udrl.spaces import Vector
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import decode_weights, encode_weights
 
@@ -31,7 +33,9 @@ CONFIG = build(
         "learning_rate": 1e-2,
     },
 )
-SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=2, max_episode_steps=20)
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=3), action_space=Categorical(n=2), max_episode_steps=20
+)
 SHAPES = weight_shapes(acting_graph(CONFIG, SPEC))
 
 

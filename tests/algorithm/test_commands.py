@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from udrl.actions import Categorical
 from udrl.commands import (
     EVALUATION_SEEDS,
     SEARCH_SEEDS,
@@ -16,7 +17,9 @@ from udrl.commands import (
     CommandSampler,
 )
 from udrl.config import Config, build
+from udrl.environments import EnvironmentSpec
 from udrl.replay import Entry, ReplayBuffer
+from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 
 
@@ -24,8 +27,13 @@ def settings(**values: Any) -> Config:
     return build(Config, {"environment": "CartPole-v1", **values})
 
 
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=4), action_space=Categorical(n=2), max_episode_steps=500
+)
+
+
 def sampler(**values: Any) -> CommandSampler:
-    return CommandSampler(settings(**values), max_episode_steps=500)
+    return CommandSampler(settings(**values), SPEC)
 
 
 def buffer_of(returns: Sequence[float], lengths: Sequence[int] = ()) -> ReplayBuffer:
@@ -54,7 +62,7 @@ def test_exploratory_commands_follow_section_2_3_4(
     config = settings(seed=seed, last_few=last_few, n_episodes_per_iter=5)
     episodes.sort()
     buffer = buffer_of(*zip(*episodes, strict=True))
-    commands = CommandSampler(config, 500).explore(3, buffer)
+    commands = CommandSampler(config, SPEC).explore(3, buffer)
 
     # 1: a number of episodes from the end of the replay buffer are selected
     selected = episodes[-last_few:]
@@ -223,13 +231,38 @@ def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
     buffer = buffer_of([1.0, 2.0], [20, 50])
     explored = sampler(**config).explore(3, buffer)
     others = sampler(**config | {"held_actions": 0.0}).explore(3, buffer)
-    assert [msgspec.structs.replace(c, hold_from=0, hold_steps=0) for c in explored] == others
-    held = [c for c in explored if c.hold_steps]
-    assert {c.hold_steps for c in held} <= {7}
+    usual = {"random_from": 0, "random_steps": 0, "random_hold": 1}
+    assert [msgspec.structs.replace(c, **usual) for c in explored] == others
+    held = [c for c in explored if c.random_steps]
+    assert {(c.random_steps, c.random_hold) for c in held} <= {(7, 7)}
     assert abs(len(held) - 1000 * share) <= 5 * sqrt(1000 * share * (1 - share))
-    where = [c.hold_from / min(60, c.desired_horizon) for c in held]
+    where = [c.random_from / min(60, c.desired_horizon) for c in held]
     assert all(0 <= part < 1 for part in where)
     if held:
         assert abs(sum(where) / len(where) - 0.5) < 0.1
-    for command in [*sampler(**config).warm_up(), *sampler(**config).evaluate(3, buffer)]:
-        assert command.hold_steps == 0
+    for command in sampler(**config).evaluate(3, buffer):
+        assert command.random_steps == 0
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+def test_warm_up_acts_at_random_from_the_first_step_to_the_last(hold: int) -> None:
+    for command in sampler(warm_up_hold=hold, max_train_steps=60).warm_up():
+        assert all(command.is_random(t) for t in range(60))
+        assert command.decisive(np.arange(7)).tolist() == [t - t % hold for t in range(7)]
+
+
+def test_held_action_is_decided_by_the_number_of_its_first_step() -> None:
+    (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
+    assert not any(command.is_random(t) for t in range(20))
+    assert command.decisive(np.arange(9)).tolist() == list(range(9))
+    held = msgspec.structs.replace(command, random_from=2, random_steps=4, random_hold=4)
+    assert [t for t in range(9) if held.is_random(t)] == [2, 3, 4, 5]
+    assert held.decisive(np.arange(9)).tolist() == [0, 1, 2, 2, 2, 2, 6, 7, 8]
+
+
+@pytest.mark.parametrize("max_return", [None, 12.0])
+def test_evaluation_is_capped_at_the_greatest_return(max_return: float | None) -> None:
+    spec = msgspec.structs.replace(SPEC, max_return=max_return)
+    sample, buffer = CommandSampler(settings(), spec), buffer_of([1.0])
+    assert {c.cap for c in sample.evaluate(1, buffer)} == {max_return}
+    assert {c.cap for c in sample.explore(1, buffer) + sample.warm_up()} == {None}

@@ -20,13 +20,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
+from udrl.actions import Categorical
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, build
 from udrl.digests import episode_digest
-from udrl.environments import make_environment, specify
+from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.doom import Doom
 from udrl.environments.downsampling import AreaAverage
 from udrl.errors import UnsupportedEnvironment
+from udrl.spaces import Image
 
 
 def take_cover(**changes: Any) -> Config:
@@ -92,8 +94,9 @@ def test_gymnasium_accepts_it(doom: Callable[..., Doom]) -> None:
 def test_take_cover_is_the_paper_s() -> None:
     env = make_environment(Config(environment="TakeCover-v0"))
     spec = specify(env, Config(environment="TakeCover-v0"))
-    assert (spec.observation_shape, spec.observation_dtype) == ((1, 32, 32), "uint8")
-    assert (spec.n_actions, spec.max_episode_steps, spec.max_return) == (2, 2100, 2100.0)
+    assert spec.observation_space == Image(channels=1, height=32, width=32)
+    assert spec.action_space == Categorical(n=2)
+    assert (spec.max_episode_steps, spec.max_return) == (2100, 2100.0)
     seen, total = play(env, 7, 2200)
     assert total == len(seen) - 1, "one for each step, the last included"
     assert len(set(seen)) > 20, "the screen moves"
@@ -160,7 +163,12 @@ def test_nothing_is_written_where_one_works(
 
 
 def commands(config: Config, n: int) -> list[Command]:
-    return CommandSampler(config, 60).warm_up()[:n]
+    spec = EnvironmentSpec(
+        observation_space=Image(channels=1, height=32, width=32),
+        action_space=Categorical(n=2),
+        max_episode_steps=60,
+    )
+    return CommandSampler(config, spec).warm_up()[:n]
 
 
 def test_death_of_an_engine_costs_an_episode() -> None:

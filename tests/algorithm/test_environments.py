@@ -12,11 +12,13 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
+from udrl.actions import Categorical
 from udrl.config import Config, build
 from udrl.environments import Environment, limit_steps, make_environment, specify
 from udrl.environments.figure2 import A1, A2, A3, Figure2
 from udrl.environments.sparse import RewardAtEnd
 from udrl.errors import UnsupportedEnvironment
+from udrl.spaces import Category, Vector
 
 
 class Blank(gym.Env[Any, Any]):
@@ -161,9 +163,8 @@ def test_figure_2_has_the_arrows_of_the_figure() -> None:
 
 def test_figure_2_is_seen_as_one_of_four_states() -> None:
     env = make("Figure2-v0")
-    assert specify(env, settings("Figure2-v0")).observation_shape == (4,)
-    observations = {tuple(env.reset(seed=seed)[0].tolist()) for seed in range(10)}
-    assert observations == {(1, 0, 0, 0), (0, 1, 0, 0)}
+    assert specify(env, settings("Figure2-v0")).observation_space == Category(n=4)
+    assert {env.reset(seed=seed)[0] for seed in range(10)} == {0, 1}
 
 
 def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
@@ -176,8 +177,8 @@ def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
 
 def test_a_spec_says_what_the_algorithm_needs_to_know() -> None:
     spec = specify(make("LunarLander-v3"), settings("LunarLander-v3"))
-    assert spec.observation_shape == (8,)
-    assert spec.n_actions == 4
+    assert spec.observation_space == Vector(size=8)
+    assert spec.action_space == Categorical(n=4)
     assert spec.max_episode_steps == 1000
     assert spec.max_return is None
 
@@ -191,21 +192,21 @@ def test_the_greatest_return_is_the_settings_then_the_instances_then_the_metadat
     assert specify(make(blank), settings(blank)).max_return == 7.0
 
 
-def test_a_discrete_observation_with_an_offset_becomes_one_hot(register: Register) -> None:
+def test_a_discrete_observation_with_an_offset_is_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(spaces.Discrete(3, start=-1), spaces.Discrete(2)))
     env = make(name)
-    assert specify(env, settings(name)).observation_shape == (3,)
+    assert specify(env, settings(name)).observation_space == Category(n=3)
     for seed in range(10):
         observation, _ = env.reset(seed=seed)
         env.unwrapped.observation_space.seed(seed)
         state = env.unwrapped.observation_space.sample()
-        assert observation.tolist() == [state == -1, state == 0, state == 1]
+        assert observation == state + 1
 
 
 def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(VECTOR, spaces.Discrete(3, start=5)))
     env = make(name)
-    assert specify(env, settings(name)).n_actions == 3
+    assert specify(env, settings(name)).action_space == Categorical(n=3)
     env.reset(seed=1)
     for action in (0, 1, 2):
         env.step(action)

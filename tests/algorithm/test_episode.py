@@ -1,12 +1,17 @@
+import dataclasses
 from functools import reduce
 from operator import add
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.episode import Episode, action_dtype, cumulative
+from udrl.actions import Categorical
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode, cumulative, fault
+from udrl.spaces import Vector
 
 floats32 = st.floats(-1e6, 1e6, width=32)
 
@@ -46,7 +51,35 @@ def test_the_return_is_the_sum_of_all_rewards(rewards: list[float]) -> None:
     assert episode(rewards).length == len(rewards)
 
 
-@pytest.mark.parametrize(("n", "dtype"), [(2, np.uint8), (256, np.uint8), (257, np.int32)])
-def test_actions_are_kept_in_the_smaller_type_that_holds_them(n: int, dtype: type) -> None:
-    assert action_dtype(n) is dtype
-    assert np.iinfo(action_dtype(n)).max >= n - 1
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
+)
+
+
+def test_nothing_is_wrong_with_an_episode_of_the_environment() -> None:
+    for n in range(1, 5):
+        assert fault(episode([0.5] * n), SPEC) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"rewards": np.zeros(0, np.float32)}, r"rewards are float32 (0,), expected float32, one"),
+        ({"rewards": np.zeros(5, np.float32)}, r"one dimension of 1 to 4 steps"),
+        ({"rewards": np.zeros((2, 1), np.float32)}, r"rewards are float32 (2, 1)"),
+        ({"rewards": np.zeros(2)}, r"rewards are float64 (2,)"),
+        ({"rewards": np.array([0, np.nan], np.float32)}, "rewards are not all finite numbers"),
+        ({"observations": np.zeros((2, 3), np.float32)},
+         "observations are float32 (2, 3), expected float32 (2, 2)"),
+        ({"observations": np.full((2, 2), np.inf, np.float32)},
+         "observations are not all finite numbers"),
+        ({"actions": np.zeros(3, np.uint8)}, "actions are uint8 (3,), expected uint8 (2,)"),
+        ({"actions": np.zeros(2, np.int64)}, "actions are int64 (2,), expected uint8 (2,)"),
+        ({"actions": np.array([0, 3], np.uint8)}, "actions are from 0 to 3, expected 0 to 2"),
+        ({"terminated": False}, "it neither terminated nor was truncated"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_an_episode_is_said(wrong: dict[str, Any], says: str) -> None:
+    found = fault(dataclasses.replace(episode([0.0, 1.0]), **wrong), SPEC)
+    assert found is not None
+    assert says in found

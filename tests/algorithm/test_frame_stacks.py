@@ -1,5 +1,6 @@
 """What the network sees in acting is what it is trained on: stacks of frames, bit for bit."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,14 +10,15 @@ import numpy.typing as npt
 import pytest
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.architecture import stacked_shape
 from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
-from udrl.episode import Episode, recent
+from udrl.episode import Episode
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call, probe_weights
+from udrl.memory import FrameStack
 from udrl.segments import Experience, Segments
+from udrl.spaces import Category, Image, ObservationSpace, Vector
 from udrl.streams import Purpose, stream_key
 
 STACK = 4
@@ -112,8 +114,30 @@ def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], W
     return generate_episodes(generator, commands, behavior), behavior
 
 
-def test_recent_repeats_the_first() -> None:
-    assert recent(np.array([0, 2, 9]), 4).tolist() == [[0, 0, 0, 0], [0, 0, 1, 2], [6, 7, 8, 9]]
+def test_before_an_episode_its_first_observation_is_repeated() -> None:
+    memory = FrameStack(Vector(size=2), settings())
+    times = memory.times(np.array([0, 2, 9]))
+    assert times.tolist() == [[0, 0, 0, 0], [0, 0, 1, 2], [6, 7, 8, 9]]
+
+
+@pytest.mark.parametrize(
+    ("space", "shape"),
+    [
+        (Vector(size=2), (8,)),
+        (Image(channels=3, height=5, width=6), (12, 5, 6)),
+        (Category(n=7), (4,)),
+    ],
+)
+def test_observations_are_joined_along_the_first_dimension(
+    space: ObservationSpace, shape: tuple[int, ...]
+) -> None:
+    memory = FrameStack(space, settings())
+    assert memory.shape == shape
+    n = math.prod(space.shape)
+    each = np.arange(2 * 4 * n).astype(space.dtype).reshape(2, 4, *space.shape)
+    joined = memory.join(each)
+    assert joined.shape == (2, *shape)
+    assert joined.ravel().tolist() == each.ravel().tolist()
 
 
 @pytest.mark.parametrize("environment", ["Noise-v0", "NoiseVectors-v0"])
@@ -121,7 +145,7 @@ def test_recent_repeats_the_first() -> None:
 def test_acting_sees_what_training_sees(
     environment: str, capacity: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("udrl.acting._FIRST_CAPACITY", capacity)  # 8: the ring turns and grows
+    monkeypatch.setattr("udrl.recording._FIRST_CAPACITY", capacity)  # 8: the ring turns and grows
     config = settings(environment)
     episodes, behavior = watch(config, 3, 12)
     acted_on = {image.tobytes() for image in behavior.seen}
@@ -134,7 +158,7 @@ def test_acting_sees_what_training_sees(
     for rank, episode in enumerate(episodes):
         t = np.arange(episode.length)
         examples = ranked.examples(Segments(np.full_like(t, rank), t, np.full_like(t, len(t))))
-        assert examples.observation.shape[1:] == stacked_shape(spec, config)
+        assert examples.observation.shape[1:] == FrameStack(spec.observation_space, config).shape
         for i, stack in enumerate(examples.observation):
             frames = [episode.observations[max(0, i - k)] for k in range(STACK)[::-1]]
             assert np.array_equal(stack, np.concatenate(frames)), f"step {i}"
@@ -150,7 +174,8 @@ def test_images_come_with_the_channels_first() -> None:
     expected, _ = raw.reset(seed=4)
     assert image.shape == (3, 5, 6)
     assert np.array_equal(image, np.moveaxis(expected, -1, 0))
-    assert specify(env, settings()).is_image
+    space = specify(env, settings()).observation_space
+    assert space == Image(channels=3, height=5, width=6)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +186,7 @@ def test_wherever_the_channels_are(shape: tuple[int, ...], seen: tuple[int, ...]
     gym.register("Shaped-v0", entry_point=lambda **_: Noise(shape), max_episode_steps=9)
     try:
         env = make_environment(build(Config, {"environment": "Shaped-v0"}))
-        assert env.reset(seed=1)[0].shape == specify(env, config).observation_shape == seen
+        assert env.reset(seed=1)[0].shape == specify(env, config).observation_space.shape == seen
     finally:
         del gym.registry["Shaped-v0"]
 

@@ -11,17 +11,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udrl import inference as module
+from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.graph import acting_graph, weight_shapes
 from udrl.inference import ActingFunction, is_exact_together, probe_rows, probe_weights
+from udrl.spaces import Category, Image, Vector
 from udrl.training import weights_of
 
-VECTOR = EnvironmentSpec(observation_shape=(4,), n_actions=3, max_episode_steps=500)
+VECTOR = EnvironmentSpec(
+    observation_space=Vector(size=4), action_space=Categorical(n=3), max_episode_steps=500
+)
 IMAGE = EnvironmentSpec(
-    observation_shape=(1, 16, 16), observation_dtype="uint8", n_actions=3, max_episode_steps=500
+    observation_space=Image(channels=1, height=16, width=16),
+    action_space=Categorical(n=3),
+    max_episode_steps=500,
+)
+CATEGORY = EnvironmentSpec(
+    observation_space=Category(n=7), action_space=Categorical(n=3), max_episode_steps=500
 )
 KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {}),
@@ -30,6 +39,8 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {"frame_stack": 3}),
     (VECTOR, {"baseline": "value"}),
     (VECTOR, {"baseline": "value", "desired_horizon": "return"}),
+    (CATEGORY, {}),
+    (CATEGORY, {"frame_stack": 3, "baseline": "value"}),
     (IMAGE, {}),
     (IMAGE, {"frame_stack": 4, "activation": "tanh"}),
     (IMAGE, {"frame_stack": 4, "baseline": "value"}),
@@ -77,6 +88,8 @@ def test_it_is_the_function_that_is_trained(
                 parameter.add_(0.3 * torch.randn_like(parameter))
     function = acting(config, behavior, spec)
     seen, command = probe_rows(function, 64)
+    if isinstance(spec.observation_space, Category):
+        seen = np.arange(seen.size, dtype=np.int32).reshape(seen.shape) % 7
     found = function.logits(seen, command)
     with torch.inference_mode():
         expected = behavior(torch.tensor(seen), torch.tensor(read(config, command))).numpy()

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from udrl import numerics
+from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.commands import CommandSampler
@@ -19,12 +20,15 @@ from udrl.episode import Episode
 from udrl.numerics import settle, settle_as
 from udrl.replay import Entry, ReplayBuffer
 from udrl.segments import Experience
+from udrl.spaces import Image
 from udrl.training import train, untrained
 from udrl.training_class import training_class
 from udrl.weights import encode_weights
 
 TAKE_COVER = EnvironmentSpec(
-    observation_shape=(1, 32, 32), observation_dtype="uint8", n_actions=2, max_episode_steps=2100
+    observation_space=Image(channels=1, height=32, width=32),
+    action_space=Categorical(n=2),
+    max_episode_steps=2100,
 )
 # Appendix B.2.
 CONVOLUTIONS = [(32, 48, 96, 128), (32, 64, 128, 256), (48, 96, 192, 384)]
@@ -41,7 +45,7 @@ def settings(**values: Any) -> Config:
 
 
 def images(n: int, spec: EnvironmentSpec = TAKE_COVER, stack: int = 8) -> torch.Tensor:
-    channels, *size = spec.observation_shape
+    channels, *size = spec.observation_space.shape
     rng = np.random.default_rng(n)
     return torch.tensor(rng.integers(0, 256, (n, stack * channels, *size)).astype(np.uint8))
 
@@ -78,8 +82,10 @@ def appendix_b_2(behavior: BehaviorFunction, image: torch.Tensor, command: torch
     """One image, in float64."""
     held = {n: t.numpy().astype(np.float64) for n, t in behavior.state_dict().items()}
     x = image.numpy() / 255
-    for i in range(len(behavior.convolutions)):
-        x = relu(convolve(x, held[f"convolutions.{i}.weight"], held[f"convolutions.{i}.bias"]))
+    n_convolutions = sum(n.startswith("encoder.") for n in held) // 2
+    for i in range(n_convolutions):
+        weight, bias = (held[f"encoder.layers.{i}.{name}"] for name in ("weight", "bias"))
+        x = relu(convolve(x, weight, bias))
     gate = 1 / (1 + np.exp(-held["command.weight"] @ command.numpy() - held["command.bias"]))
     y = x.reshape(-1) * gate
     for i in range(len(behavior.layers)):
@@ -91,7 +97,9 @@ def appendix_b_2(behavior: BehaviorFunction, image: torch.Tensor, command: torch
 @pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
 def test_logits_are_those_of_appendix_b_2(size: tuple[int, ...], initialisation: str) -> None:
     spec = EnvironmentSpec(
-        observation_shape=size, observation_dtype="uint8", n_actions=3, max_episode_steps=9
+        observation_space=Image(channels=size[0], height=size[1], width=size[2]),
+        action_space=Categorical(n=3),
+        max_episode_steps=9,
     )
     config = settings(
         convolutions=(3, 4, 5, 6), hidden=(8, 7), frame_stack=2, initialisation=initialisation
@@ -114,7 +122,7 @@ def test_layers_have_the_sizes_of_appendix_b_2(
     into = [8, *convolutions]
     flat = 4 * convolutions[-1]  # 32 -> 16 -> 8 -> 4 -> 2 pixels
     weights: dict[str, tuple[int, ...]] = {
-        f"convolutions.{i}.weight": (into[i + 1], into[i], 3, 3) for i in range(4)
+        f"encoder.layers.{i}.weight": (into[i + 1], into[i], 3, 3) for i in range(4)
     }
     weights |= {"command.weight": (flat, 2), "action.weight": (2, hidden[-1])}
     units = [flat, *hidden]
@@ -232,7 +240,7 @@ def test_horizon_is_the_return_as_an_integer() -> None:
     config = settings(desired_horizon="return", replay_size=10, last_few=4)
     buffer = ReplayBuffer(config)
     buffer.admit([Entry(float(r), i, r) for i, r in enumerate((200, 301, 350, 412))])
-    sampler = CommandSampler(config, 2100)
+    sampler = CommandSampler(config, TAKE_COVER)
     explored = sampler.explore(1, buffer)
     assert len({c.desired_return for c in explored}) > 5
     for command in (*explored, *sampler.evaluate(1, buffer)):

@@ -8,6 +8,7 @@ from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
 from udrl.acting import EpisodeGenerator
+from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction
 from udrl.config import Config, build
 from udrl.environments import Environment, EnvironmentSpec
@@ -16,9 +17,12 @@ from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import acting_class, environment_replays
+from udrl.spaces import Vector
 from udrl.training_class import training_class
 
-LANDER = EnvironmentSpec(observation_shape=(8,), n_actions=4, max_episode_steps=1000)
+LANDER = EnvironmentSpec(
+    observation_space=Vector(size=8), action_space=Categorical(n=4), max_episode_steps=1000
+)
 
 
 def settings(environment: str = "CartPole-v1", **values: Any) -> Config:

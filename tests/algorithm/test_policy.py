@@ -4,12 +4,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from udrl.actions import Categorical
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.errors import InvalidData
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
-from udrl.policy import Policy, choose, probabilities
+from udrl.policy import Policy
 
 
 def policy(environment: str = "CartPole-v1", seed: int = 1, **values: Any) -> Policy:
@@ -102,8 +103,8 @@ def test_stacked_observations_may_have_a_dimension_of_their_own() -> None:
 
 @pytest.mark.parametrize("uniform", [0.0, 0.25, 0.5, 0.999999])
 def test_choosing_is_by_inverse_cdf(uniform: float) -> None:
-    logits = np.log([0.2, 0.3, 0.5])
+    logits, space = np.log([0.2, 0.3, 0.5]), Categorical(n=3)
     expected = next(a for a, edge in enumerate([0.2, 0.5, 1.0]) if uniform < edge)
-    assert choose(logits, 1.0, uniform) == expected
-    assert choose(logits, 0.0, uniform) == 2
-    assert probabilities(logits, 1.0) == pytest.approx([0.2, 0.3, 0.5])
+    assert space.choose(logits, 1.0, uniform) == expected
+    assert space.choose(logits, 0.0, uniform) == 2
+    assert space.probabilities(logits, 1.0) == pytest.approx([0.2, 0.3, 0.5])

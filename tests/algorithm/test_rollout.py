@@ -47,12 +47,12 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
     [
         ({}, {}),
         ({"temperature": 0.0}, {}),
-        ({"temperature": 0.4}, {"max_return": 20.0}),
+        ({"temperature": 0.4, "cap": 20.0}, {}),
         ({"max_steps": 12}, {"frame_stack": 4}),
-        ({"hold_from": 5, "hold_steps": 4}, {}),
-        ({"hold_from": 0, "hold_steps": 1000, "temperature": 0.0}, {}),
+        ({"random_from": 5, "random_steps": 4, "random_hold": 4}, {}),
+        ({"random_steps": 1000, "random_hold": 7, "temperature": 0.0}, {}),
         ({"desired_return": 40.7}, {"desired_horizon": "return"}),
-        ({"kind": "explore", "desired_return": 500.0}, {"max_return": 20.0}),
+        ({"desired_return": 500.0}, {"max_return": 20.0}),
     ],
 )
 def test_left_alone_it_makes_the_episode_of_its_command(
@@ -96,8 +96,8 @@ def test_a_command_given_on_the_way_is_what_the_next_action_follows() -> None:
 
 
 def test_what_is_told_is_bounded_as_in_evaluations() -> None:
-    policy, env = agent(max_return=100.0)
-    rollout = Rollout(policy, env, command(desired_return=300.0))
+    policy, env = agent()
+    rollout = Rollout(policy, env, command(desired_return=300.0, cap=100.0))
     assert rollout.desired_return == 100.0
     policy, env = agent(desired_horizon="return")
     rollout = Rollout(policy, env, command(desired_return=33.9))

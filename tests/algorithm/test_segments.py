@@ -9,10 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from udrl.actions import Categorical
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.segments import Experience, Segments, draw_segments
+from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 
 Kind = Literal["trailing", "all"]
@@ -23,7 +25,12 @@ def experience(replay_size: int, max_steps: int) -> Experience:
         Config, {"environment": "CartPole-v1", "replay_size": replay_size, "last_few": 1}
     )
     return Experience(
-        config, EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=max_steps)
+        config,
+        EnvironmentSpec(
+            observation_space=Vector(size=2),
+            action_space=Categorical(n=3),
+            max_episode_steps=max_steps,
+        ),
     )
 
 
@@ -60,7 +67,7 @@ def gathered(held: Experience, ids: list[int], wanted: list[tuple[int, int, int]
     segments = Segments(*np.array(wanted, np.int64).reshape(-1, 3).T)
     return [
         (s.tolist(), float(r), int(h), int(a))
-        for s, r, h, a in zip(*held.by_rank(ids).examples(segments), strict=True)
+        for s, (r, h), a in zip(*held.by_rank(ids).examples(segments), strict=True)
     ]
 
 
@@ -98,7 +105,7 @@ def test_an_example_has_the_types_that_training_reads() -> None:
     held = experience(replay_size=1, max_steps=4)
     held.add(random_episode(0, 4))
     examples = held.by_rank([0]).examples(Segments(*np.array([[0], [1], [4]])))
-    assert [array.dtype for array in examples] == [np.float32, np.float64, np.int64, np.uint8]
+    assert [array.dtype for array in examples] == [np.float32, np.float64, np.uint8]
 
 
 def draw_one(u: tuple[float, float, float], lengths: list[int], kind: Kind) -> tuple[int, int, int]:

@@ -8,10 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from udrl.actions import Categorical
 from udrl.commands import CommandSampler
 from udrl.config import Config, build
+from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError
 from udrl.replay import Entry, ReplayBuffer
+from udrl.spaces import Vector
 from udrl.strategies import STRATEGIES, ask, make_strategy
 
 BEST = st.lists(st.tuples(st.floats(-500, 500), st.integers(1, 1000)), min_size=1, max_size=8).map(
@@ -92,18 +95,23 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "own_strategies"
 
 
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=4), action_space=Categorical(n=2), max_episode_steps=500
+)
+
+
 def buffer() -> ReplayBuffer:
     return ReplayBuffer(config(), [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
 
 
 def test_your_own_is_named_by_module_and_class(own: str) -> None:
-    sampler = CommandSampler(config(command_strategy=f"{own}:Patient", seed=9), 500)
+    sampler = CommandSampler(config(command_strategy=f"{own}:Patient", seed=9), SPEC)
     commands = sampler.explore(1, buffer())
     assert {(c.desired_return, c.desired_horizon) for c in commands} == {(10.0, 40)}
 
 
 def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
-    sampler = CommandSampler(config(command_strategy="not.there:Missing"), 500)
+    sampler = CommandSampler(config(command_strategy="not.there:Missing"), SPEC)
     assert {(c.desired_return, c.desired_horizon) for c in sampler.evaluate(1, buffer())} == {
         (3.0, 15)
     }

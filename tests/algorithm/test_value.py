@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from udrl.actions import Categorical
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.config import Config, build
 from udrl.digests import arrays_digest
@@ -15,13 +16,18 @@ from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.segments import Experience, RankedExperience, Segments
+from udrl.spaces import Image, Vector
 from udrl.training import train, untrained
 from udrl.value import relative
 from udrl.weights import encode_weights
 
-SPEC = EnvironmentSpec(observation_shape=(3,), n_actions=4, max_episode_steps=90)
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=3), action_space=Categorical(n=4), max_episode_steps=90
+)
 IMAGES = EnvironmentSpec(
-    observation_shape=(1, 16, 16), observation_dtype="uint8", n_actions=2, max_episode_steps=20
+    observation_space=Image(channels=1, height=16, width=16),
+    action_space=Categorical(n=2),
+    max_episode_steps=20,
 )
 
 
@@ -43,16 +49,16 @@ def episode(
     number: int, rewards: list[float], *, truncated: bool = False, spec: EnvironmentSpec = SPEC
 ) -> Episode:
     rng = np.random.default_rng(number)
-    shape = (len(rewards), *spec.observation_shape)
+    shape = (len(rewards), *spec.observation_space.shape)
     observations = (
         rng.integers(256, size=shape, dtype=np.uint8)
-        if spec.is_image
+        if isinstance(spec.observation_space, Image)
         else rng.standard_normal(shape, np.float32)
     )
     return Episode(
         command_id=number,
         observations=observations,
-        actions=rng.integers(spec.n_actions, size=len(rewards), dtype=np.uint8),
+        actions=rng.integers(spec.action_space.n, size=len(rewards)).astype(np.uint8),
         rewards=np.array(rewards, np.float32),
         terminated=not truncated,
         truncated=truncated,
@@ -103,16 +109,16 @@ def test_labels_are_lambda_returns(
         segments = Segments(np.full(n, rank), np.arange(n), np.full(n, n))
         end = values[rank][-1] if cut else 0.0
         expected = [lambda_return(rewards[t:], values[rank][t:], end, lam) for t in range(n)]
-        got = experience.examples(segments).desired_return
+        got = experience.examples(segments).command[:, 0]
         np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-6)
 
 
 def test_with_lambda_1_labels_are_what_was_obtained() -> None:
     experience = ranked([episode(0, [1.0, 2.0, 4.0]), episode(1, [-1.0])])
     segments = Segments(np.array([0, 0, 0, 1]), np.array([0, 1, 2, 0]), np.array([3, 3, 3, 1]))
-    before = experience.examples(segments).desired_return
+    before = experience.examples(segments).command[:, 0]
     experience.label(np.array([9.0, 9.0, 9.0, 9.0]), 1.0)
-    assert experience.examples(segments).desired_return.tolist() == before.tolist()
+    assert experience.examples(segments).command[:, 0].tolist() == before.tolist()
 
 
 def test_observations_come_step_by_step_in_parts() -> None:

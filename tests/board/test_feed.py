@@ -6,9 +6,11 @@ from typing import Any
 import msgspec
 import pytest
 
+from udrl.actions import Categorical
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import InvalidData, Unreachable
+from udrl.spaces import Vector
 from udrl_board.feed import FRESH_S, Feed
 from udrl_board.source import Place
 from udrl_launch.obedience import Agreement, Obedience, Point
@@ -24,7 +26,9 @@ from udrl_proto.messages import (
 
 HELLO = Hello(
     protocol=1, software="1", run_id="run", config=Config(environment="CartPole-v1"),
-    environment=EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=500),
+    environment=EnvironmentSpec(
+        observation_space=Vector(size=4), action_space=Categorical(n=2), max_episode_steps=500
+    ),
     graph=b"", allow_inexact=False, exact=True,
 )  # fmt: skip
 

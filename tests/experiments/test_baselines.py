@@ -20,6 +20,7 @@ from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue, read_toml
 from udrl.environments.making import make_environment, specify
 from udrl.errors import ConfigError, InvalidData
+from udrl.memory import FrameStack
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run
@@ -151,7 +152,9 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     if algorithm == "A2C":
         wanted = msgspec.structs.replace(wanted, hyperparameters={"activation": "relu"})
     model, config = made(wanted), wanted.config
-    behavior = BehaviorFunction(specify(make_environment(config), config), config)
+    spec = specify(make_environment(config), config)
+    behavior = BehaviorFunction(spec, config)
+    seen = FrameStack(spec.observation_space, config).shape
     if isinstance(model, DQN):
         parts: list[nn.Module] = [model.q_net]
     else:
@@ -167,7 +170,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     nn.init.zeros_(behavior.command.weight)
     nn.init.constant_(behavior.command.bias, 100.0)
     generator = np.random.default_rng(1)
-    shape = (5, *behavior.observation_shape)
+    shape = (5, *seen)
     observation = torch.from_numpy(
         generator.integers(0, 256, shape, np.uint8) if make is pictures
         else generator.normal(size=shape).astype(np.float32)
@@ -176,7 +179,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
         for mine, their in zip(ours, theirs, strict=True):
             mine.copy_(their)
         expected = behavior(observation, torch.zeros(5, 2))
-        call = policies.InPlaceOfBehavior(model, behavior.observation_shape).call(5)
+        call = policies.InPlaceOfBehavior(model, seen).call(5)
         call.observation[:] = observation.numpy()
         call.run()
         logits = torch.from_numpy(call.logits)
@@ -207,7 +210,7 @@ def test_reset_seeds(algorithm: str, tmp_path: Path) -> None:
     assert len(in_training) + len(in_evaluation) == len(seeds)
     assert len(set(in_training)) == len(in_training) > 5
 
-    sampler = CommandSampler(config, 100)
+    sampler = CommandSampler(config, specify(make_environment(config), config))
     buffer = ReplayBuffer(config, [Entry(30.0, 7, 30)])
     udrl = [c.environment_seed for i in (1, 2) for c in sampler.evaluate(i, buffer)]
     assert in_evaluation == udrl

@@ -184,7 +184,7 @@ class World:
         fields = msgpack.unpackb(data, strict_map_key=True)
         length = fields["rewards"]["shape"][0]
         assert 1 <= length <= self.spec.max_episode_steps
-        assert fields["observations"]["shape"] == [length, *self.spec.observation_shape]
+        assert fields["observations"]["shape"] == [length, *self.spec.observation_space.shape]
         assert fields["actions"]["shape"] == [length]
         for name, dtype in (("observations", "<f4"), ("actions", "|u1"), ("rewards", "<f4")):
             array = fields[name]
@@ -193,7 +193,7 @@ class World:
             assert len(values) == np.prod(array["shape"])
             assert np.isfinite(values).all()
         actions = np.frombuffer(fields["actions"]["data"], "|u1")
-        assert actions.max() < self.spec.n_actions
+        assert actions.max() < self.spec.action_space.n
         assert fields["terminated"] or fields["truncated"]
 
 

@@ -9,13 +9,16 @@ import minari
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from msgspec.structs import replace
 
+from udrl.actions import Categorical
 from udrl.algorithm1 import algorithm1
 from udrl.config import Budget, Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
 from udrl.offline import dataset_digest, read_dataset, write_dataset
+from udrl.spaces import Image, Vector
 from udrl_launch.cli import cli as command_line
 from udrl_launch.inspection import read_status, settings_of
 from udrl_launch.settings import Fleet, Settings
@@ -24,9 +27,13 @@ from udrl_proto.messages import Status
 from udrl_replay.store import Store
 from whole_run import digests, small
 
-VECTOR = EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=500)
+VECTOR = EnvironmentSpec(
+    observation_space=Vector(size=4), action_space=Categorical(n=2), max_episode_steps=500
+)
 IMAGE = EnvironmentSpec(
-    observation_shape=(1, 12, 10), observation_dtype="uint8", n_actions=3, max_episode_steps=500
+    observation_space=Image(channels=1, height=12, width=10),
+    action_space=Categorical(n=3),
+    max_episode_steps=500,
 )
 
 
@@ -39,8 +46,8 @@ def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Ep
     rng = np.random.default_rng(1)
 
     def observations(n: int) -> Any:
-        shape = (n, *spec.observation_shape)
-        if spec.is_image:
+        shape = (n, *spec.observation_space.shape)
+        if isinstance(spec.observation_space, Image):
             return rng.integers(0, 256, shape).astype(np.uint8)
         return rng.normal(size=shape).astype(np.float32)
 
@@ -48,7 +55,7 @@ def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Ep
         Episode(
             command_id=i,
             observations=observations(n),
-            actions=rng.integers(0, spec.n_actions, n).astype(np.uint8),
+            actions=rng.integers(0, spec.action_space.n, n).astype(np.uint8),
             rewards=rng.normal(size=n).astype(np.float32),
             terminated=i % 2 == 0,
             truncated=i % 2 == 1,
@@ -83,13 +90,12 @@ def test_a_name_that_is_taken_or_unknown() -> None:
 @pytest.mark.parametrize(
     ("spec", "says"),
     [
-        (EnvironmentSpec(observation_shape=(5,), n_actions=2, max_episode_steps=500),
-         r"observations float32 \(3, 4\).*float32 \(3, 5\)"),
-        (EnvironmentSpec(observation_shape=(4,), n_actions=1, max_episode_steps=500),
-         "actions from 0 to 1, the run's environment has 0 to 0"),
-        (EnvironmentSpec(observation_shape=(4,), n_actions=2, max_episode_steps=8),
-         "an episode of 9 steps, training episodes have at most 8"),
-        (IMAGE, "name a dataset of that environment"),
+        (replace(VECTOR, observation_space=Vector(size=5)),
+         r"observations are float32 \(3, 4\), expected float32 \(3, 5\)"),
+        (replace(VECTOR, action_space=Categorical(n=1)),
+         "actions are from 0 to 1, expected 0 to 0"),
+        (replace(VECTOR, max_episode_steps=8), "rewards are .* one dimension of 1 to 8 steps"),
+        (IMAGE, "name a dataset of the run's environment"),
     ],
 )  # fmt: skip
 def test_datasets_of_another_environment(spec: EnvironmentSpec, says: str) -> None:

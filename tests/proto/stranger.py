@@ -19,6 +19,7 @@ import zenoh
 
 Weights = Mapping[str, npt.NDArray[np.float32]]
 MASK = 2**64 - 1
+DTYPES = {"vector": "<f4", "image": "|u1", "category": "<i4"}
 
 
 # Random streams.
@@ -73,7 +74,9 @@ class Network:
 def seen(observations: list[npt.NDArray[Any]], stack: int) -> npt.NDArray[Any]:
     """Return the most recent observations, oldest first; the first stands for those before it."""
     last = len(observations) - 1
-    return np.concatenate([observations[max(last - k, 0)] for k in reversed(range(stack))])
+    return np.concatenate(
+        [np.atleast_1d(observations[max(last - k, 0)]) for k in reversed(range(stack))]
+    )
 
 
 def choose(row: list[float], u: float, temperature: float) -> int:
@@ -87,9 +90,10 @@ def choose(row: list[float], u: float, temperature: float) -> int:
 
 
 def as_promised(observation: Any, spec: dict[str, Any]) -> npt.NDArray[Any]:
-    """Return an observation of an environment as a float32 vector, or as an image of bytes."""
-    array = np.asarray(observation, spec["observation_dtype"])
-    if len(spec["observation_shape"]) == 3:
+    """Return an observation of an environment as its space says."""
+    kind = spec["observation_space"]["kind"]
+    array = np.asarray(observation, DTYPES[kind])
+    if kind == "image":
         array = np.moveaxis(array if array.ndim == 3 else array[..., None], -1, 0)
     return array
 
@@ -99,6 +103,7 @@ def run_episode(
 ) -> dict[str, Any]:
     """Carry out a command and return the arrays and flags of its episode."""
     config, spec = hello["config"], hello["environment"]
+    n_actions = spec["action_space"]["n"]
     limited = {"max_episode_steps": command["max_steps"]} | config["environment_kwargs"]
     env = gym.make(config["environment"], **limited)
     u = numbers(command["stream_key"], command["max_steps"])
@@ -109,21 +114,18 @@ def run_episode(
     rewards: list[np.float32] = []
     terminated = truncated = False
     while not (terminated or truncated):
-        if command["kind"] == "evaluate" and spec["max_return"] is not None:
-            desired = min(desired, spec["max_return"])
+        if command["cap"] is not None:
+            desired = min(desired, command["cap"])
         observations.append(as_promised(observation, spec))
         t = len(actions)
-        row, number = [0.0] * spec["n_actions"], u[t]
-        if network is not None:
+        since = t - command["random_from"]
+        if 0 <= since < command["random_steps"]:
+            action = int(u[t - since % command["random_hold"]] * n_actions)
+        else:
+            assert network is not None
             stacked = seen(observations, config["frame_stack"])
             row = network.logits(stacked, [desired, horizon]).tolist()
-        else:
-            number = u[t - t % config["warm_up_hold"]]
-        first = command["hold_from"]
-        if first <= t < first + command["hold_steps"]:
-            action = int(u[first] * spec["n_actions"])
-        else:
-            action = choose(row, number, command["temperature"])
+            action = choose(row, u[t], command["temperature"])
         actions.append(action)
         observation, reward, terminated, truncated, _ = env.step(action)
         rewards.append(np.float32(reward))
@@ -132,7 +134,7 @@ def run_episode(
     env.close()
     return {
         "observations": np.array(observations),
-        "actions": np.array(actions, "|u1" if spec["n_actions"] <= 256 else "<i4"),
+        "actions": np.array(actions, "|u1" if n_actions <= 256 else "<i4"),
         "rewards": np.array(rewards, "<f4"),
         "terminated": terminated,
         "truncated": truncated,
@@ -171,12 +173,16 @@ def probe_weights(graph: bytes) -> Weights:
 def probe_rows(hello: dict[str, Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return what the network sees in 16 rows, and their commands."""
     spec = hello["environment"]
-    first, *rest = spec["observation_shape"]
-    shape = (16, hello["config"]["frame_stack"] * first, *rest)
+    space, stack = spec["observation_space"], hello["config"]["frame_stack"]
+    names = ("size", "channels", "height", "width")
+    first, *rest = [space[name] for name in names if name in space] or [1]
+    shape = (16, stack * first, *rest)
     drawn = numbers(stream_key(0, "probe", 2, 0), math.prod(shape) + 32)
     observed, desired = drawn[:-32], drawn[-32:]
-    if spec["observation_dtype"] == "uint8":
+    if space["kind"] == "image":
         observation = np.array([math.floor(u * 256) for u in observed], "|u1")
+    elif space["kind"] == "category":
+        observation = np.zeros(len(observed), "<i4")
     else:
         observation = np.array([u * 4 - 2 for u in observed], "<f4")
     command = np.array([u * 200 - 100 for u in desired], "<f8")
@@ -193,15 +199,16 @@ def numerics_class(hello: dict[str, Any]) -> str:
     spec = hello["environment"]
     n = min(64, spec["max_episode_steps"])
     command = {
-        "kind": "explore",
         "desired_return": 1.0 / hello["config"]["return_scale"],
         "desired_horizon": n,
         "max_steps": n,
         "environment_seed": 1_000_000,
         "stream_key": stream_key(0, "probe", 1, 0),
         "temperature": 1.0,
-        "hold_from": 0,
-        "hold_steps": 0,
+        "cap": None,
+        "random_from": 0,
+        "random_steps": 0,
+        "random_hold": 1,
     }
     network = Network(hello["graph"], probe_weights(hello["graph"]))
     episode = run_episode(command, hello, network)

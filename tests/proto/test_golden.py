@@ -16,8 +16,8 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
-from udrl.episode import Observations
 from udrl.inference import Commands, Logits
+from udrl.spaces import Observations
 from udrl.streams import Stream
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Message
@@ -121,7 +121,9 @@ class Fixed:
 
     def __init__(self, logits: list[float], spec: EnvironmentSpec) -> None:
         self._logits = np.array([logits], np.float32)
-        self.observation: Observations = np.zeros((1, *spec.observation_shape), np.float32)
+        # The one observation that is stacked.
+        shape, dtype = spec.observation_space.shape or (1,), spec.observation_space.dtype
+        self.observation: Observations = np.zeros((1, *shape), dtype)
         self.command: Commands = np.zeros((1, 2))
         self.logits: Logits = np.zeros_like(self._logits)
 

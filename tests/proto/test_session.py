@@ -8,9 +8,11 @@ from contextlib import ExitStack
 import pytest
 import zenoh
 
+from udrl.actions import Categorical
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError, Interrupted, InvalidMessage, Unreachable
+from udrl.spaces import Vector
 from udrl_proto import PROTOCOL, keys
 from udrl_proto import session as sessions
 from udrl_proto.codec import encode
@@ -127,7 +129,9 @@ def hello(run_id: str) -> Hello:
         software="0",
         run_id=run_id,
         config=Config(environment="Figure2-v0"),
-        environment=EnvironmentSpec(observation_shape=(4,), n_actions=3, max_episode_steps=2),
+        environment=EnvironmentSpec(
+            observation_space=Vector(size=4), action_space=Categorical(n=3), max_episode_steps=2
+        ),
         graph=b"",
     )
 

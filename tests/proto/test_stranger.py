@@ -18,7 +18,7 @@ import zenoh
 from tests.proto import stranger
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
-from udrl.commands import Command, Kind
+from udrl.commands import Command
 from udrl.config import Budget, Config
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
@@ -135,28 +135,27 @@ def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("kind", "version", "temperature", "hold_steps"),
+    ("version", "more"),
     [
-        ("warm_up", 0, 1.0, 0), ("explore", 1, 1.0, 0), ("explore", 1, 1.0, 3),
-        ("evaluate", 1, 0.3, 0), ("evaluate", 1, 0.0, 0),
+        (0, {"random_steps": 25}), (0, {"random_steps": 25, "random_hold": 4}), (1, {}),
+        (1, {"random_from": 4, "random_steps": 3, "random_hold": 3}), (1, {"cap": 9.0}),
+        (1, {"temperature": 0.3}), (1, {"temperature": 0.0}),
     ],
 )  # fmt: skip
 def test_episode_has_the_same_bytes(
-    kind: Kind, version: int, temperature: float, hold_steps: int, generator: EpisodeGenerator
+    version: int, more: dict[str, Any], generator: EpisodeGenerator
 ) -> None:
     commands = [
         Command(
             id=index,
-            kind=kind,
+            kind="explore",
             desired_return=30.0,
             desired_horizon=10,
             environment_seed=1_000_000 + index,
             stream_key=stream_key(7, Purpose.EPISODE, 1, index),
             weights_version=version,
             max_steps=25,
-            temperature=temperature,
-            hold_from=4,
-            hold_steps=hold_steps,
+            **more,
         )
         for index in range(5)
     ]

@@ -11,9 +11,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
+from udrl.actions import Categorical
 from udrl.commands import Command, CommandSampler
 from udrl.config import Budget, Config
 from udrl.digests import episode_digest, replay_digest
@@ -23,6 +23,7 @@ from udrl.evaluation import Evaluation, summarise
 from udrl.graph import acting_graph
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
+from udrl.spaces import Vector
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
@@ -33,7 +34,9 @@ from udrl_replay.store import Store, Version
 #: Several pages of a file.
 BLOB = bytes(range(256)) * 40
 MAX_AGE = 3
-SPEC = EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=4)
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
+)
 
 
 def config(lead: int = 0) -> Config:
@@ -83,7 +86,8 @@ def join(name: str, environments: int = 4) -> JoinRequest:
 
 def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
     """Carry out a command; ``other``: as a machine would that rounds in its own way."""
-    cause = hashlib.sha256(msgspec.msgpack.encode(command) + weights).digest()
+    told = f"{command.id}|{command.desired_return}|{command.desired_horizon}"
+    cause = hashlib.sha256(told.encode() + weights).digest()
     length = 1 + cause[0] % command.max_steps
     return Episode(
         command_id=command.id,
@@ -124,7 +128,7 @@ class Result(NamedTuple):
 def reference(lead: int, max_env_steps: int) -> Result:
     """Do what a run does, the slow and obvious way: keep everything, begin with it each time."""
     settings = config(lead)
-    sample = CommandSampler(settings, SPEC.max_episode_steps)
+    sample = CommandSampler(settings, SPEC)
     weights = [b""]
     steps: list[int] = []
     explored: list[list[Episode]] = []

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from udrl.actions import Categorical
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage
 from udrl.replay import Entry
+from udrl.spaces import Vector
 from udrl_proto.codec import decode, decode_episode, encode_array, encode_episode
 from udrl_proto.messages import Array, EpisodeMessage
 from udrl_replay.arrival import inspect
 
-SPEC = EnvironmentSpec(observation_shape=(2,), n_actions=3, max_episode_steps=4)
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
+)
 
 
 def episode(**changes: Any) -> Episode:
@@ -62,11 +66,11 @@ def ones(*shape: int) -> np.typing.NDArray[np.float32]:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"rewards": ones(5)}, r"rewards of shape \(5,\), expected one dimension of 1 to 4 steps"),
-        ({"rewards": ones(3, 1)}, r"rewards of shape \(3, 1\), expected one dimension"),
-        ({"rewards": ones()}, r"rewards of shape \(\), expected one dimension"),
+        ({"rewards": ones(5)}, r"rewards are float32 \(5,\), .* one dimension of 1 to 4 steps"),
+        ({"rewards": ones(3, 1)}, r"rewards are float32 \(3, 1\), expected float32, one dimension"),
+        ({"rewards": ones()}, r"rewards are float32 \(\), expected float32, one dimension"),
         ({"rewards": ones(2)}, r"observations are float32 \(3, 2\), expected float32 \(2, 2\)"),
-        ({"rewards": np.ones(3, np.int32)}, r"rewards are int32 \(3,\), expected float32 \(3,\)"),
+        ({"rewards": np.ones(3, np.int32)}, r"rewards are int32 \(3,\), expected float32"),
         ({"observations": ones(2, 2)}, r"observations are float32 \(2, 2\), expected .* \(3, 2\)"),
         ({"observations": ones(3, 1)}, r"observations are float32 \(3, 1\), expected .* \(3, 2\)"),
         ({"observations": ones(6)}, r"observations are float32 \(6,\), expected .* \(3, 2\)"),
@@ -74,7 +78,7 @@ def ones(*shape: int) -> np.typing.NDArray[np.float32]:
         ({"actions": np.zeros(2, np.uint8)}, r"actions are uint8 \(2,\), expected uint8 \(3,\)"),
         ({"actions": np.zeros((3, 1), np.uint8)}, r"actions are uint8 \(3, 1\), expected uint8"),
         ({"actions": np.zeros(3, np.int32)}, r"actions are int32 \(3,\), expected uint8 \(3,\)"),
-        ({"actions": np.array([0, 3, 1], np.uint8)}, r"actions must be 0 to 2, got 0 to 3"),
+        ({"actions": np.array([0, 3, 1], np.uint8)}, "actions are from 0 to 3, expected 0 to 2"),
         ({"rewards": ones(3) * np.nan}, "rewards are not all finite"),
         ({"rewards": np.array([0, -np.inf, 0], np.float32)}, "rewards are not all finite"),
         ({"observations": ones(3, 2) * np.inf}, "observations are not all finite"),
@@ -88,11 +92,11 @@ def test_impossible_episode_is_refused_and_named(changes: dict[str, Any], compla
 
 
 def test_actions_of_large_action_spaces_are_signed_and_still_checked() -> None:
-    spec = replace(SPEC, n_actions=1000)
+    spec = replace(SPEC, action_space=Categorical(n=1000))
     good = episode(actions=np.array([0, 1, 999], np.int32))
     assert inspect(message(good), spec).entry.id == 7
     for bad in (-1, 1000):
-        with pytest.raises(InvalidMessage, match=r"actions must be 0 to 999, got "):
+        with pytest.raises(InvalidMessage, match=r"actions are from .*, expected 0 to 999"):
             inspect(message(episode(actions=np.array([0, 1, bad], np.int32))), spec)
 
 

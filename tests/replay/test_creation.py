@@ -10,10 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import udrl
+from udrl.actions import Categorical
 from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
+from udrl.spaces import Category
 from udrl_proto import PROTOCOL, keys
 from udrl_proto.messages import Hello
 from udrl_replay import creation
@@ -36,7 +38,10 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
         run_id=hello.run_id,
         config=TOY,
         environment=EnvironmentSpec(
-            observation_shape=(4,), n_actions=3, max_episode_steps=2, max_return=2.0
+            observation_space=Category(n=4),
+            action_space=Categorical(n=3),
+            max_episode_steps=2,
+            max_return=2.0,
         ),
         graph=acting_graph(TOY, hello.environment),
     )

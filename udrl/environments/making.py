@@ -1,13 +1,12 @@
 """Making an environment from a run's settings, and saying what it looks like to the algorithm.
 
-However an environment presents itself, the algorithm sees observations that are float32 vectors or
-uint8 images with the channels first, and actions 0..n-1: a ``Discrete`` observation becomes
-one-hot, an image's channels are moved, a ``Discrete`` action space with an offset is shifted to 0.
-Everything else is refused, with what is supported.
+However an environment presents itself, the algorithm sees observations of the kinds in
+:mod:`udrl.spaces` and actions of those in :mod:`udrl.actions`: an image's channels are moved to the
+front, a ``Discrete`` space with an offset is shifted to 0. Everything else is refused, with what is
+supported.
 """
 
-import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import gymnasium as gym
 import msgspec
@@ -16,43 +15,35 @@ import numpy.typing as npt
 from gymnasium import spaces
 from msgspec import Meta
 
+from udrl.actions import ActionSpace, Categorical
 from udrl.config import Config
 from udrl.errors import UnsupportedEnvironment
+from udrl.spaces import ObservationSpace, observation_space
 
 Environment = gym.Env[Any, Any]
 
 _EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot", "vizdoom": "doom"}
-
-Size = Annotated[int, Meta(ge=1, le=2**20)]
 
 
 class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the algorithm knows of an environment.
 
     Attributes:
-        observation_shape: [size] of a vector, or [channels, height, width] of an image.
-        observation_dtype: ``float32`` of vectors, ``uint8`` of images.
-        n_actions: actions are 0..n_actions-1.
+        observation_space: what it shows.
+        action_space: what can be done.
         max_episode_steps: steps after which an episode is truncated.
         max_return: the greatest return possible, if declared (caps evaluation commands, 2.3.2).
     """
 
-    observation_shape: Annotated[tuple[Size, ...], Meta(min_length=1, max_length=3)]
-    observation_dtype: Literal["float32", "uint8"] = "float32"
-    n_actions: int
-    max_episode_steps: int
+    observation_space: ObservationSpace
+    action_space: ActionSpace
+    max_episode_steps: Annotated[int, Meta(ge=1, le=2**31)]
     max_return: float | None = None
 
     @property
-    def is_image(self) -> bool:
-        """Whether observations are images."""
-        return self.observation_dtype == "uint8"
-
-    @property
     def step_bytes(self) -> int:
-        """Bytes of one observation, action and reward, as they are sent and stored, at most."""
-        size = math.prod(self.observation_shape)
-        return size * np.dtype(self.observation_dtype).itemsize + 8
+        """Bytes of one observation, action and reward, as they are sent and stored."""
+        return self.observation_space.n_bytes + self.action_space.n_bytes + 4
 
 
 def make_environment(config: Config) -> Environment:
@@ -97,7 +88,7 @@ def _remedy(error: Exception) -> str:
 def _with_plain_observations(env: Environment, name: str) -> Environment:
     space = env.observation_space
     if isinstance(space, spaces.Discrete):
-        return gym.wrappers.FlattenObservation(env)
+        return env if space.start == 0 else _with_indices_from_0(env, space)
     if isinstance(space, spaces.Box) and min(space.shape, default=0) > 0:
         if len(space.shape) == 1:
             return env
@@ -108,6 +99,13 @@ def _with_plain_observations(env: Environment, name: str) -> Environment:
         f"environment {name!r} has observations {space}; supported are Box vectors (one "
         f"dimension), Box images of uint8 (two or three dimensions) and Discrete; wrap it, e.g. "
         f"in gymnasium.wrappers.FlattenObservation"
+    )
+
+
+def _with_indices_from_0(env: Environment, space: "spaces.Discrete[Any]") -> Environment:
+    start = int(space.start)
+    return gym.wrappers.TransformObservation(
+        env, lambda observation: observation - start, spaces.Discrete(int(space.n))
     )
 
 
@@ -145,16 +143,14 @@ def _with_plain_actions(env: Environment, name: str) -> Environment:
 
 def specify(env: Environment, config: Config) -> EnvironmentSpec:
     """Return the spec of an environment that :func:`make_environment` made."""
-    assert isinstance(env.observation_space, spaces.Box)
     assert isinstance(env.action_space, spaces.Discrete)
     assert env.spec is not None
     assert env.spec.max_episode_steps is not None
     declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
     max_return = config.max_return if config.max_return is not None else declared
     return EnvironmentSpec(
-        observation_shape=env.observation_space.shape,
-        observation_dtype="uint8" if len(env.observation_space.shape) == 3 else "float32",
-        n_actions=int(env.action_space.n),
+        observation_space=observation_space(env.observation_space),
+        action_space=Categorical(n=int(env.action_space.n)),
         max_episode_steps=env.spec.max_episode_steps,
         max_return=None if max_return is None else float(max_return),
     )

@@ -250,6 +250,7 @@ class Stage(threading.Thread):
                 id=0,
                 kind="evaluate",
                 desired_return=order.desired_return,
+                cap=policy.spec.max_return,
                 desired_horizon=max(0, order.desired_horizon),
                 environment_seed=order.seed,
                 stream_key=stream_key(order.seed, Purpose.EPISODE),

@@ -19,6 +19,7 @@ from udrl.evaluation import Evaluation, summarise
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
+from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
 from udrl_replay.run import Progress
@@ -153,10 +154,10 @@ def evaluation_commands(
     config = msgspec.structs.replace(
         agent.config, eval_episodes=episodes, eval_temperature=temperature
     )
-    sampler = CommandSampler(config, agent.environment.max_episode_steps)
+    sampler = CommandSampler(config, agent.environment)
     commands = sampler.close(agent.iteration, agent.buffer)
     told = commands[0]
-    desired = sampler.desired(
+    desired = ReturnInTime(config).settle(
         told.desired_return if desired_return is None else desired_return,
         told.desired_horizon if desired_horizon is None else desired_horizon,
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from udrl.digests import replay_digest
 from udrl.errors import StoreError
 from udrl.strategies import Best
+from udrl.targets import ReturnInTime
 from udrl_proto.messages import (
     HISTORY_PAGE,
     MOST_SHOWN,
@@ -252,7 +253,7 @@ def contents(run: Run) -> Contents:
     # The best are always among those that are shown.
     shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
     best = Best.of(run.buffer.best(config.last_few)) if entries else None
-    told = best and run.sampler.desired(best.mean, best.horizon)
+    told = best and ReturnInTime(config).settle(best.mean, best.horizon)
     commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
     return Contents(
         iteration=max(run.progress.iteration, 0),

@@ -100,7 +100,7 @@ class Run:
             weights_version(e.iteration, self.config.lead)
             for e in store.evaluations(-1, self.progress.iteration)
         }
-        self.sampler = CommandSampler(self.config, self.hello.environment.max_episode_steps)
+        self.sampler = CommandSampler(self.config, self.hello.environment)
         self._began = time.monotonic() - self.progress.wall_s
         held = store.buffer(self.progress.iteration)
         self.buffer = ReplayBuffer(self.config, (p.entry for p in held))

@@ -1,0 +1,112 @@
+"""The steps of running episodes, in rings that grow with the longest of them."""
+
+import numpy as np
+import numpy.typing as npt
+
+from udrl.commands import Command
+from udrl.environments.making import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.memory import FrameStack
+from udrl.spaces import Observations
+from udrl.streams import Stream
+
+_FIRST_CAPACITY = 1024
+_FIRST_BYTES = 64 << 20
+
+
+class Recording:
+    """A ring of rounds: round k of all rows is kept at k % capacity.
+
+    Args:
+        spec: of the environments.
+        n: rows.
+
+    Attributes:
+        round: steps that all rows have made.
+        began: the round that each row's episode began in, int64 [n].
+    """
+
+    def __init__(self, spec: EnvironmentSpec, n: int) -> None:
+        self.round = 0
+        self.began = np.zeros(n, np.int64)
+        self._longest = spec.max_episode_steps
+        self._capacity = min(
+            self._longest, _FIRST_CAPACITY, max(64, _FIRST_BYTES // (n * spec.step_bytes))
+        )
+        shape = (self._capacity, n)
+        seen, acted = spec.observation_space, spec.action_space
+        self._rings = {
+            "observations": np.zeros((*shape, *seen.shape), seen.dtype),
+            "actions": np.zeros((*shape, *acted.shape), acted.dtype),
+            "rewards": np.zeros(shape, np.float32),
+            "uniforms": np.zeros(shape),
+        }
+        self._commands: dict[int, Command] = {}
+
+    def begin(self, row: int, command: Command) -> None:
+        """Let an episode begin in this round; its numbers are laid where its steps will look."""
+        self.began[row] = self.round
+        self._commands[row] = command
+        self._lay_out(row, command)
+
+    def begin_round(self, observation: Observations) -> npt.NDArray[np.float64]:
+        """Keep what is observed, [n, *observation_shape]; return what decides, float64 [n]."""
+        self._make_room()
+        at = self.round % self._capacity
+        self._rings["observations"][at] = observation
+        uniforms: npt.NDArray[np.float64] = self._rings["uniforms"][at]
+        return uniforms
+
+    def end_round(self, actions: npt.NDArray[np.integer], rewards: npt.NDArray[np.float32]) -> None:
+        """Keep what was done and what it brought, and go on to the next round."""
+        at = self.round % self._capacity
+        self._rings["actions"][at] = actions
+        self._rings["rewards"][at] = rewards
+        self.round += 1
+
+    def stacks(self, memory: FrameStack) -> Observations:
+        """Return what the networks see in this round, [n, *memory.shape]."""
+        rounds = (self.began[:, None] + memory.times(self.round - self.began)) % self._capacity
+        rows = np.arange(len(self.began))[:, None]
+        return memory.join(self._rings["observations"][rounds, rows])
+
+    def end(self, row: int, *, terminated: bool, truncated: bool) -> Episode:
+        """Return a row's episode, whose last step was that of the last round."""
+        began = int(self.began[row])
+        places = self._places(began, self.round - began)
+        kept = {name: self._rings[name][places, row] for name in self._rings if name != "uniforms"}
+        command = self._commands.pop(row)
+        return Episode(command_id=command.id, terminated=terminated, truncated=truncated, **kept)
+
+    def drop(self, row: int) -> None:
+        """Forget a row's episode."""
+        del self._commands[row]
+
+    def _places(self, first: int, count: int) -> npt.NDArray[np.int64]:
+        """Return where ``count`` rounds from ``first`` on lie in the ring."""
+        return np.arange(first, first + count) % self._capacity
+
+    def _lay_out(self, row: int, command: Command) -> None:
+        numbers = Stream(command.stream_key).uniforms(self._capacity)
+        if command.random_steps and command.random_hold > 1:
+            numbers = numbers[command.decisive(np.arange(self._capacity))]
+        places = self._places(int(self.began[row]), self._capacity)
+        self._rings["uniforms"][places, row] = numbers
+
+    def _make_room(self) -> None:
+        """Make the ring twice as long if an episode would overwrite its own beginning."""
+        first = self.round - self._capacity
+        if self._capacity >= self._longest or first < 0:
+            return
+        if not any(self.began[row] == first for row in self._commands):
+            return
+        count = self._capacity
+        old = self._places(first, count)
+        self._capacity *= 2
+        new = self._places(first, count)
+        for name, ring in self._rings.items():
+            longer = np.zeros((self._capacity, *ring.shape[1:]), ring.dtype)
+            longer[new] = ring[old]
+            self._rings[name] = longer
+        for row, command in self._commands.items():
+            self._lay_out(row, command)

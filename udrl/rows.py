@@ -1,0 +1,113 @@
+"""Many environments side by side, stepped one after another in one thread."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from udrl.config import Config
+from udrl.environments.making import (
+    Environment,
+    EnvironmentSpec,
+    limit_steps,
+    make_environment,
+    specify,
+)
+from udrl.spaces import Observations
+
+
+class Step(NamedTuple):
+    """What a step ended.
+
+    Attributes:
+        over: row, terminated and truncated of each episode that has ended.
+        broken: row and exception of each environment that raised one.
+    """
+
+    over: list[tuple[int, bool, bool]]
+    broken: list[tuple[int, Exception]]
+
+
+class Rows:
+    """``n`` environments of a run.
+
+    Args:
+        config: the run's settings.
+        n: how many.
+        make: makes one of them.
+
+    Attributes:
+        spec: of the environments.
+        observation: what each showed last, [n, *observation_shape].
+        reward: what each gave last, float32 [n].
+
+    Raises:
+        UnsupportedEnvironment: the environment cannot be made or is not supported.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        n: int,
+        make: Callable[[Config], Environment] = make_environment,
+    ) -> None:
+        self._config = config
+        self._make = make
+        self._envs = [make(config) for _ in range(n)]
+        self.spec: EnvironmentSpec = specify(self._envs[0], config)
+        self._limits = [self.spec.max_episode_steps] * n
+        space = self.spec.observation_space
+        self.observation: Observations = np.zeros((n, *space.shape), space.dtype)
+        self.reward = np.zeros(n, np.float32)
+
+    def __len__(self) -> int:
+        return len(self._envs)
+
+    def reset(self, row: int, seed: int, max_steps: int) -> Exception | None:
+        """Begin an episode; what the environment raises is returned."""
+        try:
+            if self._limits[row] != max_steps:
+                limit_steps(self._envs[row], max_steps)
+                self._limits[row] = max_steps
+            self.observation[row], _ = self._envs[row].reset(seed=seed)
+        except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
+            return error
+        self.reward[row] = 0.0
+        return None
+
+    def step(self, rows: Sequence[int], actions: npt.NDArray[np.integer]) -> Step:
+        """Take a step in some of the environments.
+
+        Args:
+            rows: which.
+            actions: of all rows, [n]; those of the others are not looked at.
+        """
+        observation, reward, envs = self.observation, self.reward, self._envs
+        over: list[tuple[int, bool, bool]] = []
+        broken: list[tuple[int, Exception]] = []
+        chosen = actions.tolist()
+        for row in rows:
+            try:
+                observation[row], reward[row], terminated, truncated, _ = envs[row].step(
+                    chosen[row]
+                )
+            except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
+                broken.append((row, error))
+                continue
+            if terminated or truncated:
+                over.append((row, bool(terminated), bool(truncated)))
+        return Step(over, broken)
+
+    def replace(self, row: int) -> None:
+        """Make an environment anew that can no longer be trusted."""
+        with contextlib.suppress(Exception):  # it is broken already, and goes
+            self._envs[row].close()
+        self._envs[row] = self._make(self._config)
+        self._limits[row] = self.spec.max_episode_steps
+
+    def close(self) -> None:
+        """Close all environments."""
+        for env in self._envs:
+            env.close()
