@@ -57,7 +57,9 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="
 
 def outside(values: npt.NDArray[Any], n: int) -> str | None:
     """Say in what way indices are not all in [0, n), or None."""
-    least, greatest = int(values.min(initial=0)), int(values.max(initial=0))
+    if values.size == 0:
+        return None
+    least, greatest = int(values.min()), int(values.max())
     if least >= 0 and greatest < n:
         return None
     return f"from {least} to {greatest}, expected 0 to {n - 1}"

@@ -186,7 +186,8 @@ class World:
         assert 1 <= length <= self.spec.max_episode_steps
         assert fields["observations"]["shape"] == [length, *self.spec.observation_space.shape]
         assert fields["actions"]["shape"] == [length]
-        for name, dtype in (("observations", "<f4"), ("actions", "|u1"), ("rewards", "<f4")):
+        seen = self.spec.observation_space.dtype.str
+        for name, dtype in (("observations", seen), ("actions", "|u1"), ("rewards", "<f4")):
             array = fields[name]
             assert array["dtype"] == dtype
             values = np.frombuffer(array["data"], dtype)

@@ -131,7 +131,7 @@ def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
     good = EpisodeMessage(
         actor="mallory",
         command_id=0,
-        observations=encode_array(np.zeros((1, 4), np.float32)),
+        observations=encode_array(np.zeros(1, np.int32)),
         actions=encode_array(np.zeros(1, np.uint8)),
         rewards=encode_array(np.zeros(1, np.float32)),
         terminated=True,
@@ -142,7 +142,7 @@ def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
         "never issued|cancelled or unknown": msgspec.structs.replace(good, command_id=77),
         "rewards are not all finite": msgspec.structs.replace(good, rewards=nan),
         "observations are float32": msgspec.structs.replace(good, observations=nan),
-        "actions must be 0 to 2": msgspec.structs.replace(
+        "actions are from 9 to 9, expected 0 to 2": msgspec.structs.replace(
             good, actions=encode_array(np.full(1, 9, np.uint8))
         ),
         "neither terminated": msgspec.structs.replace(good, terminated=False),
@@ -175,7 +175,7 @@ def test_different_episode_for_a_command_marks_the_run_inexact(hosted: Hosted) -
     first = EpisodeMessage(
         actor="one",
         command_id=3,
-        observations=encode_array(np.zeros((1, 4), np.float32)),
+        observations=encode_array(np.zeros(1, np.int32)),
         actions=encode_array(np.zeros(1, np.uint8)),
         rewards=encode_array(np.zeros(1, np.float32)),
         terminated=True,
