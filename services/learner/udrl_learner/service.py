@@ -1,4 +1,7 @@
-"""The learner service: ask for the buffer, train a version, deliver it, announce it; again.
+"""The learner service: take the buffer, train a version, deliver it, announce it; again.
+
+While a version is trained, the one before is delivered, and the buffer for the one after is
+fetched as soon as its iteration is complete.
 
 It keeps no files. A learner that starts, or that finds itself out of step with the replay service,
 takes the latest version from there and goes on; what it trains is the same either way.
@@ -9,12 +12,14 @@ import os
 import platform
 import threading
 import time
-from typing import Any
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from typing import Any, NamedTuple
 
 import zenoh
 
 import udrl
 from udrl.checkpoint import decode_state, encode_optimizer
+from udrl.episode import Episode
 from udrl.errors import Interrupted, Refused
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained, use_one_thread
@@ -43,6 +48,21 @@ log = logging.getLogger("udrl")
 
 #: Episodes that are asked for at once; a page holds fewer, usually.
 _ASK_FOR = 10_000
+
+#: Seconds after which a wait for the replay service looks whether it is still of use.
+_LOOK_S = 0.5
+
+
+class Buffer(NamedTuple):
+    """The replay buffer after an iteration.
+
+    Attributes:
+        ids: of its episodes, by rank.
+        new: those that were not held before.
+    """
+
+    ids: tuple[int, ...]
+    new: list[Episode]
 
 
 class LearnerService:
@@ -121,52 +141,94 @@ class LearnerService:
         False means: the replay service expects another version than the next one here.
         """
         experience = Experience(self._config, self._spec)
-        while True:
-            self._progress.clear()
-            request = ChangesRequest(learner=self._name, version=state.version + 1)
+        useless = threading.Event()
+        with ThreadPoolExecutor(2, f"learner {self._name}") as pool:
             try:
-                changes = self._asker.ask(keys.CHANGES, request, ChangesReply, LARGEST)
-                if changes.ended:
-                    return True
-                if changes.wait is not None:
-                    self._progress.wait(changes.wait.retry_after_s)
-                    continue
-                self._catch_up(experience, changes.ids)
-                began = time.monotonic()
-                train(state, experience.by_rank(list(changes.ids)), self._config)
-                self._deliver(state, time.monotonic() - began)
+                fetched = pool.submit(self._fetch, state.version + 1, experience.ids(), useless)
+                delivered: Future[None] | None = None
+                while (buffer := self._result(fetched, delivered)) is not None:
+                    self._take(experience, buffer)
+                    following = state.version + 2
+                    fetched = pool.submit(self._fetch, following, experience.ids(), useless)
+                    began = time.monotonic()
+                    train(state, experience.by_rank(list(buffer.ids)), self._config)
+                    message = self._message(state, time.monotonic() - began)
+                    if delivered is not None:
+                        delivered.result()
+                    delivered = pool.submit(self._deliver, message)
             except Refused as refusal:
                 if refusal.code not in ("rewind", "unknown_episode"):
                     raise
                 log.warning("learner %s starts over: %s", self._name, refusal)
                 return False
+            finally:
+                useless.set()
+                self._progress.set()
+            return True
 
-    def _catch_up(self, experience: Experience, ids: tuple[int, ...]) -> None:
+    def _result(
+        self, fetched: "Future[Buffer | None]", delivered: "Future[None] | None"
+    ) -> Buffer | None:
+        """Return what was fetched, unless the delivery before it fails."""
+        pending: list[Future[Any]] = [fetched] if delivered is None else [fetched, delivered]
+        while not fetched.done() and not self._stop.is_set():
+            wait(pending, _LOOK_S, FIRST_EXCEPTION)
+            if delivered is not None and delivered.done():
+                delivered.result()
+                pending = [fetched]
+        return fetched.result()
+
+    def _take(self, experience: Experience, buffer: Buffer) -> None:
         """Make ``experience`` hold exactly the episodes of the buffer."""
-        held = experience.ids()
-        for gone in held - set(ids):
+        for gone in experience.ids() - set(buffer.ids):
             experience.remove(gone)
-        missing = [i for i in ids if i not in held]
-        while missing:
-            request = EpisodesRequest(ids=tuple(missing[:_ASK_FOR]))
-            page = self._asker.ask(keys.EPISODES, request, EpisodesReply, LARGEST)
-            for body in page.episodes:
-                episode = decode_episode(decode(body, EpisodeMessage, LARGEST))
-                experience.add(episode)
-            missing = missing[len(page.episodes) :]
+        for episode in buffer.new:
+            experience.add(episode)
 
-    def _deliver(self, state: TrainingState, train_s: float) -> None:
-        weights = encode_weights(state.weights)
-        message = VersionMessage(
+    def _message(self, state: TrainingState, train_s: float) -> VersionMessage:
+        return VersionMessage(
             learner=self._name,
             version=state.version,
-            weights=weights,
+            weights=encode_weights(state.weights),
             optimizer=encode_optimizer(state),
             loss=state.loss,
             train_s=train_s,
         )
+
+    # In threads beside the training.
+
+    def _fetch(self, version: int, held: set[int], useless: threading.Event) -> Buffer | None:
+        """Return the buffer that a version is trained on, once it is there; None: never.
+
+        Args:
+            version: to be trained.
+            held: ids of episodes that need not be fetched.
+            useless: nobody waits for it any more.
+        """
+        while not useless.is_set():
+            self._progress.clear()
+            request = ChangesRequest(learner=self._name, version=version)
+            changes = self._asker.ask(keys.CHANGES, request, ChangesReply, LARGEST)
+            if changes.ended:
+                break
+            if changes.wait is None:
+                return Buffer(
+                    changes.ids, self._episodes([i for i in changes.ids if i not in held])
+                )
+            self._progress.wait(changes.wait.retry_after_s)
+        return None
+
+    def _episodes(self, missing: list[int]) -> list[Episode]:
+        episodes: list[Episode] = []
+        while left := missing[len(episodes) :]:
+            request = EpisodesRequest(ids=tuple(left[:_ASK_FOR]))
+            page = self._asker.ask(keys.EPISODES, request, EpisodesReply, LARGEST)
+            episodes += [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in page.episodes]
+        return episodes
+
+    def _deliver(self, message: VersionMessage) -> None:
         self._asker.ask(keys.VERSION, message, VersionReply)
         # DROP, Zenoh's default: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
-        announcement = encode(Weights(version=state.version, weights=weights))
+        announcement = encode(Weights(version=message.version, weights=message.weights))
         self._session.put(keys.key(self._hello.run_id, keys.NEW_WEIGHTS), announcement)

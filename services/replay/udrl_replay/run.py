@@ -478,8 +478,12 @@ class Run:
     def awaits_version(self) -> int | None:
         """Return the version that can be trained now, or None: its buffer is not there yet."""
         version = self.progress.latest_version + 1
-        wanted = self.progress.state == "running" or version <= self.progress.iteration
-        return version if wanted and version <= self.progress.iteration + 1 else None
+        return version if self.is_trainable(version) else None
+
+    def is_trainable(self, version: int) -> bool:
+        """Whether the buffer that a version is trained on is there, and the run needs it."""
+        needed = self.progress.state == "running" or version <= self.progress.iteration
+        return needed and version <= self.progress.iteration + 1
 
     def add_version(self, version: Version, train_s: float) -> Literal["accepted", "duplicate"]:
         """Take in a weights version once.

@@ -371,11 +371,14 @@ class ReplayService:
         if run.progress.state in ("ended", "failed"):
             return ChangesReply(ended=True)
         following = run.progress.latest_version + 1
-        if request.version != following:
+        if request.version < following:
             raise Refused(
                 "rewind", f"version {following} is next, not {request.version}; ask for the state"
             )
-        if run.awaits_version() is None:
+        if not run.is_trainable(request.version):
+            if request.version > following:  # it still trains or delivers the version before
+                retry_after_s = run.dealer.retry_after_s()
+                return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
             here = [n for r, n in self._here if r == "actor"]
             why = f"iteration {request.version - 1}" + ("" if here else ": no actor is here")
             if run.progress.state == "closing":
