@@ -5,7 +5,12 @@ on, evaluation steps counted too. Then its parts are timed alone, on the same ma
 environment step (replaying actions that the run recorded), a row of batched inference, an update.
 From these::
 
-    limit = cores / (step + inference + update x updates per env step)
+    limit = min(
+        cores / (step + inference + update x updates per env step),
+        1 / (update x updates per env step),
+    )
+
+The second is the learner's: version v needs version v-1, so that one core bounds it.
 
 The same parts are then timed in one process per core at once: cores may share caches, memory, clock
 or execution units, and then all of them together do less than so many times one.
@@ -30,7 +35,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 import torch
-from torch.nn import functional
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
@@ -45,6 +49,7 @@ from udrl.memory import FrameStack
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained, use_one_thread
+from udrl.value import value_loss
 from udrl_launch.agents import load_agent
 from udrl_launch.inspection import status_of
 from udrl_launch.process import keep_freed_memory
@@ -133,7 +138,8 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     per_step = config.n_updates_per_iter * window.iterations / window.steps
 
     def limit(parts: Parts, per_step: float = per_step, cores: int = cores) -> float:
-        return cores / (parts.step + parts.inference + parts.update * per_step)
+        training = parts.update * per_step
+        return min(cores / (parts.step + parts.inference + training), 1 / training)
 
     parts, busy = _time_parts(run_dir, 1), _time_parts(run_dir, cores)
     system = window.steps / window.seconds
@@ -277,18 +283,25 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
 
 
 def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
-    """Return the seconds of forward, backward and step on tensors that are in memory already."""
+    """Return the seconds of forward, backward and step on tensors that are in memory already.
+
+    With a value function, of its update too.
+    """
     state, n = untrained(config, spec), config.batch_size
     seen = spec.observation_space
     shape = FrameStack(seen, config).shape
     observation = (torch.rand(n, *shape) * 255).to(getattr(torch, seen.dtype.name))
     command, action = torch.rand(n, 2), torch.randint(spec.action_space.n, (n,))
 
-    def update() -> None:
-        loss = functional.cross_entropy(state.behavior(observation, command), action)
+    def step(loss: torch.Tensor) -> None:
         state.optimizer.zero_grad()
         loss.backward()
         state.optimizer.step()
+
+    def update() -> None:
+        if state.behavior.value is not None:
+            step(value_loss(state.behavior.value(observation), command[:, 0]))
+        step(state.behavior.loss(state.behavior.obey(observation, command), action))
 
     return _seconds(update, 100)
 

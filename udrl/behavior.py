@@ -54,8 +54,11 @@ class BehaviorFunction(nn.Module):
         """
         if self.value is not None:
             with torch.no_grad():
-                expected = self.value(observation)
-            command = relative(command, expected)
+                command = relative(command, self.value(observation))
+        return self.obey(observation, command)
+
+    def obey(self, observation: Tensor, command: Tensor) -> Tensor:
+        """Return the same for commands that are relative already, where there is a value."""
         features: Tensor = self.encoder(observation)
         features = features * torch.sigmoid(apply(self.command, command.to(features.dtype)))
         for layer in self.layers:

@@ -143,6 +143,8 @@ class RankedExperience:
 
     Attributes:
         lengths: of the episodes, by rank.
+        expected: (V, D) at every step, in the order of :meth:`observations`, scaled, float32
+            [steps, 2] (:mod:`udrl.value`); None: unknown.
         observation_shape: of one, as the networks see it.
         observation_dtype: likewise.
     """
@@ -151,6 +153,7 @@ class RankedExperience:
         self._experience = experience
         self._slots = slots
         self._labels: Numbers | None = None
+        self.expected: npt.NDArray[np.float32] | None = None
         self.observation_shape = experience._memory.shape
         self.observation_dtype: np.dtype[Any] = experience._observations.dtype
         self.lengths: Indices = experience._lengths[slots]
@@ -162,7 +165,7 @@ class RankedExperience:
         slot = self._slots[segments.rank]
         row = self._row(slot, segments.t1)
         if self._labels is not None:
-            desired_return = self._labels[self._first_step[segments.rank] + segments.t1]
+            desired_return = self._labels[self._step(segments)]
         else:
             earned_at_t2 = held._returns[slot]
             inner = np.flatnonzero(segments.t2 < held._lengths[slot])
@@ -173,6 +176,15 @@ class RankedExperience:
         command[:, 0], command[:, 1] = desired_return, segments.t2 - segments.t1
         return Examples(self._observed(slot, segments.t1), command, held._actions[row])
 
+    def expected_at(self, segments: Segments) -> npt.NDArray[np.float32] | None:
+        """Return (V, D) of s_t1, float32 [n, 2], if it is known."""
+        return None if self.expected is None else self.expected[self._step(segments)]
+
+    def _step(self, segments: Segments) -> Indices:
+        """Return the number of each t1 in the order of :meth:`observations`."""
+        steps: Indices = self._first_step[segments.rank] + segments.t1
+        return steps
+
     def observations(self, at_once: int = 4096) -> Iterator[Observations]:
         """Yield what the network sees at every step, episode by episode."""
         slot, t = self._all_steps()
@@ -180,7 +192,7 @@ class RankedExperience:
             part = slice(first, first + at_once)
             yield self._observed(slot[part], t[part])
 
-    def label(self, expected: Numbers, lam: float) -> None:
+    def label(self, expected: npt.NDArray[np.floating[Any]], lam: float) -> None:
         """Make lambda-returns the desired returns of all trailing segments.
 
         G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
@@ -188,7 +200,7 @@ class RankedExperience:
         kept).
 
         Args:
-            expected: V at every step, in the order of :meth:`observations`, float64.
+            expected: V at every step, in the order of :meth:`observations`, float32.
             lam: lambda, in [0, 1].
         """
         held, slots, first = self._experience, self._slots, self._first_step

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -17,7 +18,7 @@ from udrl.graph import Weights
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
-from udrl.value import ValueFunction, value_loss
+from udrl.value import ValueFunction, relative, value_loss
 
 #: Bytes of observations that are gathered at once for the next updates.
 _GATHERED_BYTES = 16 << 20
@@ -97,7 +98,7 @@ def _update(
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
     for observation, command, action in batches.gather(segments):
-        loss = state.behavior.loss(state.behavior(observation, command), action)
+        loss = state.behavior.loss(state.behavior.obey(observation, command), action)
         _step(state.optimizer, parameters, loss, one)
         losses += loss.detach()
     return float(losses)
@@ -111,24 +112,32 @@ def _learn_value(
     config: Config,
     batches: "_Batches",
 ) -> None:
-    """Bring V to the lambda-returns, one update for each row, then label the examples anew."""
+    """Bring V to the lambda-returns, one update for each row, then label the examples anew.
+
+    V and D do not change any more in this version, so the examples carry them from here on.
+    """
     parameters = list(state.behavior.parameters())
     one = torch.ones((), device=config.device)
+    experience.expected = None
     _label(value, experience, config)
     for observation, command, _ in batches.gather(segments):
         loss = value_loss(value(observation), command[:, 0])
         _step(state.optimizer, parameters, loss, one)
-    _label(value, experience, config)
+    experience.expected = _label(value, experience, config)
 
 
-def _label(value: ValueFunction, experience: RankedExperience, config: Config) -> None:
-    """Label all steps of the buffer with lambda-returns."""
+def _label(
+    value: ValueFunction, experience: RankedExperience, config: Config
+) -> npt.NDArray[np.float32]:
+    """Label all steps of the buffer with lambda-returns; return V and D at each."""
     with torch.inference_mode():
-        expected = [
-            value(torch.from_numpy(part).clone().to(config.device))[:, 0].cpu().numpy()
+        parts = [
+            value(torch.from_numpy(part).clone().to(config.device)).cpu().numpy()
             for part in experience.observations()
         ]
-    experience.label(np.concatenate(expected) / config.return_scale, config.return_lambda)
+    expected: npt.NDArray[np.float32] = np.concatenate(parts)
+    experience.label(expected[:, 0] / config.return_scale, config.return_lambda)
+    return expected
 
 
 def _step(
@@ -174,15 +183,22 @@ class _Batches:
         self._scales = np.array(ReturnInTime(config).scales)
 
     def gather(self, segments: Segments) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield observations, scaled commands and actions of each update, where the network is."""
+        """Yield observations, scaled commands and actions of each update, where the network is.
+
+        Commands are relative to what is expected, once that is known.
+        """
         n_updates = len(segments.rank)
         for first in range(0, n_updates, self._at_once):
             part = Segments(*(s[first : first + self._at_once] for s in segments))
             n = len(part.rank)
             observation, command, action = (t[:n].numpy() for t in self._tensors)
-            examples = self._experience.examples(Segments(*(s.reshape(-1) for s in part)))
+            flat = Segments(*(s.reshape(-1) for s in part))
+            examples = self._experience.examples(flat)
             observation[:] = examples.observation.reshape(observation.shape)
             command[:] = (examples.command * self._scales).reshape(command.shape)
+            if (expected := self._experience.expected_at(flat)) is not None:
+                commands = self._tensors[1][:n]
+                commands[:] = relative(commands, torch.from_numpy(expected).view(commands.shape))
             action[:] = examples.action.reshape(action.shape)
             for k in range(n):
                 observed, commanded, acted = (t[k].to(self._device) for t in self._tensors)

@@ -57,11 +57,11 @@ def value_loss(expected: Tensor, label: Tensor) -> Tensor:
 
 
 def relative(command: Tensor, expected: Tensor) -> Tensor:
-    """Return scaled commands, [batch, 2], with the desired return relative to what is expected.
+    """Return scaled commands, [..., 2], with the desired return relative to what is expected.
 
     Args:
-        command: (desired return, desired horizon), each scaled, float32 [batch, 2].
-        expected: (V(s), D(s)), float32 [batch, 2].
+        command: (desired return, desired horizon), each scaled, float32 [..., 2].
+        expected: (V(s), D(s)), float32 [..., 2].
     """
-    above = (command[:, 0] - expected[:, 0]) / expected[:, 1]
-    return torch.stack([above.clamp(-DEVIATIONS, DEVIATIONS), command[:, 1]], dim=1)
+    above = (command[..., 0] - expected[..., 0]) / expected[..., 1]
+    return torch.stack([above.clamp(-DEVIATIONS, DEVIATIONS), command[..., 1]], dim=-1)
