@@ -110,12 +110,12 @@ def test_the_training_class_sees_a_change_of_the_last_bit(
     config = settings()
     expected = training_class(config, LANDER)
     assert training_class(config, LANDER) == expected
-    forward = BehaviorFunction.forward
+    obey = BehaviorFunction.obey
 
     def rounds_otherwise(self: BehaviorFunction, s: Tensor, c: Tensor) -> Tensor:
-        return forward(self, s, c) * (1 + 2**-23)
+        return obey(self, s, c) * (1 + 2**-23)
 
-    monkeypatch.setattr(BehaviorFunction, "forward", rounds_otherwise)
+    monkeypatch.setattr(BehaviorFunction, "obey", rounds_otherwise)
     assert training_class(config, LANDER) != expected
 
 
