@@ -20,7 +20,7 @@ import zenoh
 from udrl.commands import Command
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, encode, encode_array
@@ -29,7 +29,6 @@ from udrl_proto.messages import (
     CommandsRequest,
     EpisodeMessage,
     EpisodeReply,
-    JoinReply,
     JoinRequest,
     Message,
     Weights,
@@ -102,7 +101,7 @@ class Fleet:
             for i in range(self._load.actors)
         ]
         for actor in actors:
-            Asker(actor.session, RUN, actor.name).ask(keys.JOIN, self._join(actor), JoinReply)
+            Asker(actor.session, RUN, actor.name).ask(verbs.JOIN, self._join(actor))
         for actor in actors:
             self._next(actor)
         warm = time.monotonic() + self._load.seconds / 4
@@ -163,9 +162,11 @@ class Fleet:
             command_id = actor.commands[0].id
             made_up = self._episodes[command_id % _VARIETY]
             message = msgspec.structs.replace(made_up, actor=actor.name, command_id=command_id)
-            self._send(actor, keys.EPISODE, message)
+            self._send(actor, verbs.EPISODE.name, message)
         else:
-            self._send(actor, keys.COMMANDS, CommandsRequest(actor=actor.name, wanted=_WANTED))
+            self._send(
+                actor, verbs.COMMANDS.name, CommandsRequest(actor=actor.name, wanted=_WANTED)
+            )
 
     def _send(self, actor: Actor, verb: str, message: Message) -> None:
         actor.verb, actor.payload = verb, encode(message)
@@ -203,7 +204,7 @@ class Fleet:
         actor.query += 1
         actor.answered = True
         took = time.monotonic() - actor.asked_at
-        if actor.verb == keys.EPISODE:
+        if actor.verb == verbs.EPISODE.name:
             decode(answer, EpisodeReply)
             self._episode_s.append(took)
             actor.commands.popleft()

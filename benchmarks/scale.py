@@ -37,18 +37,16 @@ from udrl.spaces import Vector
 from udrl.training import untrained, use_one_thread
 from udrl.weights import encode_weights
 from udrl_launch.training import free_port
-from udrl_proto import PROTOCOL, keys
+from udrl_proto import PROTOCOL, keys, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
-from udrl_proto.codec import LARGEST, encode
+from udrl_proto.codec import encode
 from udrl_proto.messages import (
-    ChangesReply,
     ChangesRequest,
     Hello,
     Status,
     StatusRequest,
     VersionMessage,
-    VersionReply,
     Weights,
 )
 from udrl_replay.creation import write_config
@@ -93,7 +91,7 @@ def deliver_versions(
         version = 1
         while not stop.is_set():
             request = ChangesRequest(learner="scale", version=version)
-            changes = asker.ask(keys.CHANGES, request, ChangesReply, LARGEST)
+            changes = asker.ask(verbs.CHANGES, request)
             if changes.wait is not None:
                 stop.wait(min(changes.wait.retry_after_s, 0.05))
                 continue
@@ -101,7 +99,7 @@ def deliver_versions(
                 learner="scale", version=version, weights=weights, optimizer=optimizer, loss=1.0,
                 train_s=0.0,
             )  # fmt: skip
-            asker.ask(keys.VERSION, message, VersionReply)
+            asker.ask(verbs.VERSION, message)
             announced.append(Announced(version, time.monotonic()))
             news = encode(Weights(version=version, weights=weights))
             session.put(keys.key(RUN, keys.NEW_WEIGHTS), news)
@@ -201,10 +199,10 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
             msgspec.json.encode(load).decode(), str(report),
         ])  # fmt: skip
         try:
-            status = asker.ask(keys.STATUS, StatusRequest(), Status)
+            status = asker.ask(verbs.STATUS, StatusRequest())
             deadline = time.monotonic() + 60.0 + 3 * options.seconds
             while fleet.poll() is None and time.monotonic() < deadline:
-                status = asker.ask(keys.STATUS, StatusRequest(), Status)
+                status = asker.ask(verbs.STATUS, StatusRequest())
                 samples.append(_sample(pid, status))
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     fleet.wait(1.0)

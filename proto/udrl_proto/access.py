@@ -10,21 +10,19 @@ what they ask.
 
 from typing import Any, NamedTuple
 
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 
 
 class Rights(NamedTuple):
-    """What a role may do, besides what it does to itself.
+    """What a role may do besides asking (:mod:`udrl_proto.verbs`).
 
     Attributes:
-        asks: verbs that it may send to the replay service.
         hears: publications that it may receive.
         says: publications that it may send.
         joins: whether it may say with a liveliness token that it is here, and ask who else of its
             role is.
     """
 
-    asks: tuple[str, ...]
     hears: tuple[str, ...] = ()
     says: tuple[str, ...] = ()
     joins: bool = False
@@ -36,17 +34,15 @@ REPLAY = "replay"
 #: What those who connect may do, by role.
 RIGHTS = {
     "learner": Rights(
-        asks=(keys.HELLO, keys.JOIN, keys.CHANGES, keys.EPISODES, keys.VERSION, keys.STATE),
         hears=(keys.PROGRESS,),
         says=(keys.NEW_WEIGHTS,),
         joins=True,
     ),
     "actor": Rights(
-        asks=(keys.HELLO, keys.JOIN, keys.COMMANDS, keys.EPISODE, keys.FAILURE, keys.WEIGHTS),
         hears=(keys.NEW_WEIGHTS,),
         joins=True,
     ),
-    "observer": Rights(asks=(keys.HELLO, keys.STATUS, keys.WEIGHTS, keys.HISTORY, keys.CONTENTS)),
+    "observer": Rights(),
 }
 
 #: Every role that there are certificates for.
@@ -94,13 +90,13 @@ def access_control(*, hosted: bool = True) -> dict[str, Any]:
 
 def _question(verb: str) -> str:
     # A run is looked for whatever protocol it speaks, so that the difference can be told.
-    return keys.every_hello() if verb == keys.HELLO else keys.key("*", verb)
+    return keys.every_hello() if verb == verbs.HELLO.name else keys.key("*", verb)
 
 
 def _of_client(role: str) -> dict[Rule, list[str]]:
     """Return what the router lets in from a role, and what it lets out to it."""
     rights = RIGHTS[role]
-    asks = [_question(verb) for verb in rights.asks]
+    asks = [_question(verb) for verb in verbs.asked_by(role)]
     hears = [keys.key("*", name) for name in rights.hears]
     says = [keys.key("*", name) for name in rights.says]
     alive = [keys.alive("*", role, "*")] if rights.joins else []
@@ -118,7 +114,7 @@ def _of_client(role: str) -> dict[Rule, list[str]]:
 
 def _of_replay() -> dict[Rule, list[str]]:
     """Return the counterpart: what a router lets in from the replay service, and out to it."""
-    answers = [_question(verb) for verb in keys.VERBS]
+    answers = [_question(verb.name) for verb in verbs.VERBS]
     says = [keys.key("*", keys.PROGRESS)]
     alive = [keys.alive("*", role, "*") for role, rights in RIGHTS.items() if rights.joins]
     watches = [keys.alive("*", "*", "*")]

@@ -5,8 +5,9 @@ thread that owns the run. A query that finds the inbox full gets no answer and i
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import zenoh
@@ -16,8 +17,11 @@ from udrl_proto import keys
 from udrl_proto.codec import decode, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
+from udrl_proto.verbs import VERBS, Verb
 
 log = logging.getLogger("udrl")
+
+AnyVerb = Verb[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -25,11 +29,11 @@ class Question:
     """A query that has been decoded and waits for its answer.
 
     Attributes:
-        verb: from :mod:`udrl_proto.keys`.
+        verb: what is asked.
         request: its message, or the error that kept it from being one.
     """
 
-    verb: str
+    verb: AnyVerb
     request: Message | InvalidData
     _query: zenoh.Query
     _key: str
@@ -46,51 +50,48 @@ class Question:
                     self._query.reply(self._key, encode(reply))
         except zenoh.ZError as error:
             # Who asked is gone; it will ask again when it is back.
-            log.debug("answer to %s could not be sent: %s", self.verb, error)
-
-
-@dataclass(frozen=True)
-class Verb:
-    """How a verb's requests are read.
-
-    Attributes:
-        kind: the message.
-        limit: the most bytes it may have.
-        bulk: its questions are many and large, and wait for all others.
-        prepare: turns the message into what the run wants, on the thread that received it.
-    """
-
-    kind: type[Message]
-    limit: int
-    bulk: bool = False
-    prepare: Callable[[Any], Any] = lambda request: request
+            log.debug("answer to %s could not be sent: %s", self.verb.name, error)
 
 
 def serve(
-    session: zenoh.Session, run_id: str, verbs: Mapping[str, Verb], inbox: Inbox[Any]
+    session: zenoh.Session,
+    run_id: str,
+    inbox: Inbox[Any],
+    verbs: Iterable[AnyVerb] = VERBS,
+    prepare: Mapping[str, Callable[[Any], Any]] = MappingProxyType({}),
 ) -> list[zenoh.Queryable[None]]:
-    """Declare a queryable for every verb; questions go to ``inbox``. Undeclare them to stop."""
+    """Declare a queryable for each verb; undeclare them to stop.
 
-    def receiver(name: str, verb: Verb) -> Callable[[zenoh.Query], None]:
-        key = keys.key(run_id, name)
+    Args:
+        session: where.
+        run_id: whose.
+        inbox: takes the questions.
+        verbs: what is answered.
+        prepare: by the verb's name, what turns a message into what the run wants, on the thread
+            that received it.
+    """
+
+    def receiver(verb: AnyVerb) -> Callable[[zenoh.Query], None]:
+        key = keys.key(run_id, verb.name)
+        prepared = prepare.get(verb.name, lambda request: request)
 
         def receive(query: zenoh.Query) -> None:
             request: Any
             payload = query.payload
             data = b"" if payload is None else payload.to_bytes()
-            if not inbox.has_room(len(data), bulk=verb.bulk):  # before the work of reading it
+            if not inbox.has_room(len(data), bulk=verb.is_bulk):  # before the work of reading it
                 query.drop()
                 return
             try:
-                request = verb.prepare(decode(data, verb.kind, verb.limit))
+                request = prepared(decode(data, verb.request, verb.limit))
             except InvalidData as error:
                 request = error
-            if not inbox.put(Question(name, request, query, key), len(data), bulk=verb.bulk):
+            if not inbox.put(Question(verb, request, query, key), len(data), bulk=verb.is_bulk):
                 query.drop()
 
         return receive
 
     return [
-        session.declare_queryable(keys.key(run_id, name), receiver(name, verb), complete=True)
-        for name, verb in verbs.items()
+        session.declare_queryable(keys.key(run_id, verb.name), receiver(verb), complete=True)
+        for verb in verbs
     ]

@@ -7,18 +7,16 @@ harm. Nothing waits without a deadline, and a wait that gets long is logged: who
 import logging
 import threading
 import time
-from typing import TypeVar
 
 import zenoh
 
 from udrl.errors import Interrupted, Refused, Unreachable
 from udrl_proto import keys
-from udrl_proto.codec import SMALL, decode, encode
-from udrl_proto.messages import Message, Problem
+from udrl_proto.codec import decode, encode
+from udrl_proto.messages import Problem
+from udrl_proto.verbs import Reply, Request, Verb
 
 log = logging.getLogger("udrl")
-
-Reply = TypeVar("Reply", bound=Message)
 
 #: Seconds that one query may take before it is asked again, at first and at last: twice as long
 #: each time, so that what answers slowly is not given ever more to do.
@@ -52,16 +50,12 @@ class Asker:
         self._stop = stop or threading.Event()
         self._patience_s = patience_s
 
-    def ask(
-        self, verb: str, request: Message | bytes, kind: type[Reply], limit: int = SMALL
-    ) -> Reply:
+    def ask(self, verb: Verb[Request, Reply], request: Request | bytes) -> Reply:
         """Return the answer to a request.
 
         Args:
-            verb: from :mod:`udrl_proto.keys`.
-            request: a message, encoded or not.
-            kind: the reply that is expected.
-            limit: the most bytes that the reply may have.
+            verb: what is asked.
+            request: its message, encoded or not.
 
         Raises:
             Refused: the answer is no.
@@ -76,7 +70,7 @@ class Asker:
         while not self._stop.is_set():
             asked = time.monotonic()
             replies = self._session.get(
-                keys.key(self._run_id, verb),
+                keys.key(self._run_id, verb.name),
                 payload=payload,
                 timeout=attempt_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -84,7 +78,7 @@ class Asker:
             )
             for reply in replies:
                 if reply.ok is not None:
-                    return decode(reply.ok.payload.to_bytes(), kind, limit)
+                    return decode(reply.ok.payload.to_bytes(), verb.reply, verb.reply_limit)
                 if reply.err is not None and (problem := _problem(reply.err)) is not None:
                     raise Refused(problem.code, problem.message)
             now = time.monotonic()
@@ -93,18 +87,18 @@ class Asker:
             waited = now - began
             if waited >= self._patience_s:
                 raise Unreachable(
-                    f"{self._who} asked the replay service of {self._run_id} for {verb!r} and got "
-                    f"no answer in {waited:.0f} s; is it running and reachable?"
+                    f"{self._who} asked the replay service of {self._run_id} for {verb.name!r} and "
+                    f"got no answer in {waited:.0f} s; is it running and reachable?"
                 )
             if waited >= warn_at:
                 log.warning(
                     "%s has been waiting %.0f s for the replay service to answer %r",
-                    self._who, waited, verb,
+                    self._who, waited, verb.name,
                 )  # fmt: skip
                 warn_at *= 2
             self._stop.wait(pause)
             pause = min(2 * pause, 1.0)
-        raise Interrupted(f"{self._who} was stopped while asking for {verb!r}")
+        raise Interrupted(f"{self._who} was stopped while asking for {verb.name!r}")
 
 
 def _problem(error: zenoh.ReplyError) -> Problem | None:

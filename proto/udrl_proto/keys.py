@@ -4,36 +4,6 @@ import re
 
 from udrl_proto import PROTOCOL
 
-#: Queries to the replay service.
-HELLO = "hello"
-JOIN = "join"
-COMMANDS = "commands"
-EPISODE = "episode"
-FAILURE = "failure"
-CHANGES = "changes"
-EPISODES = "episodes"
-VERSION = "version"
-STATE = "state"
-WEIGHTS = "weights"
-STATUS = "status"
-HISTORY = "history"
-CONTENTS = "contents"
-VERBS = (
-    HELLO,
-    JOIN,
-    COMMANDS,
-    EPISODE,
-    FAILURE,
-    CHANGES,
-    EPISODES,
-    VERSION,
-    STATE,
-    WEIGHTS,
-    STATUS,
-    HISTORY,
-    CONTENTS,
-)
-
 #: Publications; each may be lost, and nothing depends on one.
 NEW_WEIGHTS = "news/weights"
 PROGRESS = "news/progress"
@@ -53,7 +23,7 @@ def alive(run_id: str, role: str, name: str) -> str:
 
 def every_hello() -> str:
     """Return the expression that finds every run on a router, whatever protocol it speaks."""
-    return f"udrl/*/*/{HELLO}"
+    return "udrl/*/*/hello"
 
 
 def parse(expression: str) -> tuple[str, str, str]:

@@ -75,16 +75,15 @@ def by_type(inputs: int, seed: int) -> None:
     import hypothesis
     from hypothesis import strategies as st
 
-    from tests.fuzz.world import Target, honest_questions, read_as_everything
+    from tests.fuzz.world import NAMES, Target, honest_questions, read_as_everything
     from tests.proto.strategies import messages
-    from udrl_proto import keys
+    from udrl_proto import verbs
     from udrl_proto.codec import encode
 
     target = Target(honest_questions())
-    verbs = target.kinds()
-    drawn = st.sampled_from(keys.VERBS).flatmap(
-        lambda verb: messages(verbs[verb]).map(
-            lambda message: bytes([keys.VERBS.index(verb)]) + encode(message)
+    drawn = st.sampled_from(NAMES).flatmap(
+        lambda verb: messages(verbs.BY_NAME[verb].request).map(
+            lambda message: bytes([NAMES.index(verb)]) + encode(message)
         )
     )
     known = st.sampled_from(target.seeds())

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 import udrl_replay.service
 from tests.fuzz.world import Target, World, honest_questions
-from udrl_proto import keys
+from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import JoinRequest, Problem
 
@@ -65,7 +65,7 @@ def target(questions: list[tuple[str, bytes]]) -> Iterator[Target]:
 def test_honest_questions_reach_every_verb_and_are_answered(
     questions: list[tuple[str, bytes]],
 ) -> None:
-    assert {verb for verb, _ in questions} == set(keys.VERBS)
+    assert {verb for verb, _ in questions} == set(verbs.BY_NAME)
     world = World()
     for verb, data in questions:
         answer = world.knock(verb, data)
@@ -78,10 +78,10 @@ def test_actors_are_bounded(
     questions: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(udrl_replay.service, "MOST_ACTORS", 2)
-    join = decode(next(data for verb, data in questions if verb == keys.JOIN), JoinRequest)
+    join = decode(next(data for verb, data in questions if verb == verbs.JOIN.name), JoinRequest)
     world = World()
     codes = [
-        getattr(world.knock(keys.JOIN, encode(replace(join, id=name))), "code", None)
+        getattr(world.knock(verbs.JOIN.name, encode(replace(join, id=name))), "code", None)
         for name in ("a", "b", "c")
     ]
     world.close()

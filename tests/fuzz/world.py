@@ -25,38 +25,26 @@ from udrl.inference import ActingFunction
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights
-from udrl_proto import keys
-from udrl_proto.answering import serve
+from udrl_proto import keys, verbs
 from udrl_proto.codec import decode, decode_episode, encode, encode_episode
 from udrl_proto.messages import (
-    Acknowledged,
     ChangesReply,
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
-    Contents,
     ContentsRequest,
     EpisodeMessage,
-    EpisodeReply,
-    EpisodesReply,
     EpisodesRequest,
     FailureMessage,
-    Hello,
     HelloRequest,
-    History,
     HistoryRequest,
-    JoinReply,
     JoinRequest,
     Message,
     Problem,
     Progress,
-    StateReply,
     StateRequest,
-    Status,
     StatusRequest,
     VersionMessage,
-    VersionReply,
-    Weights,
     WeightsRequest,
 )
 from udrl_replay.creation import create
@@ -68,21 +56,7 @@ CONFIG = Config(
     eval_episodes=2, segments="all",
 )  # fmt: skip
 
-REPLIES: dict[str, type[Message]] = {
-    keys.HELLO: Hello,
-    keys.JOIN: JoinReply,
-    keys.COMMANDS: CommandsReply,
-    keys.EPISODE: EpisodeReply,
-    keys.FAILURE: Acknowledged,
-    keys.CHANGES: ChangesReply,
-    keys.EPISODES: EpisodesReply,
-    keys.VERSION: VersionReply,
-    keys.STATE: StateReply,
-    keys.WEIGHTS: Weights,
-    keys.STATUS: Status,
-    keys.HISTORY: History,
-    keys.CONTENTS: Contents,
-}
+NAMES = list(verbs.BY_NAME)
 
 #: Where a file is synced at once.
 _MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
@@ -146,8 +120,7 @@ class World:
         budget = Budget(max_env_steps=2**53)
         self.service = ReplayService(session, self._store, budget, run_dir, audit=0.2)
         self.spec = self.service.run.hello.environment
-        verbs, inbox = self.service._verbs(), self.service._inbox
-        serve(session, self.service.run.hello.run_id, verbs, inbox)
+        self.service._serve()
 
     def close(self) -> None:
         """Forget the run."""
@@ -172,7 +145,7 @@ class World:
             return decode(query.problems[0], Problem)
         if self.service.run.progress.accepted > accepted:
             self._check_accepted(data)
-        return decode(query.replies[0], REPLIES[verb], 1 << 30)
+        return decode(query.replies[0], verbs.BY_NAME[verb].reply, 1 << 30)
 
     def _check_ledgers(self) -> None:
         progress, outstanding = self.service.run.progress, self.service.run.dealer.outstanding
@@ -217,7 +190,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
 
     def act() -> None:
         request = CommandsRequest(actor="actor-1", wanted=4)
-        commands = cast(CommandsReply, ask(keys.COMMANDS, request)).commands
+        commands = cast(CommandsReply, ask(verbs.COMMANDS.name, request)).commands
         by_version: dict[int, list[Command]] = {}
         for command in commands:
             by_version.setdefault(command.weights_version, []).append(command)
@@ -225,11 +198,11 @@ def honest_questions() -> list[tuple[str, bytes]]:
             weights = states[version].weights
             behavior = ActingFunction(graph, weights) if version else None
             for episode in generate_episodes(generator, together, behavior):
-                ask(keys.EPISODE, encode_episode(episode, "actor-1"))
+                ask(verbs.EPISODE.name, encode_episode(episode, "actor-1"))
 
-    ask(keys.HELLO, HelloRequest())
+    ask(verbs.HELLO.name, HelloRequest())
     ask(
-        keys.JOIN,
+        verbs.JOIN.name,
         JoinRequest(
             role="actor",
             id="actor-1",
@@ -241,28 +214,29 @@ def honest_questions() -> list[tuple[str, bytes]]:
             environment=world.spec,
         ),
     )
-    ask(keys.JOIN, JoinRequest(role="learner", id="learner-1", host="h", pid=1, software="0",
+    ask(verbs.JOIN.name, JoinRequest(role="learner", id="learner-1", host="h", pid=1, software="0",
                                numerics_class="c"))  # fmt: skip
     act()
     for version in (1, 2):
         ids = cast(
-            ChangesReply, ask(keys.CHANGES, ChangesRequest(learner="learner-1", version=version))
+            ChangesReply,
+            ask(verbs.CHANGES.name, ChangesRequest(learner="learner-1", version=version)),
         ).ids
-        ask(keys.EPISODES, EpisodesRequest(ids=ids))
-        ask(keys.STATE, StateRequest(learner="learner-1"))
+        ask(verbs.EPISODES.name, EpisodesRequest(ids=ids))
+        ask(verbs.STATE.name, StateRequest(learner="learner-1"))
         states.append(_train(world, version, states))
         state = states[version]
-        ask(keys.VERSION, VersionMessage(
+        ask(verbs.VERSION.name, VersionMessage(
             learner="learner-1", version=version, weights=encode_weights(state.weights),
             optimizer=encode_optimizer(state), loss=state.loss, train_s=0.1))  # fmt: skip
-        ask(keys.WEIGHTS, WeightsRequest(version="latest"))
+        ask(verbs.WEIGHTS.name, WeightsRequest(version="latest"))
         act()
         act()
     held = next(iter(world.service.run.dealer.outstanding))
-    ask(keys.FAILURE, FailureMessage(actor="actor-1", command_id=held, error="no fuel"))
-    ask(keys.STATUS, StatusRequest())
-    ask(keys.HISTORY, HistoryRequest(after=-1))
-    ask(keys.CONTENTS, ContentsRequest())
+    ask(verbs.FAILURE.name, FailureMessage(actor="actor-1", command_id=held, error="no fuel"))
+    ask(verbs.STATUS.name, StatusRequest())
+    ask(verbs.HISTORY.name, HistoryRequest(after=-1))
+    ask(verbs.CONTENTS.name, ContentsRequest())
     generator.close()
     world.close()
     return asked
@@ -290,17 +264,9 @@ class Target:
         self._left = 0
         self.accepted = self.refused = 0
 
-    @staticmethod
-    def kinds() -> dict[str, type[Message]]:
-        """Return the message that each verb expects."""
-        world = World()
-        kinds = {name: verb.kind for name, verb in world.service._verbs().items()}
-        world.close()
-        return kinds
-
     def seeds(self) -> list[bytes]:
         """Return inputs to begin with: a byte for the verb, then the payload."""
-        return [bytes([keys.VERBS.index(verb)]) + data for verb, data in self._questions]
+        return [bytes([NAMES.index(verb)]) + data for verb, data in self._questions]
 
     def __call__(self, data: bytes) -> None:
         """Knock with one input."""
@@ -308,7 +274,7 @@ class Target:
             self._begin()
         self._left -= 1
         assert self._world is not None
-        verb = keys.VERBS[(data[0] if data else 0) % len(keys.VERBS)]
+        verb = NAMES[(data[0] if data else 0) % len(NAMES)]
         answer = self._world.knock(verb, data[1:])
         if isinstance(answer, Problem):
             self.refused += 1

@@ -16,19 +16,16 @@ from udrl_actor.service import ActorService
 from udrl_launch import roles
 from udrl_launch.address import Address
 from udrl_learner.service import LearnerService
-from udrl_proto import keys
+from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode, encode_array
 from udrl_proto.messages import (
     EpisodeMessage,
-    EpisodeReply,
     Hello,
-    JoinReply,
     JoinRequest,
     Status,
     StatusRequest,
     VersionMessage,
-    VersionReply,
 )
 from udrl_proto.session import connect, find_run
 from udrl_replay.creation import create
@@ -55,7 +52,7 @@ class Hosted:
         self.asker = Asker(self.session, self.hello.run_id, "the test", patience_s=10)
 
     def status(self) -> Status:
-        return self.asker.ask(keys.STATUS, StatusRequest(), Status)
+        return self.asker.ask(verbs.STATUS, StatusRequest())
 
     def finish(self) -> Status:
         """Let a good actor and a good learner end the run; return its last status."""
@@ -110,7 +107,7 @@ def test_peer_that_rounds_differently_is_refused(
     first = JoinRequest(
         role=role, id="first", host="here", pid=1, software="0", numerics_class="0123456789abcdef"
     )
-    hosted.asker.ask(keys.JOIN, first, JoinReply)
+    hosted.asker.ask(verbs.JOIN, first)
     with pytest.raises(Refused, match=r"class 0123456789abcdef.*like [0-9a-f]{16}.*inexact") as no:
         service(hosted)
     assert no.value.code == "other_numerics"
@@ -149,11 +146,11 @@ def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
     }
     for reason, message in bad.items():
         with pytest.raises(Refused, match=reason):
-            hosted.asker.ask(keys.EPISODE, message, EpisodeReply)
+            hosted.asker.ask(verbs.EPISODE, message)
     with pytest.raises(Refused, match="not MessagePack"):
-        hosted.asker.ask(keys.EPISODE, b"\xc1 garbage", EpisodeReply)
+        hosted.asker.ask(verbs.EPISODE, b"\xc1 garbage")
     with pytest.raises(Refused, match="at most"):
-        hosted.asker.ask(keys.EPISODE, bytes(1 << 20), EpisodeReply)
+        hosted.asker.ask(verbs.EPISODE, bytes(1 << 20))
     status = hosted.status()
     assert status.episodes.rejected == len(bad) + 2
     assert_conserved(status)
@@ -165,7 +162,7 @@ def test_bad_weights_are_refused(hosted: Hosted) -> None:
         learner="mallory", version=1, weights=b"x", optimizer=b"y", loss=0.0, train_s=0.0
     )
     with pytest.raises(Refused, match="not safetensors"):
-        hosted.asker.ask(keys.VERSION, encode(message), VersionReply)
+        hosted.asker.ask(verbs.VERSION, encode(message))
     assert hosted.status().weights_version == 0
 
 
@@ -181,10 +178,10 @@ def test_different_episode_for_a_command_marks_the_run_inexact(hosted: Hosted) -
         terminated=True,
         truncated=False,
     )
-    assert hosted.asker.ask(keys.EPISODE, first, EpisodeReply).result == "accepted"
-    assert hosted.asker.ask(keys.EPISODE, first, EpisodeReply).result == "duplicate"
+    assert hosted.asker.ask(verbs.EPISODE, first).result == "accepted"
+    assert hosted.asker.ask(verbs.EPISODE, first).result == "duplicate"
     other = msgspec.structs.replace(first, actions=encode_array(np.ones(1, np.uint8)))
-    assert hosted.asker.ask(keys.EPISODE, other, EpisodeReply).result == "duplicate"
+    assert hosted.asker.ask(verbs.EPISODE, other).result == "duplicate"
     status = hosted.status()
     assert not status.exact
     assert "command 3" in status.inexact_reason

@@ -18,7 +18,7 @@ import zenoh
 from tests.markdown import ROOT, section
 from udrl.errors import ConfigError, Unreachable
 from udrl_launch import authority
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 from udrl_proto import session as sessions
 from udrl_proto.access import RIGHTS, ROLES
 from udrl_proto.credentials import load
@@ -50,7 +50,7 @@ class Replay:
         self.hosts_router = hosts_router
         self.asked: list[str] = []
         self.tokens: queue.Queue[str] = queue.Queue()
-        for verb in keys.VERBS:
+        for verb in verbs.BY_NAME:
             key = keys.key("run", verb)
             self.session.declare_queryable(key, partial(self._answer, key), complete=True)
         self.heard = Heard(session, "**")
@@ -152,7 +152,7 @@ def test_without_a_certificate_nobody_gets_in(
         zenoh.open(raw(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
     with pytest.raises(Unreachable, match="nobody answers"):
         sessions.connect(secure_endpoint.replace("tls", "tcp"), patience_s=0.1)
-    assert ask(connect("actor"), keys.HELLO) == ["replay"]
+    assert ask(connect("actor"), verbs.HELLO.name) == ["replay"]
 
 
 def test_key_of_another_authority_is_refused_by_both_sides(
@@ -213,8 +213,10 @@ def test_role_gets_answers_to_its_own_verbs_only(
     role: str, replay: Replay, connect: Connect
 ) -> None:
     client = connect(role)
-    assert {verb for verb in keys.VERBS if ask(client, verb)} == MAY_ASK[role]
-    assert replay.asked == [keys.key("run", verb) for verb in keys.VERBS if verb in MAY_ASK[role]]
+    assert {verb for verb in verbs.BY_NAME if ask(client, verb)} == MAY_ASK[role]
+    assert replay.asked == [
+        keys.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
+    ]
 
 
 @pytest.mark.parametrize("expression", ["udrl/**", "udrl/1/run/*", "**", "udrl/*/*/st*"])
@@ -223,7 +225,7 @@ def test_wildcards_open_nothing(expression: str, replay: Replay, connect: Connec
     expression = expression.replace("st*", "st$*")
     assert list(client.get(expression, timeout=DEADLINE_S, target=zenoh.QueryTarget.ALL)) == []
     assert len(list(client.get(keys.every_hello(), timeout=DEADLINE_S))) == 1
-    assert replay.asked == [keys.key("run", keys.HELLO)]
+    assert replay.asked == [keys.key("run", verbs.HELLO.name)]
 
 
 def pose_as_replay(thief: zenoh.Session) -> list[str]:
@@ -235,7 +237,7 @@ def pose_as_replay(thief: zenoh.Session) -> list[str]:
             stolen.append(str(query.key_expr))
             query.reply(query.key_expr, b"thief")
 
-    for expression in [*(keys.key("run", verb) for verb in keys.VERBS), "udrl/**"]:
+    for expression in [*(keys.key("run", verb.name) for verb in verbs.VERBS), "udrl/**"]:
         thief.declare_queryable(expression, answer, complete=True)
     # What was declared before this token is known to the router when the token is.
     thief.liveliness().declare_token(keys.alive("run", "actor", "thief"))
@@ -245,9 +247,9 @@ def pose_as_replay(thief: zenoh.Session) -> list[str]:
 def test_nobody_answers_in_the_replay_services_place(replay: Replay, connect: Connect) -> None:
     stolen = pose_as_replay(connect("actor"))
     assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
-    for role, verbs in MAY_ASK.items():
+    for role, asked in MAY_ASK.items():
         victim = connect(role)
-        for verb in verbs:
+        for verb in asked:
             assert ask(victim, verb) == ["replay"]
     assert stolen == []
 
@@ -266,7 +268,7 @@ def test_peer_with_an_actors_key_may_no_more_than_a_client(
     with zenoh.open(config) as thief:
         stolen = pose_as_replay(thief)
         assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
-        assert ask(connect("learner"), keys.STATE) == ["replay"]
+        assert ask(connect("learner"), verbs.STATE.name) == ["replay"]
         assert stolen == []
 
 
@@ -280,7 +282,7 @@ def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
     ):
         stolen = pose_as_replay(thief)
         replay.tokens.get(timeout=DEADLINE_S)
-        assert "thief" in ask(victim, keys.STATE)
+        assert "thief" in ask(victim, verbs.STATE.name)
         assert stolen
 
 
@@ -291,10 +293,10 @@ def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
 def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connect: Connect) -> None:
     heard = Heard(connect("actor"), keys.key("run", keys.NEW_WEIGHTS))
     thief = connect(mallory)
-    for name in (keys.NEW_WEIGHTS, keys.PROGRESS, keys.EPISODE):
+    for name in (keys.NEW_WEIGHTS, keys.PROGRESS, verbs.EPISODE.name):
         thief.put(keys.key("run", name), b"false")
     thief.delete(keys.key("run", keys.NEW_WEIGHTS))
-    ask(thief, keys.HELLO)  # when this ends the router has seen what was sent before
+    ask(thief, verbs.HELLO.name)  # when this ends the router has seen what was sent before
     connect("learner").put(keys.key("run", keys.NEW_WEIGHTS), b"true")
     heard.wait_for("true")
     expected = [(keys.key("run", keys.NEW_WEIGHTS), "true")]
@@ -312,7 +314,7 @@ def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> Non
     of_learner, of_actor = Heard(learner, *everything), Heard(actor, *everything)
     of_observer = Heard(connect("observer"), *everything)
     for client in (learner, actor):
-        ask(client, keys.HELLO)  # when this ends the router knows the subscriptions
+        ask(client, verbs.HELLO.name)  # when this ends the router knows the subscriptions
     connect("learner").put(weights, b"weights")
     replay.session.put(progress, b"progress")
     of_actor.wait_for("weights")
@@ -326,7 +328,7 @@ def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> No
     learner = connect("learner")
     heard = Heard(connect("learner"), keys.key("run", keys.PROGRESS))
     learner.put(keys.key("run", keys.PROGRESS), b"false")
-    ask(learner, keys.HELLO)
+    ask(learner, verbs.HELLO.name)
     replay.session.put(keys.key("run", keys.PROGRESS), b"true")
     heard.wait_for("true")
     assert heard.messages == [(keys.key("run", keys.PROGRESS), "true")]
@@ -365,7 +367,7 @@ def test_table_of_rights_is_documented() -> None:
             found[role] = set(asks), set(hears), set(says), tokens
     assert found == {
         role: (
-            set(rights.asks),
+            set(verbs.asked_by(role)),
             set(rights.hears),
             set(rights.says),
             [f"alive/{role}/*"] if rights.joins else [],
@@ -375,7 +377,7 @@ def test_table_of_rights_is_documented() -> None:
 
 
 def test_every_verb_is_somebodys() -> None:
-    assert {verb for rights in RIGHTS.values() for verb in rights.asks} == set(keys.VERBS)
+    assert {verb for role in RIGHTS for verb in verbs.asked_by(role)} == set(verbs.BY_NAME)
     assert set(ROLES) == set(MAY_ASK)
 
 

@@ -1,5 +1,6 @@
 """Asking until there is an answer, and answering: at least once, never for ever."""
 
+import dataclasses
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -11,15 +12,14 @@ import pytest
 import zenoh
 
 from udrl.errors import Interrupted, InvalidMessage, Refused, Unreachable
-from udrl_proto import asking, keys
-from udrl_proto.answering import Question, Verb, serve
+from udrl_proto import asking, keys, verbs
+from udrl_proto.answering import Question, serve
 from udrl_proto.asking import Asker
 from udrl_proto.codec import SMALL, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
     Acknowledged,
     FailureMessage,
-    Message,
     Problem,
     StateReply,
     StateRequest,
@@ -30,6 +30,7 @@ RUN = "run"
 REQUEST = StateRequest(learner="l")
 ANSWER = StateReply(version=3, weights=b"w", optimizer=b"o")
 WAIT_S = 10.0
+STATE = dataclasses.replace(verbs.STATE, limit=100)
 
 Questions = Inbox[Question]
 Ask = Callable[..., Future[StateReply]]
@@ -39,7 +40,7 @@ Ask = Callable[..., Future[StateReply]]
 def inbox(router: zenoh.Session) -> Questions:
     """Questions that arrive at a service on the router."""
     questions: Questions = Inbox(100, 1000)
-    serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, questions)
+    serve(router, RUN, questions, [STATE])
     return questions
 
 
@@ -53,8 +54,10 @@ def ask(asker: Asker) -> Iterator[Ask]:
     """Asks from another thread."""
     with ThreadPoolExecutor(1) as thread:
 
-        def submit(request: Message | bytes = REQUEST, limit: int = SMALL) -> Future[StateReply]:
-            return thread.submit(lambda: asker.ask(keys.STATE, request, StateReply, limit))
+        def submit(request: Any = REQUEST, limit: int = SMALL) -> Future[StateReply]:
+            return thread.submit(
+                lambda: asker.ask(dataclasses.replace(verbs.STATE, reply_limit=limit), request)
+            )
 
         yield submit
 
@@ -67,18 +70,18 @@ def first(inbox: Inbox[Any]) -> Any:
 def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
     """Treat the first query with the first function, and so on."""
     remaining = iter(answers)
-    session.declare_queryable(keys.key(RUN, keys.STATE), lambda query: next(remaining)(query))
+    session.declare_queryable(keys.key(RUN, "state"), lambda query: next(remaining)(query))
 
 
 def answer(query: zenoh.Query) -> None:
     with query:
-        query.reply(keys.key(RUN, keys.STATE), encode(ANSWER))
+        query.reply(keys.key(RUN, "state"), encode(ANSWER))
 
 
 def test_answer_is_returned(inbox: Questions, ask: Ask) -> None:
     future = ask()
     question = first(inbox)
-    assert (question.verb, question.request) == (keys.STATE, REQUEST)
+    assert (question.verb, question.request) == (STATE, REQUEST)
     question.answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
@@ -101,7 +104,7 @@ def test_problem_is_raised_with_its_code(inbox: Questions, ask: Ask) -> None:
 
 def test_question_without_an_answer_is_asked_again(router: zenoh.Session, asker: Asker) -> None:
     answer_each(router, zenoh.Query.drop, zenoh.Query.drop, answer)
-    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_question_that_hangs_is_asked_again(
@@ -110,7 +113,7 @@ def test_question_that_hangs_is_asked_again(
     monkeypatch.setattr(asking, "ATTEMPT_S", 0.1)
     hanging: list[zenoh.Query] = []
     answer_each(router, hanging.append, answer)
-    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
     hanging.pop().drop()
 
 
@@ -132,13 +135,13 @@ def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
     asker = Asker(cast(zenoh.Session, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
     with pytest.raises(Unreachable):
-        asker.ask(keys.STATE, REQUEST, StateReply)
+        asker.ask(verbs.STATE, REQUEST)
     assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]
 
 
 def test_error_that_is_not_ours_is_no_answer(router: zenoh.Session, asker: Asker) -> None:
     answer_each(router, lambda query: query.reply_err(b"router is busy"), answer)
-    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_service_that_starts_later_is_found(
@@ -150,13 +153,13 @@ def test_service_that_starts_later_is_found(
             return False
 
     monkeypatch.setattr(asker, "_stop", FirstPause())
-    assert asker.ask(keys.STATE, REQUEST, StateReply) == ANSWER
+    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_patience_ends(client: zenoh.Session) -> None:
     asker = Asker(client, RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable, match=r"^learner l asked .* of run for 'state' and got no"):
-        asker.ask(keys.STATE, REQUEST, StateReply)
+        asker.ask(verbs.STATE, REQUEST)
 
 
 def test_long_wait_says_who_waits_for_what(
@@ -171,7 +174,7 @@ def test_long_wait_says_who_waits_for_what(
     monkeypatch.setattr(asking, "time", clock)
     asker = Asker(client, RUN, "learner l", NoPause(), patience_s=5.0)
     with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
-        asker.ask(keys.STATE, REQUEST, StateReply)
+        asker.ask(verbs.STATE, REQUEST)
     assert [record.getMessage() for record in caplog.records] == [
         "learner l has been waiting 2 s for the replay service to answer 'state'",
         "learner l has been waiting 4 s for the replay service to answer 'state'",
@@ -182,7 +185,7 @@ def test_asking_can_be_stopped(client: zenoh.Session) -> None:
     stop = threading.Event()
     asker = Asker(client, RUN, "learner l", stop)
     with ThreadPoolExecutor(1) as thread:
-        future = thread.submit(asker.ask, keys.STATE, REQUEST, StateReply)
+        future = thread.submit(lambda: asker.ask(verbs.STATE, REQUEST))
         stop.set()
         with pytest.raises(Interrupted, match="learner l was stopped while asking for 'state'"):
             future.result(WAIT_S)
@@ -227,8 +230,8 @@ def test_invalid_request_reaches_the_service_as_the_error_it_is(
 
 def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)
-    verb = Verb(StateRequest, 100, prepare=lambda request: request.learner.upper())
-    serve(router, RUN, {keys.STATE: verb}, inbox)
+    prepare = {"state": lambda request: request.learner.upper()}
+    serve(router, RUN, inbox, [STATE], prepare)
     future = ask()
     question = first(inbox)
     assert question.request == "L"
@@ -247,7 +250,7 @@ def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session
             return super().put(item, size, bulk=bulk)
 
     inbox = FullAtFirst(100, 1000)
-    serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox)
+    serve(router, RUN, inbox, [STATE])
     future = ask()
     first(inbox).answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
@@ -258,7 +261,7 @@ def test_answer_to_somebody_who_is_gone_is_forgotten(
     inbox: Questions, router: zenoh.Session, endpoint: str
 ) -> None:
     with connect(endpoint, patience_s=5.0) as client:
-        client.get(keys.key(RUN, keys.STATE), payload=encode(REQUEST))
+        client.get(keys.key(RUN, "state"), payload=encode(REQUEST))
         question = first(inbox)
     question.answer(ANSWER)
     assert inbox.take(1, 1, 0.0) == []
@@ -268,9 +271,9 @@ def test_service_that_undeclares_its_verbs_is_not_asked(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)
-    for queryable in serve(router, RUN, {keys.STATE: Verb(StateRequest, 100)}, inbox):
+    for queryable in serve(router, RUN, inbox, [STATE]):
         queryable.undeclare()
     asker = Asker(client, RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable):
-        asker.ask(keys.STATE, REQUEST, StateReply)
+        asker.ask(verbs.STATE, REQUEST)
     assert inbox.take(1, 1, 0.0) == []

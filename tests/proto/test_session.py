@@ -13,7 +13,7 @@ from udrl.config import Config
 from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError, Interrupted, InvalidMessage, Unreachable
 from udrl.spaces import Vector
-from udrl_proto import PROTOCOL, keys
+from udrl_proto import PROTOCOL, verbs
 from udrl_proto import session as sessions
 from udrl_proto.codec import encode
 from udrl_proto.messages import Hello
@@ -137,7 +137,7 @@ def hello(run_id: str) -> Hello:
 
 
 def serve(session: zenoh.Session, run_id: str, payload: bytes, protocol: int = PROTOCOL) -> None:
-    key = f"udrl/{protocol}/{run_id}/{keys.HELLO}"
+    key = f"udrl/{protocol}/{run_id}/{verbs.HELLO.name}"
     session.declare_queryable(key, lambda query: query.reply(key, payload))
 
 

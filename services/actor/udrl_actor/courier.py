@@ -20,17 +20,13 @@ from udrl.errors import InvalidMessage, Refused
 from udrl.inference import ActingFunction
 from udrl.weights import decode_behavior
 from udrl_actor.outbox import Outbox
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import (
-    Acknowledged,
-    CommandsReply,
     CommandsRequest,
-    EpisodeReply,
     FailureMessage,
     Hello,
-    JoinReply,
     JoinRequest,
     Weights,
     WeightsRequest,
@@ -188,11 +184,11 @@ class Courier(threading.Thread):
             weights_version=self._newest,
         )
         try:
-            reply = self._asker.ask(keys.COMMANDS, request, CommandsReply)
+            reply = self._asker.ask(verbs.COMMANDS, request)
         except Refused as refusal:
             if refusal.code != "join_first":
                 raise
-            self._asker.ask(keys.JOIN, self._join, JoinReply)
+            self._asker.ask(verbs.JOIN, self._join)
             return 0.0
         if reply.ended:
             self.ended = True
@@ -210,12 +206,12 @@ class Courier(threading.Thread):
             failure = FailureMessage(
                 actor=self._join.id, command_id=command_id, error=str(outcome.error)[:4000]
             )
-            self._asker.ask(keys.FAILURE, failure, Acknowledged)
+            self._asker.ask(verbs.FAILURE, failure)
         else:
             command_id = outcome.command_id
             try:
                 message = encode_episode(outcome, self._join.id)
-                self._asker.ask(keys.EPISODE, message, EpisodeReply)
+                self._asker.ask(verbs.EPISODE, message)
             except Refused as refusal:
                 if refusal.code != "rejected":
                     raise  # malformed: the next one would be too
@@ -264,7 +260,7 @@ class Courier(threading.Thread):
             self._await_announcement(version)
         if version not in self._behaviors:
             request = WeightsRequest(version=version)
-            self._learn(self._asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
+            self._learn(self._asker.ask(verbs.WEIGHTS, request))
         return self._behaviors[version]
 
     def _await_announcement(self, version: int) -> None:

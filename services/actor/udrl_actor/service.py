@@ -15,9 +15,9 @@ from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
 from udrl_actor.courier import Courier
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
-from udrl_proto.messages import Hello, JoinReply, JoinRequest
+from udrl_proto.messages import Hello, JoinRequest
 
 log = logging.getLogger("udrl")
 
@@ -79,7 +79,7 @@ class ActorService:
                 numerics_class=acting_class(config, generator, self._hello.graph),
                 environment=generator.spec,
             )
-            asker.ask(keys.JOIN, join, JoinReply)
+            asker.ask(verbs.JOIN, join)
             token = self._session.liveliness().declare_token(
                 keys.alive(run_id, "actor", self._name)
             )

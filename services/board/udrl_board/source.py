@@ -15,9 +15,8 @@ from udrl_launch.address import Address, connected
 from udrl_launch.agents import load_agent
 from udrl_launch.inspection import read_run, read_status, served_at
 from udrl_launch.obedience import Obedience, kept
-from udrl_proto import keys
+from udrl_proto import verbs
 from udrl_proto.asking import Asker
-from udrl_proto.codec import LARGEST
 from udrl_proto.messages import (
     Contents,
     ContentsRequest,
@@ -173,21 +172,21 @@ class Served:
 
     def status(self) -> Status:
         """Return how the run is doing."""
-        return self._ask(lambda asker: asker.ask(keys.STATUS, StatusRequest(), Status))
+        return self._ask(lambda asker: asker.ask(verbs.STATUS, StatusRequest()))
 
     def history(self, after: int) -> History:
         """Return what came of the iterations after one, or the first of them."""
         request = HistoryRequest(after=after)
-        return self._ask(lambda asker: asker.ask(keys.HISTORY, request, History))
+        return self._ask(lambda asker: asker.ask(verbs.HISTORY, request))
 
     def contents(self) -> Contents:
         """Return what the replay buffer holds."""
-        return self._ask(lambda asker: asker.ask(keys.CONTENTS, ContentsRequest(), Contents))
+        return self._ask(lambda asker: asker.ask(verbs.CONTENTS, ContentsRequest()))
 
     def weights(self, version: Wanted) -> Weights:
         """Return a weights version that is kept."""
         request = WeightsRequest(version=version)
-        return self._ask(lambda asker: asker.ask(keys.WEIGHTS, request, Weights, LARGEST))
+        return self._ask(lambda asker: asker.ask(verbs.WEIGHTS, request))
 
     def obedience(self) -> Obedience | None:
         """Return nothing: it is in the run's directory, which may be on another machine."""

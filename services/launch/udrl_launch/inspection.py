@@ -13,7 +13,7 @@ from udrl.config import Budget, build, read_toml
 from udrl.errors import UdrlError
 from udrl_launch.address import Address, connected
 from udrl_launch.roles import ENDPOINT_FILE
-from udrl_proto import keys
+from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Status, StatusRequest
 from udrl_replay.reporting import Throughput, Waits, status
@@ -34,7 +34,7 @@ def status_at(address: Address) -> Status:
     """
     with connected("observer", address) as (session, hello):
         asker = Asker(session, hello.run_id, "udrl status", patience_s=_ANSWER_S)
-        return asker.ask(keys.STATUS, StatusRequest(), Status)
+        return asker.ask(verbs.STATUS, StatusRequest())
 
 
 def status_from(where: Path | Address, keys_dir: Path | None = None) -> Status:

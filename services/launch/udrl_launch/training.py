@@ -16,8 +16,8 @@ from udrl_launch.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.roles import require_torch
 from udrl_launch.settings import Settings
-from udrl_proto import keys as verbs
 from udrl_proto import session as sessions
+from udrl_proto import verbs
 from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
@@ -155,7 +155,7 @@ def _watch(
             if services.done:
                 return
             try:
-                status = asker.ask(verbs.STATUS, StatusRequest(), Status)
+                status = asker.ask(verbs.STATUS, StatusRequest())
             except (Unreachable, Interrupted) as error:
                 log.debug("no status: %s", error)
                 continue

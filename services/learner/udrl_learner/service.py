@@ -25,22 +25,17 @@ from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained, use_one_thread
 from udrl.training_class import training_class
 from udrl.weights import encode_weights
-from udrl_proto import keys
+from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode
 from udrl_proto.messages import (
-    ChangesReply,
     ChangesRequest,
     EpisodeMessage,
-    EpisodesReply,
     EpisodesRequest,
     Hello,
-    JoinReply,
     JoinRequest,
-    StateReply,
     StateRequest,
     VersionMessage,
-    VersionReply,
     Weights,
 )
 
@@ -124,12 +119,12 @@ class LearnerService:
             software=udrl.__version__,
             numerics_class=training_class(self._config, self._spec),
         )
-        self._asker.ask(keys.JOIN, request, JoinReply)
+        self._asker.ask(verbs.JOIN, request)
 
     def _latest(self) -> TrainingState:
         """Return the state to go on from: the replay service's latest version."""
         request = StateRequest(learner=self._name)
-        reply = self._asker.ask(keys.STATE, request, StateReply, LARGEST)
+        reply = self._asker.ask(verbs.STATE, request)
         if reply.version == 0:
             return untrained(self._config, self._spec)
         log.info("learner %s goes on from weights version %d", self._name, reply.version)
@@ -208,7 +203,7 @@ class LearnerService:
         while not useless.is_set():
             self._progress.clear()
             request = ChangesRequest(learner=self._name, version=version)
-            changes = self._asker.ask(keys.CHANGES, request, ChangesReply, LARGEST)
+            changes = self._asker.ask(verbs.CHANGES, request)
             if changes.ended:
                 break
             if changes.wait is None:
@@ -222,12 +217,12 @@ class LearnerService:
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
             request = EpisodesRequest(ids=tuple(left[:_ASK_FOR]))
-            page = self._asker.ask(keys.EPISODES, request, EpisodesReply, LARGEST)
+            page = self._asker.ask(verbs.EPISODES, request)
             episodes += [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in page.episodes]
         return episodes
 
     def _deliver(self, message: VersionMessage) -> None:
-        self._asker.ask(keys.VERSION, message, VersionReply)
+        self._asker.ask(verbs.VERSION, message)
         # DROP, Zenoh's default: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
         announcement = encode(Weights(version=message.version, weights=message.weights))

@@ -9,6 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,9 +21,9 @@ from udrl.digests import arrays_digest
 from udrl.errors import InvalidData, InvalidMessage, Refused
 from udrl.graph import weight_shapes
 from udrl.weights import decode_weights, optimizer_shapes
-from udrl_proto import keys
-from udrl_proto.answering import Question, Verb, serve
-from udrl_proto.codec import LARGEST, PAGE, encode
+from udrl_proto import keys, verbs
+from udrl_proto.answering import Question, serve
+from udrl_proto.codec import PAGE, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
     Acknowledged,
@@ -77,8 +78,6 @@ _GROUP, _GROUP_BYTES = 64, 8 << 20
 _LINGER_S = 10.0
 #: Seconds that it stays when nobody is left.
 _FAREWELL_S = 0.3
-#: Bytes of an episode's message besides its arrays.
-_OVERHEAD = 4096
 
 
 class _Presence(NamedTuple):
@@ -129,19 +128,19 @@ class ReplayService:
         self._acting_with = self.run.progress.latest_version
         self._lag_s = 0.0
         self._handlers: dict[str, Callable[[Any, float], Message]] = {
-            keys.HELLO: self._hello,
-            keys.JOIN: self._join,
-            keys.COMMANDS: self._commands,
-            keys.EPISODE: self._episode,
-            keys.FAILURE: self._failure,
-            keys.CHANGES: self._changes,
-            keys.EPISODES: self._episodes,
-            keys.VERSION: self._version,
-            keys.STATE: self._state,
-            keys.WEIGHTS: self._weights,
-            keys.STATUS: self._status,
-            keys.HISTORY: self._history,
-            keys.CONTENTS: self._contents,
+            verbs.HELLO.name: self._hello,
+            verbs.JOIN.name: self._join,
+            verbs.COMMANDS.name: self._commands,
+            verbs.EPISODE.name: self._episode,
+            verbs.FAILURE.name: self._failure,
+            verbs.CHANGES.name: self._changes,
+            verbs.EPISODES.name: self._episodes,
+            verbs.VERSION.name: self._version,
+            verbs.STATE.name: self._state,
+            verbs.WEIGHTS.name: self._weights,
+            verbs.STATUS.name: self._status,
+            verbs.HISTORY.name: self._history,
+            verbs.CONTENTS.name: self._contents,
         }
 
     def serve(self, stop: threading.Event) -> None:
@@ -155,7 +154,7 @@ class ReplayService:
             self._session.liveliness().declare_subscriber(
                 keys.alive(run_id, "*", "*"), self._presence, history=True
             ),
-            *serve(self._session, run_id, self._verbs(), self._inbox),
+            *self._serve(),
         ]
         log.info("replay serves run %s", run_id)
         if self.run.progress.state == "ended":
@@ -182,7 +181,8 @@ class ReplayService:
                 if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
                     return
 
-    def _verbs(self) -> dict[str, Verb]:
+    def _serve(self) -> list[zenoh.Queryable[None]]:
+        """Declare what is answered; what arrives is checked on the thread that received it."""
         spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
 
@@ -200,22 +200,15 @@ class ReplayService:
             except InvalidMessage as error:
                 return Malformed(message.actor, error)
 
-        steps = spec.max_episode_steps * spec.step_bytes
-        return {
-            keys.HELLO: Verb(HelloRequest, _OVERHEAD),
-            keys.JOIN: Verb(JoinRequest, 1 << 16),
-            keys.COMMANDS: Verb(CommandsRequest, 1 << 20),
-            keys.EPISODE: Verb(EpisodeMessage, steps + _OVERHEAD, bulk=True, prepare=arrive),
-            keys.FAILURE: Verb(FailureMessage, 1 << 16),
-            keys.CHANGES: Verb(ChangesRequest, _OVERHEAD),
-            keys.EPISODES: Verb(EpisodesRequest, PAGE),
-            keys.VERSION: Verb(VersionMessage, LARGEST, prepare=check),
-            keys.STATE: Verb(StateRequest, _OVERHEAD),
-            keys.WEIGHTS: Verb(WeightsRequest, _OVERHEAD),
-            keys.STATUS: Verb(StatusRequest, _OVERHEAD),
-            keys.HISTORY: Verb(HistoryRequest, _OVERHEAD),
-            keys.CONTENTS: Verb(ContentsRequest, _OVERHEAD),
-        }
+        longest = spec.max_episode_steps * spec.step_bytes + verbs.FEW
+        episode = replace(verbs.EPISODE, limit=longest)
+        return serve(
+            self._session,
+            self.run.hello.run_id,
+            self._inbox,
+            [episode if verb is verbs.EPISODE else verb for verb in verbs.VERBS],
+            {verbs.EPISODE.name: arrive, verbs.VERSION.name: check},
+        )
 
     def _presence(self, sample: zenoh.Sample) -> None:
         _, _, token = keys.parse(str(sample.key_expr))
@@ -255,15 +248,15 @@ class ReplayService:
             self.run.offend(request.actor, str(request.error))
             request = request.error
         if isinstance(request, InvalidData):
-            if question.verb == keys.EPISODE:
+            if question.verb.name == verbs.EPISODE.name:
                 self.run.progress.delivered += 1
                 self.run.progress.rejected += 1
-            log.warning("invalid %s: %s", question.verb, request)
+            log.warning("invalid %s: %s", question.verb.name, request)
             return Problem(code="invalid", message=str(request)[:4000])
         try:
-            return self._handlers[question.verb](request, now)
+            return self._handlers[question.verb.name](request, now)
         except Refused as error:
-            log.warning("refused %s: %s", question.verb, error)
+            log.warning("refused %s: %s", question.verb.name, error)
             return Problem(code=error.code, message=str(error)[:4000])
 
     def _note_presence(self, presence: _Presence, now: float) -> None:
