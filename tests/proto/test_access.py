@@ -291,8 +291,9 @@ def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
 
 @pytest.mark.parametrize("mallory", ["actor", "observer", "replay"])
 def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connect: Connect) -> None:
-    heard = Heard(connect("actor"), keys.key("run", keys.NEW_WEIGHTS))
-    thief = connect(mallory)
+    listener, thief = connect("actor"), connect(mallory)
+    heard = Heard(listener, keys.key("run", keys.NEW_WEIGHTS))
+    ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
     for name in (keys.NEW_WEIGHTS, keys.PROGRESS, verbs.EPISODE.name):
         thief.put(keys.key("run", name), b"false")
     thief.delete(keys.key("run", keys.NEW_WEIGHTS))
@@ -325,8 +326,9 @@ def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> Non
 
 
 def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> None:
-    learner = connect("learner")
-    heard = Heard(connect("learner"), keys.key("run", keys.PROGRESS))
+    learner, listener = connect("learner"), connect("learner")
+    heard = Heard(listener, keys.key("run", keys.PROGRESS))
+    ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
     learner.put(keys.key("run", keys.PROGRESS), b"false")
     ask(learner, verbs.HELLO.name)
     replay.session.put(keys.key("run", keys.PROGRESS), b"true")
