@@ -20,7 +20,7 @@ from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Child, Supervisor
 from udrl_proto.messages import Status
 from udrl_replay.creation import create, write_config
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import Store
 
 _POLL_S = 0.02

@@ -33,6 +33,7 @@ from udrl_proto.messages import (
     Message,
     Weights,
 )
+from udrl_proto.zenoh_transport import ZenohTransport
 
 RUN = "scale"
 #: Made-up episodes that an actor chooses from.
@@ -101,7 +102,7 @@ class Fleet:
             for i in range(self._load.actors)
         ]
         for actor in actors:
-            Asker(actor.session, RUN, actor.name).ask(verbs.JOIN, self._join(actor))
+            Asker(ZenohTransport(actor.session), RUN, actor.name).ask(verbs.JOIN, self._join(actor))
         for actor in actors:
             self._next(actor)
         warm = time.monotonic() + self._load.seconds / 4

@@ -49,8 +49,9 @@ from udrl_proto.messages import (
     VersionMessage,
     Weights,
 )
+from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import write_config
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -87,7 +88,7 @@ def deliver_versions(
     state.optimizer.step()  # gives Adam the state that a delivery must have
     weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
-        asker = Asker(session, RUN, "learner scale", stop)
+        asker = Asker(ZenohTransport(session), RUN, "learner scale", stop)
         version = 1
         while not stop.is_set():
             request = ChangesRequest(learner="scale", version=version)
@@ -185,7 +186,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
         replay_service(Path(folder) / "run", hello, endpoint) as pid,
         sessions.connect(endpoint, 30.0) as session,
     ):
-        asker = Asker(session, RUN, "scale", patience_s=30.0)
+        asker = Asker(ZenohTransport(session), RUN, "scale", patience_s=30.0)
         learner = threading.Thread(
             target=deliver_versions, args=(endpoint, hello, stop, announced), daemon=True
         )

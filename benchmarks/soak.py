@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from udrl.errors import UdrlError
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import FILE, Store
 
 ROLES = ("replay", "learner", "actor")

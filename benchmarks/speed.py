@@ -55,7 +55,7 @@ from udrl_launch.inspection import status_of
 from udrl_launch.process import keep_freed_memory
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")

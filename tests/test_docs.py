@@ -31,8 +31,8 @@ from udrl.errors import UdrlError
 from udrl_launch.settings import Fleet, gather
 from udrl_launch.supervisor import FINAL_CODES
 from udrl_proto.messages import Status
+from udrl_replay.progress import Progress
 from udrl_replay.reporting import COLUMNS
-from udrl_replay.run import Progress
 from udrl_replay.store import FILE, Store
 
 # Settings.

@@ -8,12 +8,11 @@ import logging
 import threading
 import time
 
-import zenoh
-
 from udrl.errors import Interrupted, Refused, Unreachable
 from udrl_proto import keys
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Problem
+from udrl_proto.transport import Transport
 from udrl_proto.verbs import Reply, Request, Verb
 
 log = logging.getLogger("udrl")
@@ -29,7 +28,7 @@ class Asker:
     """One service's line to the replay service of a run.
 
     Args:
-        session: connected to the run's router.
+        transport: reaches the replay service.
         run_id: the run.
         who: the asking service, for the log.
         stop: ends every wait.
@@ -38,13 +37,13 @@ class Asker:
 
     def __init__(
         self,
-        session: zenoh.Session,
+        transport: Transport,
         run_id: str,
         who: str,
         stop: threading.Event | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        self._session = session
+        self._transport = transport
         self._run_id = run_id
         self._who = who
         self._stop = stop or threading.Event()
@@ -69,18 +68,12 @@ class Asker:
         warn_at = 2.0
         while not self._stop.is_set():
             asked = time.monotonic()
-            replies = self._session.get(
-                keys.key(self._run_id, verb.name),
-                payload=payload,
-                timeout=attempt_s,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-            for reply in replies:
-                if reply.ok is not None:
-                    return decode(reply.ok.payload.to_bytes(), verb.reply, verb.reply_limit)
-                if reply.err is not None and (problem := _problem(reply.err)) is not None:
+            key = keys.key(self._run_id, verb.name)
+            for answer in self._transport.ask(key, payload, attempt_s):
+                if answer.is_problem:
+                    problem = decode(answer.data, Problem)
                     raise Refused(problem.code, problem.message)
+                return decode(answer.data, verb.reply, verb.reply_limit)
             now = time.monotonic()
             if now - asked >= attempt_s:
                 attempt_s = min(2 * attempt_s, LONGEST_ATTEMPT_S)
@@ -99,11 +92,3 @@ class Asker:
             self._stop.wait(pause)
             pause = min(2 * pause, 1.0)
         raise Interrupted(f"{self._who} was stopped while asking for {verb.name!r}")
-
-
-def _problem(error: zenoh.ReplyError) -> Problem | None:
-    """Return our own error reply; None for Zenoh's, e.g. a timeout, after which we ask again."""
-    data = error.payload.to_bytes()
-    if data == b"Timeout" or error.encoding != zenoh.Encoding.APPLICATION_OCTET_STREAM:
-        return None
-    return decode(data, Problem)

@@ -1,19 +1,16 @@
 """A run whose every door can be knocked at without a network: whatever bytes come, what must hold.
 
-The queryables are those of the replay service, declared on a session that only remembers them. What
-is asked of each input: one answer, which is a message of the protocol; ledgers that balance; no
-exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
+What is asked of each input: one answer, which is a message of the protocol; ledgers that balance;
+no exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
 """
 
 import tempfile
-from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import msgpack
 import numpy as np
-import zenoh
 
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.checkpoint import encode_optimizer
@@ -27,6 +24,7 @@ from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights
 from udrl_proto import keys, verbs
 from udrl_proto.codec import decode, decode_episode, encode, encode_episode
+from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import (
     ChangesReply,
     ChangesRequest,
@@ -41,12 +39,12 @@ from udrl_proto.messages import (
     JoinRequest,
     Message,
     Problem,
-    Progress,
     StateRequest,
     StatusRequest,
     VersionMessage,
     WeightsRequest,
 )
+from udrl_proto.transport import Answer
 from udrl_replay.creation import create
 from udrl_replay.service import ReplayService
 
@@ -63,49 +61,22 @@ _MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 class Query:
-    """What Zenoh hands to a queryable."""
+    """A question by nobody."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self.replies: list[bytes] = []
-        self.problems: list[bytes] = []
+        self.answers: list[Answer] = []
         self.dropped = False
 
     @property
-    def payload(self) -> "Query":
-        return self
-
-    def to_bytes(self) -> bytes:
+    def data(self) -> bytes:
         return self._data
 
-    def __enter__(self) -> "Query":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-    def reply(self, _: str, data: bytes) -> None:
-        self.replies.append(data)
-
-    def reply_err(self, data: bytes, *, encoding: object) -> None:
-        self.problems.append(data)
+    def reply(self, answer: Answer) -> None:
+        self.answers.append(answer)
 
     def drop(self) -> None:
         self.dropped = True
-
-
-class _Session:
-    """A session that remembers what is declared, and sends nothing."""
-
-    def __init__(self) -> None:
-        self.receivers: dict[str, Callable[[Any], None]] = {}
-
-    def declare_queryable(self, key: str, receiver: Callable[[Any], None], **_: object) -> None:
-        self.receivers[keys.parse(key)[2]] = receiver
-
-    def put(self, key: str, data: bytes) -> None:
-        assert keys.parse(key)[2] == keys.PROGRESS
-        decode(data, Progress)
 
 
 class World:
@@ -115,12 +86,12 @@ class World:
         self._folder = tempfile.TemporaryDirectory(dir=_MEMORY)
         run_dir = Path(self._folder.name)
         self._store = create(run_dir, CONFIG)
-        self._session = _Session()
-        session = cast(zenoh.Session, self._session)
+        self._exchange = Exchange()
+        transport = MemoryTransport(self._exchange)
         budget = Budget(max_env_steps=2**53)
-        self.service = ReplayService(session, self._store, budget, run_dir, audit=0.2)
-        self.spec = self.service.run.hello.environment
-        self.service._serve()
+        self.service = ReplayService(transport, self._store, budget, run_dir, audit=0.2)
+        self._run_id, self.spec = self.service.run.hello.run_id, self.service.run.hello.environment
+        self.service.open()
 
     def close(self) -> None:
         """Forget the run."""
@@ -136,16 +107,16 @@ class World:
         """Ask with any bytes and return the answer, after checking all that must hold."""
         query = Query(data)
         accepted = self.service.run.progress.accepted
-        self._session.receivers[verb](query)
-        self.service._answer(self.service._inbox.take(1, 1, 0.0))
+        self._exchange.answering[keys.key(self._run_id, verb)](query)
+        self.service.answer_waiting(0.0)
         assert not query.dropped
-        assert len(query.replies) + len(query.problems) == 1, "one question, one answer"
+        (answer,) = query.answers
         self._check_ledgers()
-        if query.problems:
-            return decode(query.problems[0], Problem)
+        if answer.is_problem:
+            return decode(answer.data, Problem)
         if self.service.run.progress.accepted > accepted:
             self._check_accepted(data)
-        return decode(query.replies[0], verbs.BY_NAME[verb].reply, 1 << 30)
+        return decode(answer.data, verbs.BY_NAME[verb].reply, 1 << 30)
 
     def _check_ledgers(self) -> None:
         progress, outstanding = self.service.run.progress, self.service.run.dealer.outstanding

@@ -28,6 +28,7 @@ from udrl_proto.messages import (
     VersionMessage,
 )
 from udrl_proto.session import connect, find_run
+from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import create
 from whole_run import assert_conserved, digests, free_port, reference, toy
 
@@ -48,8 +49,9 @@ class Hosted:
         )
         self._thread.start()
         self.session: zenoh.Session = connect(self.endpoint, 10)
+        self.transport = ZenohTransport(self.session)
         self.hello: Hello = find_run(self.session, None, 10)
-        self.asker = Asker(self.session, self.hello.run_id, "the test", patience_s=10)
+        self.asker = Asker(self.transport, self.hello.run_id, "the test", patience_s=10)
 
     def status(self) -> Status:
         return self.asker.ask(verbs.STATUS, StatusRequest())
@@ -85,18 +87,18 @@ def hosted(tmp_path: Path) -> Iterator[Hosted]:
 
 
 def actor(hosted: Hosted) -> None:
-    ActorService(hosted.session, hosted.hello, "another", 1, hosted.stop).run()
+    ActorService(hosted.transport, hosted.hello, "another", 1, hosted.stop).run()
 
 
 def learner(hosted: Hosted) -> None:
-    LearnerService(hosted.session, hosted.hello, "another", hosted.stop).run()
+    LearnerService(hosted.transport, hosted.hello, "another", hosted.stop).run()
 
 
 def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
     other = msgspec.structs.replace(hosted.hello.config, max_episode_steps=1)
     hello = msgspec.structs.replace(hosted.hello, config=other)
     with pytest.raises(Refused, match=r"max_episode_steps=2.*yours is.*max_episode_steps=1") as no:
-        ActorService(hosted.session, hello, "other", 1, hosted.stop).run()
+        ActorService(hosted.transport, hello, "other", 1, hosted.stop).run()
     assert no.value.code == "other_environment"
 
 

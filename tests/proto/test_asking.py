@@ -25,6 +25,8 @@ from udrl_proto.messages import (
     StateRequest,
 )
 from udrl_proto.session import connect
+from udrl_proto.transport import Answer, Transport
+from udrl_proto.zenoh_transport import ZenohTransport
 
 RUN = "run"
 REQUEST = StateRequest(learner="l")
@@ -40,13 +42,13 @@ Ask = Callable[..., Future[StateReply]]
 def inbox(router: zenoh.Session) -> Questions:
     """Questions that arrive at a service on the router."""
     questions: Questions = Inbox(100, 1000)
-    serve(router, RUN, questions, [STATE])
+    serve(ZenohTransport(router), RUN, questions, [STATE])
     return questions
 
 
 @pytest.fixture
 def asker(client: zenoh.Session) -> Asker:
-    return Asker(client, RUN, "learner l", patience_s=WAIT_S)
+    return Asker(ZenohTransport(client), RUN, "learner l", patience_s=WAIT_S)
 
 
 @pytest.fixture
@@ -122,10 +124,10 @@ def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch
     attempts: list[float] = []
 
     class Slow:
-        def get(self, *_: object, timeout: float, **__: object) -> list[zenoh.Reply]:
+        def ask(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
             nonlocal now
-            now += timeout
-            attempts.append(timeout)
+            now += timeout_s
+            attempts.append(timeout_s)
             return []
 
     class NoPause(threading.Event):
@@ -133,7 +135,7 @@ def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch
             return False
 
     monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
-    asker = Asker(cast(zenoh.Session, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
+    asker = Asker(cast(Transport, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
     with pytest.raises(Unreachable):
         asker.ask(verbs.STATE, REQUEST)
     assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]
@@ -157,7 +159,7 @@ def test_service_that_starts_later_is_found(
 
 
 def test_patience_ends(client: zenoh.Session) -> None:
-    asker = Asker(client, RUN, "learner l", patience_s=0.05)
+    asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable, match=r"^learner l asked .* of run for 'state' and got no"):
         asker.ask(verbs.STATE, REQUEST)
 
@@ -172,7 +174,7 @@ def test_long_wait_says_who_waits_for_what(
     seconds = iter(range(100))
     clock = SimpleNamespace(monotonic=lambda: next(seconds))  # every look at it takes a second
     monkeypatch.setattr(asking, "time", clock)
-    asker = Asker(client, RUN, "learner l", NoPause(), patience_s=5.0)
+    asker = Asker(ZenohTransport(client), RUN, "learner l", NoPause(), patience_s=5.0)
     with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
         asker.ask(verbs.STATE, REQUEST)
     assert [record.getMessage() for record in caplog.records] == [
@@ -183,7 +185,7 @@ def test_long_wait_says_who_waits_for_what(
 
 def test_asking_can_be_stopped(client: zenoh.Session) -> None:
     stop = threading.Event()
-    asker = Asker(client, RUN, "learner l", stop)
+    asker = Asker(ZenohTransport(client), RUN, "learner l", stop)
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(lambda: asker.ask(verbs.STATE, REQUEST))
         stop.set()
@@ -231,7 +233,7 @@ def test_invalid_request_reaches_the_service_as_the_error_it_is(
 def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)
     prepare = {"state": lambda request: request.learner.upper()}
-    serve(router, RUN, inbox, [STATE], prepare)
+    serve(ZenohTransport(router), RUN, inbox, [STATE], prepare)
     future = ask()
     question = first(inbox)
     assert question.request == "L"
@@ -250,7 +252,7 @@ def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session
             return super().put(item, size, bulk=bulk)
 
     inbox = FullAtFirst(100, 1000)
-    serve(router, RUN, inbox, [STATE])
+    serve(ZenohTransport(router), RUN, inbox, [STATE])
     future = ask()
     first(inbox).answer(ANSWER)
     assert future.result(WAIT_S) == ANSWER
@@ -271,9 +273,9 @@ def test_service_that_undeclares_its_verbs_is_not_asked(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)
-    for queryable in serve(router, RUN, inbox, [STATE]):
+    for queryable in serve(ZenohTransport(router), RUN, inbox, [STATE]):
         queryable.undeclare()
-    asker = Asker(client, RUN, "learner l", patience_s=0.05)
+    asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable):
         asker.ask(verbs.STATE, REQUEST)
     assert inbox.take(1, 1, 0.0) == []

@@ -29,6 +29,7 @@ from udrl.streams import Purpose, stream_key
 from udrl.training import untrained
 from udrl_learner.service import LearnerService
 from udrl_proto.session import find_run
+from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import create
 from udrl_replay.service import ReplayService
 
@@ -179,12 +180,14 @@ def test_actor_written_from_the_page_serves_a_run(
     with ExitStack() as stack:
         store = create(tmp_path, CONFIG)
         stack.callback(store.close)
-        service = ReplayService(router, store, budget, tmp_path)
+        service = ReplayService(ZenohTransport(router), store, budget, tmp_path)
         serving = threading.Thread(target=service.serve, args=[stop])
         serving.start()
         stack.callback(serving.join)
         stack.callback(stop.set)
-        learner = LearnerService(client, find_run(client, None, 5.0), "learner-1", stop)
+        learner = LearnerService(
+            ZenohTransport(client), find_run(client, None, 5.0), "learner-1", stop
+        )
         training = threading.Thread(target=learner.run)
         training.start()
         stack.callback(training.join)

@@ -28,7 +28,9 @@ from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
 from udrl_replay.arrival import Arrival, inspect
-from udrl_replay.run import Progress, Run
+from udrl_replay.progress import Progress
+from udrl_replay.run import Run
+from udrl_replay.standing import Standing
 from udrl_replay.store import Store, Version
 
 #: Several pages of a file.
@@ -169,7 +171,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
     return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
 
 
-def result(run: Run) -> Result:
+def result(run: Standing) -> Result:
     """Say where a run stands, in the terms of :func:`reference`."""
     version = run.store.version(run.progress.latest_version)
     last = run.store.last_evaluation(closing=False)

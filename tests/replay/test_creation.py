@@ -19,7 +19,7 @@ from udrl.spaces import Category
 from udrl_proto import PROTOCOL, keys
 from udrl_proto.messages import Hello
 from udrl_replay import creation
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import FILE, Store
 
 TOY = Config(environment="Figure2-v0", max_return=2.0)

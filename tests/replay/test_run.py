@@ -39,8 +39,10 @@ from udrl.replay import Entry
 from udrl.schedule import weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage, Status
 from udrl_replay.arrival import Arrival
+from udrl_replay.progress import Progress
 from udrl_replay.reporting import Throughput, Waits, status
-from udrl_replay.run import Progress, Run
+from udrl_replay.run import Run
+from udrl_replay.standing import Standing
 from udrl_replay.store import Store, Version
 
 #: Env steps after which every run of the machine ends at last.
@@ -594,6 +596,6 @@ def test_run_that_is_only_looked_at_writes_nothing(make_run: MakeRun, tmp_path: 
     run = make_run(max_env_steps=20)
     finish(run)
     with closing(Store(tmp_path, read_only=True)) as store:
-        looked_at = Run(store, Budget(max_env_steps=1000))
+        looked_at = Standing(store, Budget(max_env_steps=1000))
         assert looked_at.progress == run.progress
         assert result(looked_at) == result(run)

@@ -11,8 +11,6 @@ import time
 from collections import deque
 from typing import NamedTuple
 
-import zenoh
-
 from udrl.acting import Failure
 from udrl.commands import Command
 from udrl.episode import Episode
@@ -31,6 +29,7 @@ from udrl_proto.messages import (
     Weights,
     WeightsRequest,
 )
+from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
@@ -50,7 +49,7 @@ class Courier(threading.Thread):
     """Talks to the replay service for one actor.
 
     Args:
-        session: connected to the run's router.
+        transport: reaches the run.
         hello: the run's specification.
         join: who the actor is.
         asker: its line to the replay service.
@@ -60,7 +59,7 @@ class Courier(threading.Thread):
 
     def __init__(
         self,
-        session: zenoh.Session,
+        transport: Transport,
         hello: Hello,
         join: JoinRequest,
         asker: Asker,
@@ -68,7 +67,7 @@ class Courier(threading.Thread):
         capacity: int,
     ) -> None:
         super().__init__(name=f"courier of {join.id}", daemon=True)
-        self._session = session
+        self._transport = transport
         self._hello = hello
         self._join = join
         self._asker = asker
@@ -129,7 +128,7 @@ class Courier(threading.Thread):
     def run(self) -> None:
         """Deliver and fetch until the run ends, ``stop`` is set, or the replay service says no."""
         key = keys.key(self._hello.run_id, keys.NEW_WEIGHTS)
-        subscriber = self._session.declare_subscriber(key, self._note_weights)
+        subscriber = self._transport.subscribe(key, self._note_weights)
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
@@ -224,10 +223,10 @@ class Courier(threading.Thread):
 
     # Weights.
 
-    def _note_weights(self, sample: zenoh.Sample) -> None:
+    def _note_weights(self, announcement: bytes) -> None:
         """Keep the newest announcement; it also means that there are new commands."""
         with self._changed:
-            self._announced = sample.payload.to_bytes()
+            self._announced = announcement
             self._changed.notify_all()
 
     def _learn_announced(self) -> None:

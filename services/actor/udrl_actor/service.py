@@ -7,8 +7,6 @@ import platform
 import threading
 import time
 
-import zenoh
-
 import udrl
 from udrl.acting import EpisodeGenerator, Failure
 from udrl.episode import Episode
@@ -18,6 +16,7 @@ from udrl_actor.courier import Courier
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, JoinRequest
+from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
@@ -30,7 +29,7 @@ class ActorService:
     """Carries out commands of one run.
 
     Args:
-        session: connected to the run's router.
+        transport: reaches the run.
         hello: the run's specification.
         name: unique to this process.
         environments: how many to step at once.
@@ -41,14 +40,14 @@ class ActorService:
 
     def __init__(
         self,
-        session: zenoh.Session,
+        transport: Transport,
         hello: Hello,
         name: str,
         environments: int,
         stop: threading.Event,
         hang_s: float | None = None,
     ) -> None:
-        self._session = session
+        self._transport = transport
         self._hello = hello
         self._name = name
         self._environments = environments
@@ -66,7 +65,7 @@ class ActorService:
         config, run_id = self._hello.config, self._hello.run_id
         self._arm()
         generator = EpisodeGenerator(config, self._environments)
-        asker = Asker(self._session, run_id, f"actor {self._name}", self._stop)
+        asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
             join = JoinRequest(
@@ -80,11 +79,9 @@ class ActorService:
                 environment=generator.spec,
             )
             asker.ask(verbs.JOIN, join)
-            token = self._session.liveliness().declare_token(
-                keys.alive(run_id, "actor", self._name)
-            )
+            token = self._transport.appear(keys.alive(run_id, "actor", self._name))
             courier = Courier(
-                self._session, self._hello, join, asker, self._stop, capacity=self._environments
+                self._transport, self._hello, join, asker, self._stop, capacity=self._environments
             )
             courier.start()
             self._act(generator, courier)

@@ -209,8 +209,8 @@ class Served:
 
     def _connected(self) -> tuple[Asker, Hello]:
         if self._line is None:
-            session, hello = self._stack.enter_context(connected("observer", self._address))
-            self._line = Asker(session, hello.run_id, "the board", patience_s=_ANSWER_S), hello
+            transport, hello = self._stack.enter_context(connected("observer", self._address))
+            self._line = Asker(transport, hello.run_id, "the board", patience_s=_ANSWER_S), hello
         return self._line
 
     def _disconnect(self) -> None:

@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import zenoh
-
 from udrl_proto import session as sessions
 from udrl_proto.credentials import load
 from udrl_proto.messages import Hello
+from udrl_proto.transport import Transport
+from udrl_proto.zenoh_transport import ZenohTransport
 
 #: Characters of a machine's name in the names of its services, which are keys.
 _LONGEST_HOST = 30
@@ -43,7 +43,7 @@ class Address(NamedTuple):
 @contextmanager
 def connected(
     role: str, address: Address, stop: threading.Event | None = None
-) -> Iterator[tuple[zenoh.Session, Hello]]:
+) -> Iterator[tuple[Transport, Hello]]:
     """Connect to a run in a role, and find it.
 
     Raises:
@@ -54,7 +54,7 @@ def connected(
     endpoint, run_id, patience_s, keys = address
     credentials = load(keys, role) if keys else None
     with sessions.connect(endpoint, patience_s, stop, credentials) as session:
-        yield session, sessions.find_run(session, run_id, patience_s, stop)
+        yield ZenohTransport(session), sessions.find_run(session, run_id, patience_s, stop)
 
 
 def unique_name(role: str) -> str:

@@ -22,7 +22,7 @@ from udrl.replay import ReplayBuffer
 from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import Store
 
 #: Seconds after which a command that is reproduced shows where it is, again and again.

@@ -15,7 +15,7 @@ from udrl_launch.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import FILE, EvaluationRow, Store
 
 _CARD = """\

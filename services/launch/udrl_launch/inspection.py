@@ -17,7 +17,7 @@ from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Status, StatusRequest
 from udrl_replay.reporting import Throughput, Waits, status
-from udrl_replay.run import Run
+from udrl_replay.standing import Standing
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -32,8 +32,8 @@ def status_at(address: Address) -> Status:
         Unreachable: nobody answers there.
         ConfigError: the endpoint or the keys cannot be used, or the run must be named.
     """
-    with connected("observer", address) as (session, hello):
-        asker = Asker(session, hello.run_id, "udrl status", patience_s=_ANSWER_S)
+    with connected("observer", address) as (transport, hello):
+        asker = Asker(transport, hello.run_id, "udrl status", patience_s=_ANSWER_S)
         return asker.ask(verbs.STATUS, StatusRequest())
 
 
@@ -88,9 +88,9 @@ def read_status(run_dir: Path) -> Status:
     return found
 
 
-def read_run(run_dir: Path, store: Store) -> Run:
+def read_run(run_dir: Path, store: Store) -> Standing:
     """Return a run by its directory and its store, to look at."""
-    return Run(store, budget_of(run_dir))
+    return Standing(store, budget_of(run_dir))
 
 
 def budget_of(run_dir: Path) -> Budget:

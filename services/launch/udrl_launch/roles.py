@@ -15,6 +15,7 @@ from udrl_actor.service import ActorService
 from udrl_launch.address import Address, connected, unique_name
 from udrl_proto import session as sessions
 from udrl_proto.credentials import Credentials
+from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
@@ -55,7 +56,7 @@ def replay(
             where = {"endpoint": endpoint, "pid": os.getpid()}
             endpoint_file = run_dir / ENDPOINT_FILE
             endpoint_file.write_text(json.dumps(where), encoding="utf-8")
-            service = ReplayService(session, store, budget, run_dir, audit)
+            service = ReplayService(ZenohTransport(session), store, budget, run_dir, audit)
             try:
                 service.serve(stop)
             finally:
@@ -80,8 +81,8 @@ def learner(address: Address, stop: threading.Event) -> None:
     require_torch()
     from udrl_learner.service import LearnerService  # the only one that needs torch
 
-    with connected("learner", address, stop) as (session, hello):
-        LearnerService(session, hello, unique_name("learner"), stop).run()
+    with connected("learner", address, stop) as (transport, hello):
+        LearnerService(transport, hello, unique_name("learner"), stop).run()
 
 
 def actor(
@@ -98,5 +99,5 @@ def actor(
     # The courier's thread must get the interpreter soon while the loop steps environments: at the
     # default of 5 ms a query takes 5 ms instead of 0.2.
     sys.setswitchinterval(0.0005)
-    with connected("actor", address, stop) as (session, hello):
-        ActorService(session, hello, unique_name("actor"), environments, stop, hang_s).run()
+    with connected("actor", address, stop) as (transport, hello):
+        ActorService(transport, hello, unique_name("actor"), environments, stop, hang_s).run()

@@ -10,7 +10,7 @@ import msgspec
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch.inspection import budget_of, served_at
 from udrl_proto.messages import Hello
-from udrl_replay.run import Progress
+from udrl_replay.progress import Progress
 from udrl_replay.store import FILE, Store
 
 State = Literal["running", "stopped", "ended", "failed", "unreadable"]

@@ -148,8 +148,8 @@ def _watch(
 ) -> None:
     """Show the status until the services are done or ``stop`` is set."""
     give_up = _GiveUp(services, stop)
-    with connected("observer", address, give_up) as (session, hello):
-        asker = Asker(session, hello.run_id, "the display", give_up)
+    with connected("observer", address, give_up) as (transport, hello):
+        asker = Asker(transport, hello.run_id, "the display", give_up)
         while not stop.wait(_POLL_S):
             services.check()
             if services.done:

@@ -15,8 +15,6 @@ import time
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
-import zenoh
-
 import udrl
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.episode import Episode
@@ -38,6 +36,7 @@ from udrl_proto.messages import (
     VersionMessage,
     Weights,
 )
+from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
@@ -64,22 +63,22 @@ class LearnerService:
     """Trains one run.
 
     Args:
-        session: connected to the run's router.
+        transport: reaches the run.
         hello: the run's specification.
         name: unique to this learner.
         stop: ends everything.
     """
 
     def __init__(
-        self, session: zenoh.Session, hello: Hello, name: str, stop: threading.Event
+        self, transport: Transport, hello: Hello, name: str, stop: threading.Event
     ) -> None:
-        self._session = session
+        self._transport = transport
         self._hello = hello
         self._config = hello.config
         self._spec = hello.environment
         self._name = name
         self._stop = stop
-        self._asker = Asker(session, hello.run_id, f"learner {name}", stop)
+        self._asker = Asker(transport, hello.run_id, f"learner {name}", stop)
         self._progress = threading.Event()
 
     def run(self) -> None:
@@ -95,8 +94,8 @@ class LearnerService:
         try:
             self._join()
             declared += [
-                self._session.liveliness().declare_token(keys.alive(run_id, "learner", self._name)),
-                self._session.declare_subscriber(
+                self._transport.appear(keys.alive(run_id, "learner", self._name)),
+                self._transport.subscribe(
                     keys.key(run_id, keys.PROGRESS), lambda _: self._progress.set()
                 ),
             ]
@@ -223,7 +222,7 @@ class LearnerService:
 
     def _deliver(self, message: VersionMessage) -> None:
         self._asker.ask(verbs.VERSION, message)
-        # DROP, Zenoh's default: one stopped actor must not stall training, and whoever misses
+        # Not acknowledged: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
         announcement = encode(Weights(version=message.version, weights=message.weights))
-        self._session.put(keys.key(self._hello.run_id, keys.NEW_WEIGHTS), announcement)
+        self._transport.publish(keys.key(self._hello.run_id, keys.NEW_WEIGHTS), announcement)

@@ -23,7 +23,8 @@ from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect
-from udrl_replay.run import Progress, Run
+from udrl_replay.progress import Progress
+from udrl_replay.run import Run
 from udrl_replay.store import FILE, Store
 
 log = logging.getLogger("udrl")

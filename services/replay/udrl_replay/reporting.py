@@ -27,7 +27,7 @@ from udrl_proto.messages import (
     Status,
     Waiting,
 )
-from udrl_replay.run import Run
+from udrl_replay.standing import Standing
 from udrl_replay.store import EvaluationRow, Store
 
 COLUMNS = (
@@ -139,7 +139,7 @@ class Waits:
         )
 
 
-def status(run: Run, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
+def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
     progress, dealer, config = run.progress, run.dealer, run.config
     returns = [e.episode_return for e in run.buffer.best(run.config.replay_size)]
@@ -246,7 +246,7 @@ def history(store: Store, after: int) -> History:
     )
 
 
-def contents(run: Run) -> Contents:
+def contents(run: Standing) -> Contents:
     """Return what the replay buffer holds, and what its next commands ask for."""
     config = run.config
     entries = list(run.buffer)

@@ -7,75 +7,26 @@ store when the transaction ends; everything else it can find out again.
 
 import logging
 import math
-import time
 from typing import Literal
-
-import msgspec
 
 from udrl.commands import CLOSING, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Deceived, Refused, RunFailed
 from udrl.evaluation import summarise
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
-from udrl_proto.messages import CommandsRequest, FailureMessage, Hello
+from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_replay.arrival import Arrival
-from udrl_replay.auditing import Auditor
-from udrl_replay.dealing import MAX_DEALT, SUSPICIOUS, Dealer
-from udrl_replay.quarantine import OFFENCES, Quarantine
+from udrl_replay.dealing import SUSPICIOUS
+from udrl_replay.standing import Standing
 from udrl_replay.store import EvaluationRow, Store, Version
+from udrl_replay.trust import Trust
 
 log = logging.getLogger("udrl")
 
-State = Literal["running", "closing", "ended", "failed"]
 
-
-class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """Where a run stands, apart from its episodes, commands and weights.
-
-    Attributes:
-        state: ``running`` up to the last iteration N; ``closing`` while N's final weights are
-            awaited and evaluated; then ``ended``. ``failed``: a command cannot be carried out.
-        iteration: the last one completed; -1 before the warm-up is.
-        env_steps: of warm-up and exploratory episodes of completed iterations.
-        eval_env_steps: of evaluation episodes of completed iterations, closing ones included.
-        issued, accepted, cancelled: the ledger of commands, except what is outstanding.
-        delivered, duplicate, rejected: the ledger of episodes, with ``accepted``.
-        env_failures: commands that actors could not carry out.
-        wall_s: seconds that the run was being worked on, until this was written.
-        latest_version: the newest weights version; 0: none yet.
-        best_version: the version with the best evaluation; 0: none yet.
-        exact: whether the result is still a function of the configuration alone.
-        deceived: the run failed because episodes of an actor that lied have entered it.
-        audit: share of the episodes that a second actor makes again.
-        agreed: those that it made alike.
-    """
-
-    state: State = "running"
-    iteration: int = -1
-    env_steps: int = 0
-    eval_env_steps: int = 0
-    issued: int = 0
-    accepted: int = 0
-    cancelled: int = 0
-    delivered: int = 0
-    duplicate: int = 0
-    rejected: int = 0
-    env_failures: int = 0
-    wall_s: float = 0.0
-    latest_version: int = 0
-    best_version: int = 0
-    best_mean: float | None = None
-    exact: bool = True
-    inexact_reason: str = ""
-    problem: str = ""
-    deceived: bool = False
-    audit: float = 0.0
-    agreed: int = 0
-
-
-class Run:
-    """A run, new or resumed.
+class Run(Standing):
+    """A run that is worked on, new or resumed.
 
     Args:
         store: its file.
@@ -87,30 +38,13 @@ class Run:
     """
 
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
-        self.store = store
-        self.budget = budget
-        self.hello = store.fact("hello", Hello)
-        self.config = self.hello.config
-        self.progress = store.fact("progress", Progress)
-        self.dealer = Dealer()
-        self.auditor = Auditor(audit)
-        self.quarantined = Quarantine(store)
-        self._entered = store.fact("entered", dict[str, int], {})
+        super().__init__(store, budget, audit)
+        self.sampler = CommandSampler(self.config, self.hello.environment)
+        self.trust = Trust(self, self.lose)
         self._evaluated = {
             weights_version(e.iteration, self.config.lead)
             for e in store.evaluations(-1, self.progress.iteration)
         }
-        self.sampler = CommandSampler(self.config, self.hello.environment)
-        self._began = time.monotonic() - self.progress.wall_s
-        held = store.buffer(self.progress.iteration)
-        self.buffer = ReplayBuffer(self.config, (p.entry for p in held))
-        self.digests = {p.entry.id: p.digest for p in held}
-        outstanding = store.commands(cancelled=False)
-        arrived = store.pending_ids()
-        self.dealer.add(c for c in outstanding if c.id not in arrived)
-        self._open = {c.id: c for c in outstanding}
-        if store.read_only:
-            return
         if self.progress.deceived:
             raise Deceived(self.progress.problem)
         self.progress.audit = audit
@@ -124,23 +58,11 @@ class Run:
             self._advance()
             self.save()
 
-    @property
-    def wall_s(self) -> float:
-        """Seconds that the run was being worked on."""
-        return time.monotonic() - self._began
-
     def save(self) -> None:
         """Write the progress; belongs at the end of every transaction that changed something."""
         if self.progress.state in ("running", "closing"):
             self.progress.wall_s = self.wall_s
         self.store.set_fact("progress", self.progress)
-
-    def mark_inexact(self, reason: str) -> None:
-        """Say that the result no longer depends on the configuration alone."""
-        if self.progress.exact:
-            log.warning("the run is no longer exact: %s", reason)
-            self.progress.exact = False
-            self.progress.inexact_reason = reason
 
     # Episodes.
 
@@ -159,15 +81,15 @@ class Run:
         item = self.dealer.outstanding.get(command_id)
         if item is None:
             if self.auditor.asked(arrival.actor, command_id):
-                return self._compare(arrival)
+                return self.trust.compare(arrival)
             return self._accept_again(arrival)
         if arrival.entry.length > item.command.max_steps:
-            self.offend(arrival.actor, f"an episode longer than command {command_id} allows")
+            self.trust.offend(arrival.actor, f"an episode longer than command {command_id} allows")
             raise self.reject(
                 f"episode {command_id} has {arrival.entry.length} steps, its command allows "
                 f"{item.command.max_steps}"
             )
-        self._begin_audit(item.command, arrival)
+        self.trust.note(item.command, arrival)
         self.dealer.remove(command_id, now)
         self.store.add_episode(arrival.entry, arrival.digest, arrival.body)
         self.progress.accepted += 1
@@ -188,9 +110,11 @@ class Run:
         if digest is not None or self._is_done(iteration, index):
             self.progress.duplicate += 1
             return "duplicate"
-        if command_id in self._open or index >= CLOSING or iteration > self.progress.iteration:
+        if index >= CLOSING or iteration > self.progress.iteration:
             raise self.reject(f"command {command_id} is cancelled or unknown; drop the episode")
-        self.offend(arrival.actor, f"an episode of command {command_id}, which was never issued")
+        self.trust.offend(
+            arrival.actor, f"an episode of command {command_id}, which was never issued"
+        )
         raise self.reject(f"command {command_id} was never issued; drop the episode")
 
     def _is_done(self, iteration: int, index: int) -> bool:
@@ -199,6 +123,11 @@ class Run:
             return iteration <= self.progress.iteration and index < self.store.issued_in(iteration)
         closed = self.progress.state == "ended" and iteration == self.progress.iteration > 0
         return closed and index < CLOSING + self.config.eval_episodes
+
+    def deal(self, request: CommandsRequest, now: float) -> list[Command]:
+        """Return commands for an actor that has joined; those to be checked come first."""
+        again, rest = self.trust.assign(request)
+        return again + self.dealer.deal(rest, self.progress.latest_version, now)
 
     def reject(self, why: str) -> Refused:
         """Count a rejected episode and return the refusal to raise."""
@@ -242,80 +171,13 @@ class Run:
         self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
         log.error("%s", RunFailed(self.progress.problem))
 
-    # Whom to believe.
-
-    def deal(self, request: CommandsRequest, now: float) -> list[Command]:
-        """Return commands for an actor that has joined; those to be checked come first."""
-        actor = self.dealer.actors[request.actor]
-        again = self.auditor.assign(
-            actor.join.id, actor.join.numerics_class, request.running,
-            min(request.wanted, MAX_DEALT),
-        )  # fmt: skip
-        actor.reruns += len(again)
-        rest = msgspec.structs.replace(request, wanted=request.wanted - len(again))
-        return again + self.dealer.deal(rest, self.progress.latest_version, now)
-
-    def _begin_audit(self, command: Command, arrival: Arrival) -> None:
-        """Remember who brings an episode, and perhaps have it made again."""
-        name = arrival.actor
-        if name not in self._entered:
-            self._entered[name] = command.iteration
-            self.store.set_fact("entered", self._entered)
-        if name in self.dealer.actors:
-            numerics_class = self.dealer.actors[name].join.numerics_class
-            self.auditor.consider(command, name, numerics_class, arrival.digest)
-
-    def _compare(self, arrival: Arrival) -> Literal["duplicate"]:
-        """Take in an episode that was asked for to check another actor's."""
-        self.progress.duplicate += 1
-        command_id = arrival.entry.id
-        verdict = self.auditor.compare(arrival.actor, command_id, arrival.digest)
-        if verdict is None and command_id in self.auditor.open:
-            log.warning("actors differ on command %d; a third will decide who lied", command_id)
-        elif verdict is None:
-            self.progress.agreed += 1
-        elif verdict.liar is None:
-            self.auditor.stop()
-            self.progress.audit = 0.0
-            self.mark_inexact(
-                f"three actors carried out command {command_id} and all their episodes differ; the "
-                f"environment {self.config.environment} or their machines are not deterministic; "
-                f"nothing is audited any more"
-            )
-        else:
-            self._convict(verdict.liar, command_id)
-        return "duplicate"
-
-    def _convict(self, liar: str, command_id: int) -> None:
-        why = f"its episode of command {command_id} differs from that of two others"
-        self.quarantine(liar, why)
-        if liar in self._entered and self.progress.state not in ("ended", "failed"):
-            self.progress.state = "failed"
-            self.progress.deceived = True
-            self.progress.problem = (
-                f"actor {liar} lied: {why}. Since iteration {self._entered[liar]} the run has "
-                f"learned from its episodes; start a new run without it, in another --run-dir"
-            )
-            log.error("%s", self.progress.problem)
-
-    def offend(self, actor: str, what: str) -> None:
-        """Note that an actor delivered what it may not; too often is once too many."""
-        if self.quarantined.count(actor):
-            self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
-
-    def quarantine(self, actor: str, why: str) -> None:
-        """Take nothing from an actor any more, and give what it holds to others."""
-        self.quarantined.add(actor, why)
-        self.lose(actor)
-
     # Iterations.
 
     def _advance(self) -> None:
         """Complete every iteration whose turn it is and whose episodes are all there."""
         while self.progress.state == "running":
             following = self.progress.iteration + 1
-            issued = following * COMMANDS_PER_ITERATION in self._open
-            if not issued or self.dealer.left(following):
+            if self.dealer.left(following):
                 return
             self._complete(following)
 
@@ -324,8 +186,9 @@ class Run:
         progress = self.progress
         arrived = self.store.pending(iteration)
         ids = [p.entry.id for p in arrived]
-        evaluated = [p.entry for p in arrived if self._open[p.entry.id].kind == "evaluate"]
-        explored = [p for p in arrived if self._open[p.entry.id].kind != "evaluate"]
+        commands = {c.id: c for c in self.open_commands() if c.iteration == iteration}
+        evaluated = [p.entry for p in arrived if commands[p.entry.id].kind == "evaluate"]
+        explored = [p for p in arrived if commands[p.entry.id].kind != "evaluate"]
         steps_before = progress.env_steps
         progress.env_steps += sum(p.entry.length for p in explored)
         progress.eval_env_steps += sum(e.length for e in evaluated)
@@ -340,10 +203,9 @@ class Run:
             del self.digests[gone]
 
         if evaluated:
-            self._note_evaluation(iteration, evaluated, closing=False)
+            self._note_evaluation(commands[evaluated[0].id], evaluated, closing=False)
         best = self.buffer.best(self.config.replay_size)
         returns = [e.episode_return for e in best]
-        commands = [self._open[i] for i in ids]
         self.store.add_iteration(
             iteration,
             len(ids),
@@ -355,12 +217,10 @@ class Run:
             returns[-1],
             math.fsum(p.entry.episode_return for p in explored) / len(explored),
             weights_version(iteration, self.config.lead),
-            *_range([c.desired_return for c in commands if c.kind == "explore"]),
+            *_range([c.desired_return for c in commands.values() if c.kind == "explore"]),
             sum(e.iteration == iteration for e in best),
         )
         self.store.remove_commands(ids)
-        for i in ids:
-            del self._open[i]
 
         due = evaluation_due(iteration, steps_before, progress.env_steps, self.config.eval_every)
         for opened in opened_by(iteration, self.config.lead):
@@ -371,10 +231,10 @@ class Run:
         if self._budget_spent():
             self._close()
 
-    def _note_evaluation(self, iteration: int, entries: list[Entry], *, closing: bool) -> None:
+    def _note_evaluation(self, command: Command, entries: list[Entry], *, closing: bool) -> None:
+        """Summarise what an evaluation's episodes obtained; ``command`` is one of theirs."""
         result = summarise([e.episode_return for e in entries])
-        command = self._open[entries[0].id]
-        version = command.weights_version
+        iteration, version = command.iteration, command.weights_version
         source = self.progress.env_steps if closing else self.store.env_steps_after(version - 1)
         self.store.add_evaluation(
             EvaluationRow(
@@ -394,7 +254,6 @@ class Run:
     def _issue(self, commands: list[Command]) -> None:
         self.store.add_commands(commands)
         self.dealer.add(commands)
-        self._open |= {c.id: c for c in commands}
         self.progress.issued += len(commands)
 
     # The end, and going on after it.
@@ -430,31 +289,29 @@ class Run:
         final = self.progress.iteration
         if self.dealer.outstanding:
             return
-        ids = [i for i in self._open if i % COMMANDS_PER_ITERATION >= CLOSING]
+        commands = self._closing_commands()
         entries = [p.entry for p in self.store.pending(final)]
         self.progress.eval_env_steps += sum(e.length for e in entries)
-        self._note_evaluation(final, entries, closing=True)
+        self._note_evaluation(commands[0], entries, closing=True)
         self.store.remove_episodes(e.id for e in entries)
-        self.store.remove_commands(ids)
-        for i in ids:
-            del self._open[i]
+        self.store.remove_commands(c.id for c in commands)
         self.progress.wall_s = self.wall_s
         self.progress.state = "ended"
+
+    def _closing_commands(self) -> list[Command]:
+        return [c for c in self.open_commands() if c.index >= CLOSING]
 
     def _cancel(self, ids: list[int]) -> None:
         for i in ids:
             self.dealer.remove(i)
-            del self._open[i]
         self.store.mark_commands(ids, cancelled=True)
         self.progress.cancelled += len(ids)
 
     def _reopen(self) -> None:
         """Go on after the end with a larger budget, as if it had not come."""
         final = self.progress.iteration
-        closing = [i for i in self._open if i % COMMANDS_PER_ITERATION >= CLOSING]
+        closing = [c.id for c in self._closing_commands()]
         unfinished = [i for i in closing if i in self.dealer.outstanding]
-        for i in closing:
-            del self._open[i]
         for i in unfinished:
             self.dealer.remove(i)
         self.progress.cancelled += len(unfinished)
@@ -463,14 +320,12 @@ class Run:
         again = self.store.commands(cancelled=True)
         self.store.mark_commands((c.id for c in again), cancelled=False)
         self.progress.cancelled -= len(again)
-        self._open |= {c.id: c for c in again}
         self.dealer.add(again)
         self.progress.state = "running"
 
     def _try_again(self) -> None:
         """Go on with the command that could not be carried out."""
-        closing = any(i % COMMANDS_PER_ITERATION >= CLOSING for i in self._open)
-        self.progress.state = "closing" if closing else "running"
+        self.progress.state = "closing" if self._closing_commands() else "running"
         self.progress.problem = ""
 
     # Weights.
@@ -524,7 +379,7 @@ class Run:
         """Forget what nobody can ask for any more: weights, optimizers and evicted episodes."""
         latest = self.progress.latest_version
         # A run that is resumed after its end takes its cancelled commands up again.
-        wanted = [*self._open.values(), *self.store.commands(cancelled=True)]
+        wanted = self.open_commands() + self.store.commands(cancelled=True)
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
         needed |= self.auditor.versions
         needed |= self._evaluated  # for whoever wants to look at them later

@@ -1,4 +1,4 @@
-"""The replay service: Zenoh queries in, answers out, one thread that owns the run.
+"""The replay service: questions in, answers out, one thread that owns the run.
 
 Questions are taken from the inbox in groups. A group is handled inside one transaction, and its
 answers are sent when that is on disk: under load a sync is shared by many episodes, without load an
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import zenoh
 
 from udrl.config import Budget
 from udrl.digests import arrays_digest
@@ -54,6 +53,7 @@ from udrl_proto.messages import (
     Weights,
     WeightsRequest,
 )
+from udrl_proto.transport import Declaration, Presence, Transport
 from udrl_replay.arrival import Arrival, Malformed, inspect
 from udrl_replay.dealing import MOST_ACTORS
 from udrl_replay.reporting import (
@@ -80,14 +80,6 @@ _LINGER_S = 10.0
 _FAREWELL_S = 0.3
 
 
-class _Presence(NamedTuple):
-    """A liveliness token came or went."""
-
-    role: str
-    name: str
-    here: bool
-
-
 class _Delivery(NamedTuple):
     """A weights version that has been checked."""
 
@@ -99,7 +91,7 @@ class ReplayService:
     """Serves one run over one Zenoh session.
 
     Args:
-        session: the run's router, or a client of one.
+        transport: where it is reached.
         store: the run.
         budget: when it ends.
         run_dir: where ``metrics.csv`` and, at the end, the weights go.
@@ -108,19 +100,19 @@ class ReplayService:
 
     def __init__(
         self,
-        session: zenoh.Session,
+        transport: Transport,
         store: Store,
         budget: Budget,
         run_dir: Path,
         audit: float = 0.0,
     ) -> None:
         self.run = Run(store, budget, audit)
-        self._session = session
+        self._transport = transport
         self._store = store
         self._run_dir = run_dir
         self._metrics = MetricsFile(run_dir, store)
         self._metrics.update(self.run.progress.iteration)
-        self._inbox: Inbox[Question | _Presence] = Inbox(_INBOX, _INBOX_BYTES)
+        self._inbox: Inbox[Question | Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
         self._waits = Waits()
         self._here: set[tuple[str, str]] = set()
@@ -150,12 +142,7 @@ class ReplayService:
             StoreError: the run's file cannot be written.
         """
         run_id = self.run.hello.run_id
-        declared: list[Any] = [
-            self._session.liveliness().declare_subscriber(
-                keys.alive(run_id, "*", "*"), self._presence, history=True
-            ),
-            *self._serve(),
-        ]
+        declared = self.open()
         log.info("replay serves run %s", run_id)
         if self.run.progress.state == "ended":
             log.info("the run has ended; with a greater --max-env-steps it goes on")
@@ -174,15 +161,15 @@ class ReplayService:
         ended_at: float | None = None
         while not stop.is_set():
             # Waits for a quarter of a second at most: time passes also when nobody asks.
-            self._answer(self._inbox.take(_GROUP, _GROUP_BYTES, 0.25))
+            self.answer_waiting(0.25)
             now = time.monotonic()
             if self.run.progress.state in ("ended", "failed"):
                 ended_at = ended_at or now
                 if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
                     return
 
-    def _serve(self) -> list[zenoh.Queryable[None]]:
-        """Declare what is answered; what arrives is checked on the thread that received it."""
+    def open(self) -> list[Declaration]:
+        """Begin to receive questions, which are checked on the thread that receives them."""
         spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
 
@@ -202,20 +189,23 @@ class ReplayService:
 
         longest = spec.max_episode_steps * spec.step_bytes + verbs.FEW
         episode = replace(verbs.EPISODE, limit=longest)
-        return serve(
-            self._session,
-            self.run.hello.run_id,
-            self._inbox,
-            [episode if verb is verbs.EPISODE else verb for verb in verbs.VERBS],
-            {verbs.EPISODE.name: arrive, verbs.VERSION.name: check},
-        )
+        run_id = self.run.hello.run_id
+        return [
+            self._transport.watch(keys.alive(run_id, "*", "*"), self._inbox.must_put),
+            *serve(
+                self._transport,
+                run_id,
+                self._inbox,
+                [episode if verb is verbs.EPISODE else verb for verb in verbs.VERBS],
+                {verbs.EPISODE.name: arrive, verbs.VERSION.name: check},
+            ),
+        ]
 
-    def _presence(self, sample: zenoh.Sample) -> None:
-        _, _, token = keys.parse(str(sample.key_expr))
-        _, role, name = token.split("/", 2)
-        self._inbox.must_put(_Presence(role, name, sample.kind == zenoh.SampleKind.PUT))
+    def answer_waiting(self, timeout_s: float) -> None:
+        """Answer what waits, or comes within so many seconds."""
+        self._answer(self._inbox.take(_GROUP, _GROUP_BYTES, timeout_s))
 
-    def _answer(self, group: list[Question | _Presence]) -> None:
+    def _answer(self, group: list[Question | Presence]) -> None:
         now = time.monotonic()
         run = self.run
         before = run.progress.iteration
@@ -229,7 +219,7 @@ class ReplayService:
                 run.lose(name)
                 self._waits.end(f"actor {name}")
             for item in group:
-                if isinstance(item, _Presence):
+                if isinstance(item, Presence):
                     self._note_presence(item, now)
                 else:
                     answers.append((item, self._reply(item, now)))
@@ -240,12 +230,12 @@ class ReplayService:
             question.answer(reply)
         if run.progress.iteration != before:
             news = encode(Progress(iteration=run.progress.iteration))
-            self._session.put(keys.key(run.hello.run_id, keys.PROGRESS), news)
+            self._transport.publish(keys.key(run.hello.run_id, keys.PROGRESS), news)
 
     def _reply(self, question: Question, now: float) -> Message:
         request: Any = question.request
         if isinstance(request, Malformed):
-            self.run.offend(request.actor, str(request.error))
+            self.run.trust.offend(request.actor, str(request.error))
             request = request.error
         if isinstance(request, InvalidData):
             if question.verb.name == verbs.EPISODE.name:
@@ -259,16 +249,18 @@ class ReplayService:
             log.warning("refused %s: %s", question.verb.name, error)
             return Problem(code=error.code, message=str(error)[:4000])
 
-    def _note_presence(self, presence: _Presence, now: float) -> None:
-        peer = presence.role, presence.name
+    def _note_presence(self, presence: Presence, now: float) -> None:
+        _, _, token = keys.parse(presence.key)
+        _, role, name = token.split("/", 2)
+        peer = role, name
         if presence.here:
             self._here.add(peer)
             log.info("%s %s is here", *peer)
         else:
             self._here.discard(peer)
-            self._waits.end(f"{presence.role} {presence.name}")
-            if presence.role == "actor":
-                self.run.lose(presence.name)
+            self._waits.end(f"{role} {name}")
+            if role == "actor":
+                self.run.lose(name)
             log.info("%s %s left", *peer)
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:

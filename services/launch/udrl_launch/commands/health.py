@@ -30,14 +30,12 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
     """
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
     # A replay service has no key to ask itself with; it is asked whether the endpoint answers.
-    with connected("observer" if role == REPLAY else role, address) as (session, hello):
+    with connected("observer" if role == REPLAY else role, address) as (transport, hello):
         if role == REPLAY:
             click.echo(f"run {hello.run_id} answers at {connect}")
             return 0
         wanted = expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
-        found = [str(r.ok.key_expr).rpartition("/")[2]
-                 for r in session.liveliness().get(wanted, timeout=_ANSWER_S)
-                 if r.ok is not None]  # fmt: skip
+        found = [key.rpartition("/")[2] for key in transport.present(wanted, _ANSWER_S)]
     there = [name for name in found if is_of_this_machine(name, role)]
     if not there:
         raise Unreachable(

@@ -1,0 +1,127 @@
+"""A transport without a network, for services that share a process, and for tests."""
+
+import threading
+from collections.abc import Callable, Iterator
+
+from udrl_proto.transport import Answer, Presence, Query
+
+
+class Exchange:
+    """What connects the transports of one process."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.answering: dict[str, Callable[[Query], None]] = {}
+        self.subscribed: list[tuple[str, Callable[[bytes], None]]] = []
+        self.watching: list[tuple[str, Callable[[Presence], None]]] = []
+        self.here: list[str] = []
+
+    def tell(self, presence: Presence) -> None:
+        """Tell who watches that a service came or went."""
+        with self.lock:
+            told = [r for pattern, r in self.watching if _matches(pattern, presence.key)]
+        for receive in told:
+            receive(presence)
+
+
+class MemoryTransport:
+    """One service's end of an :class:`Exchange`. What is sent is received on the sender's thread.
+
+    Args:
+        exchange: that it has in common with others.
+    """
+
+    def __init__(self, exchange: Exchange) -> None:
+        self._exchange = exchange
+
+    def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+        """Yield the answer to a question."""
+        receive = self._exchange.answering.get(key)
+        if receive is None:
+            return
+        query = _MemoryQuery(data)
+        receive(query)
+        query.settled.wait(timeout_s)
+        if query.answer is not None:
+            yield query.answer
+
+    def answer(self, key: str, receive: Callable[[Query], None]) -> "_Declared":
+        """Have the questions on a key received."""
+        self._exchange.answering[key] = receive
+        return _Declared(lambda: self._exchange.answering.pop(key))
+
+    def publish(self, key: str, data: bytes) -> None:
+        """Tell whoever listens."""
+        with self._exchange.lock:
+            told = [receive for held, receive in self._exchange.subscribed if held == key]
+        for receive in told:
+            receive(data)
+
+    def subscribe(self, key: str, receive: Callable[[bytes], None]) -> "_Declared":
+        """Have what is published on a key received."""
+        subscribed, entry = self._exchange.subscribed, (key, receive)
+        with self._exchange.lock:
+            subscribed.append(entry)
+        return _Declared(lambda: subscribed.remove(entry))
+
+    def appear(self, key: str) -> "_Declared":
+        """Say that a service is here."""
+        with self._exchange.lock:
+            self._exchange.here.append(key)
+        self._exchange.tell(Presence(key, here=True))
+
+        def vanish() -> None:
+            self._exchange.here.remove(key)
+            self._exchange.tell(Presence(key, here=False))
+
+        return _Declared(vanish)
+
+    def present(self, key: str, timeout_s: float) -> list[str]:
+        """Return the keys of services that are here."""
+        with self._exchange.lock:
+            return [held for held in self._exchange.here if _matches(key, held)]
+
+    def watch(self, key: str, receive: Callable[[Presence], None]) -> "_Declared":
+        """Have it received who appears and goes."""
+        watching, entry = self._exchange.watching, (key, receive)
+        with self._exchange.lock:
+            watching.append(entry)
+            here = [held for held in self._exchange.here if _matches(key, held)]
+        for held in here:
+            receive(Presence(held, here=True))
+        return _Declared(lambda: watching.remove(entry))
+
+
+class _Declared:
+    def __init__(self, undeclare: Callable[[], object]) -> None:
+        self._undeclare = undeclare
+
+    def undeclare(self) -> None:
+        self._undeclare()
+
+
+class _MemoryQuery:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.answer: Answer | None = None
+        self.settled = threading.Event()
+
+    @property
+    def data(self) -> bytes:
+        return self._data
+
+    def reply(self, answer: Answer) -> None:
+        self.answer = answer
+        self.settled.set()
+
+    def drop(self) -> None:
+        self.settled.set()
+
+
+def _matches(pattern: str, key: str) -> bool:
+    """Say whether a key is one of a pattern's, with ``*`` for any part, and ``$*`` for any end."""
+    wanted, found = pattern.split("/"), key.split("/")
+    return len(wanted) == len(found) and all(
+        w == "*" or w == f or (w.endswith("$*") and f.startswith(w[:-2]))
+        for w, f in zip(wanted, found, strict=True)
+    )

@@ -1,0 +1,98 @@
+"""Zenoh as a transport; ``session`` opens its sessions."""
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zenoh
+
+from udrl_proto.transport import Answer, Declaration, Presence, Query
+
+log = logging.getLogger("udrl")
+
+#: How our own errors are told from Zenoh's, such as a timeout.
+_OURS = zenoh.Encoding.APPLICATION_OCTET_STREAM
+
+
+class ZenohTransport:
+    """A Zenoh session.
+
+    Args:
+        session: whose; it is closed by whoever opened it.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+        """Yield the answers to a question; Zenoh's own errors are none."""
+        for reply in self._session.get(
+            key,
+            payload=data,
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        ):
+            if reply.ok is not None:
+                yield Answer(reply.ok.payload.to_bytes(), is_problem=False)
+            elif reply.err is not None and reply.err.encoding == _OURS:
+                found = reply.err.payload.to_bytes()
+                if found != b"Timeout":
+                    yield Answer(found, is_problem=True)
+
+    def answer(self, key: str, receive: Callable[[Query], None]) -> Declaration:
+        """Declare a queryable."""
+        return self._session.declare_queryable(
+            key, lambda query: receive(_ZenohQuery(key, query)), complete=True
+        )
+
+    def publish(self, key: str, data: bytes) -> None:
+        """Put; congestion drops it, which is Zenoh's default."""
+        self._session.put(key, data)
+
+    def subscribe(self, key: str, receive: Callable[[bytes], None]) -> Declaration:
+        """Declare a subscriber."""
+        return self._session.declare_subscriber(
+            key, lambda sample: receive(sample.payload.to_bytes())
+        )
+
+    def appear(self, key: str) -> Declaration:
+        """Declare a liveliness token, which goes with the process."""
+        return self._session.liveliness().declare_token(key)
+
+    def present(self, key: str, timeout_s: float) -> list[str]:
+        """Ask for liveliness tokens."""
+        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def watch(self, key: str, receive: Callable[[Presence], None]) -> Declaration:
+        """Declare a liveliness subscriber."""
+
+        def note(sample: zenoh.Sample) -> None:
+            receive(Presence(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+
+        return self._session.liveliness().declare_subscriber(key, note, history=True)
+
+
+class _ZenohQuery:
+    def __init__(self, key: str, query: zenoh.Query) -> None:
+        self._key = key
+        self._query = query
+
+    @property
+    def data(self) -> bytes:
+        payload: Any = self._query.payload
+        return b"" if payload is None else bytes(payload.to_bytes())
+
+    def reply(self, answer: Answer) -> None:
+        try:
+            with self._query:
+                if answer.is_problem:
+                    self._query.reply_err(answer.data, encoding=_OURS)
+                else:
+                    self._query.reply(self._key, answer.data)
+        except zenoh.ZError as error:
+            log.debug("an answer on %s could not be sent: %s", self._key, error)
+
+    def drop(self) -> None:
+        self._query.drop()

@@ -1,0 +1,67 @@
+"""A run as its store has it: to be looked at, or to go on from."""
+
+import logging
+import time
+
+from udrl.commands import Command
+from udrl.config import Budget
+from udrl.replay import ReplayBuffer
+from udrl_proto.messages import Hello
+from udrl_replay.auditing import Auditor
+from udrl_replay.dealing import Dealer
+from udrl_replay.progress import Progress
+from udrl_replay.quarantine import Quarantine
+from udrl_replay.store import Store
+
+log = logging.getLogger("udrl")
+
+
+class Standing:
+    """Where a run stands. Making one changes nothing.
+
+    Args:
+        store: the run's file.
+        budget: when it ends.
+        audit: share of the episodes that a second actor makes again, 0 to 1.
+
+    Attributes:
+        hello: the run specification.
+        progress: counters and state.
+        buffer: the replay buffer after the last completed iteration.
+        digests: of its episodes, by id.
+        dealer: commands without an episode, and who carries them out.
+        auditor: episodes that are made again, to check who made them.
+        quarantined: actors that are shut out.
+    """
+
+    def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
+        self.store = store
+        self.budget = budget
+        self.hello = store.fact("hello", Hello)
+        self.config = self.hello.config
+        self.progress = store.fact("progress", Progress)
+        self.dealer = Dealer()
+        self.auditor = Auditor(audit)
+        self.quarantined = Quarantine(store)
+        held = store.buffer(self.progress.iteration)
+        self.buffer = ReplayBuffer(self.config, (p.entry for p in held))
+        self.digests = {p.entry.id: p.digest for p in held}
+        arrived = store.pending_ids()
+        self.dealer.add(c for c in self.open_commands() if c.id not in arrived)
+        self._began = time.monotonic() - self.progress.wall_s
+
+    def open_commands(self) -> list[Command]:
+        """Return the commands of iterations that are not complete, by id."""
+        return self.store.commands(cancelled=False)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds that the run was being worked on."""
+        return time.monotonic() - self._began
+
+    def mark_inexact(self, reason: str) -> None:
+        """Say that the result no longer depends on the configuration alone."""
+        if self.progress.exact:
+            log.warning("the run is no longer exact: %s", reason)
+            self.progress.exact = False
+            self.progress.inexact_reason = reason

@@ -1,0 +1,95 @@
+"""Whom to believe: what follows from audits and offences."""
+
+import logging
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+
+from udrl.commands import Command
+from udrl_proto.messages import CommandsRequest
+from udrl_replay.arrival import Arrival
+from udrl_replay.dealing import MAX_DEALT
+from udrl_replay.quarantine import OFFENCES
+from udrl_replay.standing import Standing
+
+log = logging.getLogger("udrl")
+
+
+class Trust:
+    """Judges the actors of a run.
+
+    Args:
+        run: whose auditor, quarantine and progress these are.
+        lose: gives what an actor holds to others.
+    """
+
+    def __init__(self, run: Standing, lose: Callable[[str], None]) -> None:
+        self._run = run
+        self._lose = lose
+        # The iteration in which an actor's first episode entered the run.
+        self._entered = run.store.fact("entered", dict[str, int], {})
+
+    def assign(self, request: CommandsRequest) -> tuple[list[Command], CommandsRequest]:
+        """Return commands to be carried out again, and the request for what else is wanted."""
+        actor = self._run.dealer.actors[request.actor]
+        again = self._run.auditor.assign(
+            actor.join.id, actor.join.numerics_class, request.running,
+            min(request.wanted, MAX_DEALT),
+        )  # fmt: skip
+        actor.reruns += len(again)
+        return again, msgspec.structs.replace(request, wanted=request.wanted - len(again))
+
+    def note(self, command: Command, arrival: Arrival) -> None:
+        """Remember who brings an episode, and perhaps have it made again."""
+        run, name = self._run, arrival.actor
+        if name not in self._entered:
+            self._entered[name] = command.iteration
+            run.store.set_fact("entered", self._entered)
+        if name in run.dealer.actors:
+            numerics_class = run.dealer.actors[name].join.numerics_class
+            run.auditor.consider(command, name, numerics_class, arrival.digest)
+
+    def compare(self, arrival: Arrival) -> Literal["duplicate"]:
+        """Take in an episode that was asked for to check another actor's."""
+        run, command_id = self._run, arrival.entry.id
+        run.progress.duplicate += 1
+        verdict = run.auditor.compare(arrival.actor, command_id, arrival.digest)
+        if verdict is None and command_id in run.auditor.open:
+            log.warning("actors differ on command %d; a third will decide who lied", command_id)
+        elif verdict is None:
+            run.progress.agreed += 1
+        elif verdict.liar is None:
+            run.auditor.stop()
+            run.progress.audit = 0.0
+            run.mark_inexact(
+                f"three actors carried out command {command_id} and all their episodes differ; the "
+                f"environment {run.config.environment} or their machines are not deterministic; "
+                f"nothing is audited any more"
+            )
+        else:
+            self._convict(verdict.liar, command_id)
+        return "duplicate"
+
+    def _convict(self, liar: str, command_id: int) -> None:
+        why = f"its episode of command {command_id} differs from that of two others"
+        self.quarantine(liar, why)
+        progress = self._run.progress
+        if liar in self._entered and progress.state not in ("ended", "failed"):
+            progress.state = "failed"
+            progress.deceived = True
+            progress.problem = (
+                f"actor {liar} lied: {why}. Since iteration {self._entered[liar]} the run has "
+                f"learned from its episodes; start a new run without it, in another --run-dir"
+            )
+            log.error("%s", progress.problem)
+
+    def offend(self, actor: str, what: str) -> None:
+        """Note that an actor delivered what it may not; too often is once too many."""
+        if self._run.quarantined.count(actor):
+            self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
+
+    def quarantine(self, actor: str, why: str) -> None:
+        """Take nothing from an actor any more, and give what it holds to others."""
+        self._run.quarantined.add(actor, why)
+        self._lose(actor)

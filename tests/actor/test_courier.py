@@ -1,0 +1,220 @@
+"""The courier against a scripted replay service."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from tests.proto.scripted import Scripted
+from udrl.actions import Categorical
+from udrl.commands import Command
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import Refused
+from udrl.graph import acting_graph
+from udrl.inference import probe_weights
+from udrl.spaces import Vector
+from udrl.streams import Purpose, stream_key
+from udrl.weights import encode_weights
+from udrl_actor.courier import Courier, Order
+from udrl_proto import PROTOCOL, keys, verbs
+from udrl_proto.asking import Asker
+from udrl_proto.messages import (
+    CommandsReply,
+    CommandsRequest,
+    EpisodeReply,
+    Hello,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Problem,
+    Wait,
+    Weights,
+)
+from whole_run import wait_for
+
+CONFIG = Config(environment="Synthetic-v0", hidden=(4, 4))
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
+)
+GRAPH = acting_graph(CONFIG, SPEC)
+HELLO = Hello(
+    protocol=PROTOCOL, software="0", run_id="scripted", config=CONFIG, environment=SPEC,
+    graph=GRAPH,
+)  # fmt: skip
+JOIN = JoinRequest(
+    role="actor", id="a", host="h", pid=1, software="0", environments=2, numerics_class="c",
+    environment=SPEC,
+)  # fmt: skip
+WEIGHTS = encode_weights(probe_weights(GRAPH))
+DEADLINE_S = 10.0
+
+
+def command(number: int, version: int = 0) -> Command:
+    return Command(
+        id=number,
+        kind="explore",
+        desired_return=1.0,
+        desired_horizon=4,
+        environment_seed=1_000_000,
+        stream_key=stream_key(1, Purpose.EPISODE, 1, number),
+        weights_version=version,
+        max_steps=4,
+    )
+
+
+def episode(number: int) -> Episode:
+    return Episode(
+        command_id=number,
+        observations=np.zeros((1, 2), np.float32),
+        actions=np.zeros(1, np.uint8),
+        rewards=np.zeros(1, np.float32),
+        terminated=True,
+        truncated=False,
+    )
+
+
+class Deals:
+    """Answers to one question for commands after another; then there is nothing to do."""
+
+    def __init__(self, *answers: Message) -> None:
+        self._answers = list(answers)
+
+    def __call__(self, request: CommandsRequest) -> Message:
+        if self._answers:
+            return self._answers.pop(0)
+        return CommandsReply(wait=Wait(on="nothing", retry_after_s=0.05))
+
+
+@pytest.fixture
+def replay() -> Scripted:
+    scripted = Scripted(HELLO.run_id)
+    scripted.answers(verbs.JOIN, lambda _: JoinReply())
+    scripted.answers(verbs.WEIGHTS, lambda r: Weights(version=r.version, weights=WEIGHTS))
+    scripted.answers(verbs.EPISODE, lambda _: EpisodeReply(result="accepted"))
+    return scripted
+
+
+@pytest.fixture
+def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
+    stop = threading.Event()
+    started: list[Courier] = []
+
+    def begin(*answers: Message) -> Courier:
+        replay.answers(verbs.COMMANDS, Deals(*answers))
+        asker = Asker(replay.transport, HELLO.run_id, "actor a", stop)
+        courier = Courier(replay.transport, HELLO, JOIN, asker, stop, capacity=2)
+        courier.start()
+        started.append(courier)
+        return courier
+
+    yield begin
+    stop.set()
+    for courier in started:
+        courier.join(DEADLINE_S)
+        assert not courier.is_alive()
+
+
+def take(courier: Courier, n: int) -> list[Order]:
+    """Exchange until ``n`` orders have come."""
+    orders: list[Order] = []
+
+    def more() -> bool:
+        orders.extend(courier.exchange([], n - len(orders), 0, wait_s=0.5))
+        return len(orders) == n
+
+    wait_for(more, "orders", DEADLINE_S)
+    return orders
+
+
+def test_commands_come_with_the_weights_that_they_name(
+    replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    courier = start(CommandsReply(commands=(command(1), command(2, version=3))))
+    random, acting = take(courier, 2)
+    assert (random.command, random.behavior) == (command(1), None)
+    assert acting.command == command(2, version=3)
+    assert acting.behavior is not None
+    assert encode_weights(acting.behavior.weights) == WEIGHTS
+    assert [request.version for request in replay.requests(verbs.WEIGHTS)] == [3]
+
+
+def test_weights_that_were_announced_are_not_asked_for(
+    replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    courier = start()
+    courier.exchange([], 1, 0, wait_s=0.0)
+    wait_for(lambda: replay.requests(verbs.COMMANDS), "a question", DEADLINE_S)
+    replay.publish(keys.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
+    replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
+    (order,) = take(courier, 1)
+    assert order.behavior is not None
+    assert replay.requests(verbs.WEIGHTS) == []
+
+
+def test_service_that_was_started_again_is_joined_again(
+    replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    unknown = Problem(code="join_first", message="who is that?")
+    courier = start(unknown, CommandsReply(commands=(command(1),)))
+    assert [order.command.id for order in take(courier, 1)] == [1]
+    assert replay.requests(verbs.JOIN) == [JOIN]
+
+
+def test_command_whose_weights_are_gone_is_dropped(
+    replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    gone = Problem(code="unknown_version", message="weights version 3 is not kept")
+    replay.answers(verbs.WEIGHTS, lambda _: gone)
+    courier = start(CommandsReply(commands=(command(1, version=3), command(2))))
+    assert [order.command.id for order in take(courier, 1)] == [2]
+    # It is no longer among those that the actor says it holds.
+    courier.exchange([], 1, 0, wait_s=0.0)
+    wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
+
+
+def test_episode_is_delivered_and_its_command_no_longer_held(
+    replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    courier = start(CommandsReply(commands=(command(1), command(2))))
+    take(courier, 2)
+    courier.exchange([episode(1)], 1, 1, wait_s=0.0)
+    wait_for(lambda: replay.requests(verbs.EPISODE), "the episode", DEADLINE_S)
+    assert replay.requests(verbs.EPISODE)[0].command_id == 1
+    wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
+
+
+def test_rejected_episode_is_let_go(
+    replay: Scripted, start: Callable[..., Courier], caplog: pytest.LogCaptureFixture
+) -> None:
+    replay.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))
+    courier = start(CommandsReply(commands=(command(1),)))
+    take(courier, 1)
+    with caplog.at_level(logging.INFO, "udrl"):
+        courier.exchange([episode(1)], 1, 1, wait_s=0.0)
+        wait_for(lambda: "the run has ended" in caplog.text, "the log", DEADLINE_S)
+    assert courier.error is None
+
+
+@pytest.mark.parametrize("verb", [verbs.COMMANDS, verbs.EPISODE], ids=lambda verb: verb.name)
+def test_other_refusals_reach_the_loop_that_steps_environments(
+    verb: verbs.Verb[Message, Message], replay: Scripted, start: Callable[..., Courier]
+) -> None:
+    courier = start(CommandsReply(commands=(command(1),)))
+    take(courier, 1)
+    replay.answers(verb, lambda _: Problem(code="quarantined", message="it lied"))
+    courier.exchange([episode(1)], 1, 1, wait_s=0.0)
+    wait_for(lambda: courier.error, "the error", DEADLINE_S)
+    assert isinstance(courier.error, Refused)
+    assert courier.error.code == "quarantined"
+
+
+def test_end_of_the_run_ends_it(start: Callable[..., Courier]) -> None:
+    courier = start(CommandsReply(ended=True))
+    courier.exchange([], 1, 0, wait_s=DEADLINE_S)
+    courier.join(DEADLINE_S)
+    assert courier.ended
+    assert courier.error is None

@@ -1,0 +1,198 @@
+"""The learner service against a scripted replay service."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.proto.scripted import Scripted
+from udrl.actions import Categorical
+from udrl.config import Config
+from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
+from udrl.errors import Refused
+from udrl.graph import acting_graph
+from udrl.segments import Experience
+from udrl.spaces import Vector
+from udrl.training import train, untrained
+from udrl.weights import encode_weights
+from udrl_learner.service import LearnerService
+from udrl_proto import PROTOCOL, verbs
+from udrl_proto.codec import encode_episode
+from udrl_proto.messages import (
+    ChangesReply,
+    ChangesRequest,
+    EpisodesReply,
+    EpisodesRequest,
+    Hello,
+    JoinReply,
+    Message,
+    Problem,
+    StateReply,
+    VersionMessage,
+    VersionReply,
+    Wait,
+)
+
+CONFIG = Config(
+    environment="Synthetic-v0", batch_size=4, hidden=(4, 4), n_updates_per_iter=2, replay_size=4,
+    last_few=1,
+)  # fmt: skip
+SPEC = EnvironmentSpec(
+    observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
+)
+HELLO = Hello(
+    protocol=PROTOCOL, software="0", run_id="scripted", config=CONFIG, environment=SPEC,
+    graph=acting_graph(CONFIG, SPEC),
+)  # fmt: skip
+
+
+def episode(number: int) -> Episode:
+    rng = np.random.default_rng(number)
+    return Episode(
+        command_id=number,
+        observations=rng.standard_normal((3, 2), np.float32),
+        actions=rng.integers(3, size=3).astype(np.uint8),
+        rewards=rng.standard_normal(3, np.float32),
+        terminated=True,
+        truncated=False,
+    )
+
+
+def weights_after(*buffers: list[int]) -> bytes:
+    """Train a version on each buffer, one after another."""
+    state, experience = untrained(CONFIG, SPEC), Experience(CONFIG, SPEC)
+    for ids in buffers:
+        for gone in experience.ids() - set(ids):
+            experience.remove(gone)
+        for new in set(ids) - experience.ids():
+            experience.add(episode(new))
+        train(state, experience.by_rank(ids), CONFIG)
+    return encode_weights(state.weights)
+
+
+#: The buffer that each version is trained on; then the run has ended.
+BUFFERS = {1: [1, 2], 2: [2, 3], 3: [3, 4, 2]}
+
+
+@pytest.fixture
+def replay() -> Scripted:
+    scripted = Scripted(HELLO.run_id)
+
+    def changes(request: ChangesRequest) -> ChangesReply:
+        if request.version not in BUFFERS:
+            return ChangesReply(ended=True)
+        return ChangesReply(ids=tuple(BUFFERS[request.version]))
+
+    def episodes(request: EpisodesRequest) -> EpisodesReply:
+        # One a page: the learner must go on asking.
+        return EpisodesReply(episodes=(encode_episode(episode(request.ids[0]), "a"),))
+
+    scripted.answers(verbs.JOIN, lambda _: JoinReply())
+    scripted.answers(verbs.STATE, lambda _: StateReply(version=0))
+    scripted.answers(verbs.CHANGES, changes)
+    scripted.answers(verbs.EPISODES, episodes)
+    scripted.answers(verbs.VERSION, lambda _: VersionReply(result="accepted"))
+    return scripted
+
+
+@pytest.fixture
+def run(replay: Scripted) -> Callable[[], None]:
+    return LearnerService(replay.transport, HELLO, "l", threading.Event()).run
+
+
+def delivered(replay: Scripted) -> list[tuple[int, bytes]]:
+    versions: list[VersionMessage] = replay.requests(verbs.VERSION)
+    return [(message.version, message.weights) for message in versions]
+
+
+def test_versions_are_those_of_training_on_each_buffer(
+    replay: Scripted, run: Callable[[], None]
+) -> None:
+    run()
+    buffers = list(BUFFERS.values())
+    assert delivered(replay) == [(v, weights_after(*buffers[:v])) for v in (1, 2, 3)]
+
+
+def test_only_episodes_that_are_new_are_fetched(replay: Scripted, run: Callable[[], None]) -> None:
+    run()
+    first = [request.ids[0] for request in replay.requests(verbs.EPISODES)]
+    assert first == [1, 2, 3, 4]
+
+
+def test_next_buffer_is_asked_for_while_a_version_is_trained(
+    replay: Scripted, run: Callable[[], None]
+) -> None:
+    asked = threading.Event()
+
+    def changes(request: ChangesRequest) -> ChangesReply:
+        if request.version == 2:
+            asked.set()
+        return ChangesReply(ids=(1, 2)) if request.version == 1 else ChangesReply(ended=True)
+
+    def version(message: VersionMessage) -> VersionReply:
+        assert asked.wait(10.0), "version 1 came before the next buffer was asked for"
+        return VersionReply(result="accepted")
+
+    replay.answers(verbs.CHANGES, changes)
+    replay.answers(verbs.VERSION, version)
+    run()
+    assert [v for v, _ in delivered(replay)] == [1]
+
+
+@pytest.mark.parametrize(
+    "verb", [verbs.CHANGES, verbs.EPISODES, verbs.VERSION], ids=lambda v: v.name
+)
+def test_learner_that_is_out_of_step_starts_from_the_state(
+    verb: verbs.Verb[Any, Any], replay: Scripted, run: Callable[[], None]
+) -> None:
+    """What it trains in the end is the same."""
+    code = "unknown_episode" if verb is verbs.EPISODES else "rewind"
+    answers: dict[str, Callable[[Any], Message]] = {
+        "changes": lambda r: (
+            ChangesReply(ids=tuple(BUFFERS[r.version]))
+            if r.version in BUFFERS
+            else ChangesReply(ended=True)
+        ),
+        "episodes": lambda r: EpisodesReply(episodes=(encode_episode(episode(r.ids[0]), "a"),)),
+        "version": lambda _: VersionReply(result="accepted"),
+    }
+    refused = False
+
+    def once(request: Any) -> Message:
+        nonlocal refused
+        if not refused:
+            refused = True
+            return Problem(code=code, message="no")
+        return answers[verb.name](request)
+
+    replay.answers(verb, once)
+    run()
+    assert len(replay.requests(verbs.STATE)) == 2
+    assert delivered(replay)[-1] == (3, weights_after(*BUFFERS.values()))
+
+
+def test_refusal_that_starting_over_does_not_mend_is_raised(
+    replay: Scripted, run: Callable[[], None]
+) -> None:
+    replay.answers(verbs.VERSION, lambda _: Problem(code="unequal_version", message="differs"))
+    with pytest.raises(Refused, match="differs"):
+        run()
+
+
+def test_delivery_that_fails_is_noticed_while_the_next_buffer_is_awaited(
+    replay: Scripted, run: Callable[[], None]
+) -> None:
+    """The replay service waits for the version, and would never have the next buffer."""
+
+    def changes(request: ChangesRequest) -> ChangesReply:
+        if request.version == 1:
+            return ChangesReply(ids=(1, 2))
+        return ChangesReply(wait=Wait(on="actors", retry_after_s=0.05))
+
+    replay.answers(verbs.CHANGES, changes)
+    replay.answers(verbs.VERSION, lambda _: Problem(code="invalid", message="diverged"))
+    with pytest.raises(Refused, match="diverged"):
+        run()

@@ -1,0 +1,47 @@
+"""A replay service that answers from a script, without a network."""
+
+from collections.abc import Callable
+from typing import Any
+
+from udrl_proto import keys
+from udrl_proto.codec import decode, encode
+from udrl_proto.memory_transport import Exchange, MemoryTransport
+from udrl_proto.messages import Message, Problem
+from udrl_proto.transport import Answer, Query
+from udrl_proto.verbs import Verb
+
+
+class Scripted:
+    """Answers what it was told to answer, and remembers what it was asked.
+
+    Args:
+        run_id: of the run that it pretends to serve.
+
+    Attributes:
+        transport: reaches it.
+        asked: name of the verb and request of each question, in their order.
+    """
+
+    def __init__(self, run_id: str) -> None:
+        self._run_id = run_id
+        self.transport = MemoryTransport(Exchange())
+        self.asked: list[tuple[str, Any]] = []
+
+    def answers(self, verb: Verb[Any, Any], script: Callable[[Any], Message]) -> None:
+        """Answer a verb's questions by a function of the request."""
+
+        def receive(query: Query) -> None:
+            request = decode(query.data, verb.request, verb.limit)
+            self.asked.append((verb.name, request))
+            answer = script(request)
+            query.reply(Answer(encode(answer), is_problem=isinstance(answer, Problem)))
+
+        self.transport.answer(keys.key(self._run_id, verb.name), receive)
+
+    def publish(self, name: str, message: Message) -> None:
+        """Publish a message."""
+        self.transport.publish(keys.key(self._run_id, name), encode(message))
+
+    def requests(self, verb: Verb[Any, Any]) -> list[Any]:
+        """Return the questions of a verb."""
+        return [request for name, request in self.asked if name == verb.name]

@@ -1,0 +1,101 @@
+"""Both transports do what services need of one."""
+
+import queue
+import threading
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from udrl_proto.memory_transport import Exchange, MemoryTransport
+from udrl_proto.transport import Answer, Presence, Query, Transport
+from udrl_proto.zenoh_transport import ZenohTransport
+from whole_run import wait_for
+
+KEY = "udrl/2/run/status"
+ALIVE = "udrl/2/run/alive/actor"
+WAIT_S = 10.0
+
+Ends = tuple[Transport, Transport]
+
+
+@pytest.fixture(params=["memory", "zenoh"])
+def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
+    """The ends of a replay service and of a client."""
+    if request.param == "memory":
+        exchange = Exchange()
+        yield MemoryTransport(exchange), MemoryTransport(exchange)
+    else:
+        router: zenoh.Session = request.getfixturevalue("router")
+        client: zenoh.Session = request.getfixturevalue("client")
+        yield ZenohTransport(router), ZenohTransport(client)
+
+
+def ask(client: Transport, data: bytes = b"?", timeout_s: float = WAIT_S) -> list[Answer]:
+    return list(client.ask(KEY, data, timeout_s))
+
+
+@pytest.mark.parametrize("is_problem", [False, True])
+def test_question_is_answered(ends: Ends, is_problem: bool) -> None:
+    service, client = ends
+    service.answer(KEY, lambda query: query.reply(Answer(query.data + b"!", is_problem)))
+    wait_for(lambda: ask(client) == [Answer(b"?!", is_problem)], "the answer")
+
+
+def test_question_may_be_answered_from_another_thread(ends: Ends) -> None:
+    service, client = ends
+    waiting: queue.Queue[Query] = queue.Queue()
+    service.answer(KEY, waiting.put)
+
+    def answer() -> None:
+        waiting.get(timeout=WAIT_S).reply(Answer(b"late", is_problem=False))
+
+    threading.Thread(target=answer, daemon=True).start()
+    wait_for(lambda: ask(client) == [Answer(b"late", is_problem=False)], "the answer")
+
+
+def test_nobody_answers_what_is_dropped_or_was_never_declared_or_no_longer_is(ends: Ends) -> None:
+    service, client = ends
+    assert ask(client) == []
+    declared = service.answer(KEY, lambda query: query.drop())
+    assert ask(client) == []
+    declared.undeclare()
+    assert ask(client) == []
+
+
+def test_question_that_hangs_is_given_up(ends: Ends) -> None:
+    service, client = ends
+    hanging: list[Query] = []
+    service.answer(KEY, hanging.append)
+    wait_for(lambda: ask(client, timeout_s=0.1) == [] and hanging, "the question")
+    hanging[0].drop()
+
+
+def test_news_reach_who_listens_until_it_does_not(ends: Ends) -> None:
+    service, client = ends
+    heard: queue.Queue[bytes] = queue.Queue()
+    subscription = client.subscribe(KEY, heard.put)
+
+    def is_heard() -> bool:
+        service.publish(KEY, b"news")
+        return not heard.empty()
+
+    wait_for(is_heard, "the news")
+    assert heard.get() == b"news"
+    subscription.undeclare()
+
+
+def test_who_appears_and_goes_is_told(ends: Ends) -> None:
+    service, client = ends
+    early = client.appear(f"{ALIVE}/early")
+    wait_for(lambda: service.present(f"{ALIVE}/*", WAIT_S), "the first")
+    seen: queue.Queue[Presence] = queue.Queue()
+    watching = service.watch("udrl/2/run/alive/*/*", seen.put)
+    assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=True)
+    late = client.appear(f"{ALIVE}/late")
+    assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/late", here=True)
+    assert service.present(f"{ALIVE}/ea$*", WAIT_S) == [f"{ALIVE}/early"]
+    early.undeclare()
+    assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=False)
+    watching.undeclare()
+    late.undeclare()
