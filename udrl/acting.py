@@ -71,6 +71,9 @@ class EpisodeGenerator:
         self._rows = Rows(config, n_environments, make)
         self.spec = self._rows.spec
         self._memory = FrameStack(self.spec.observation_space, config)
+        # What the networks see where it is no more than what is observed.
+        single = self._memory.length == 1
+        self._seen = self._memory.join(self._rows.observation) if single else None
         self._target = ReturnInTime(config)
         self._recording = Recording(self.spec, n_environments)
         self._commands: list[Command | None] = [None] * n_environments
@@ -86,6 +89,7 @@ class EpisodeGenerator:
         # says of choosing.
         self._desired = np.zeros((n_environments, self._target.size))
         self._cap = np.full(n_environments, np.inf)
+        self._n_capped = 0
         self._parameters = np.zeros((n_environments, self.spec.action_space.n_parameters))
         self._temperature = np.ones((n_environments, 1))
         # The rounds from and before which its actions are random, and how many rows have such.
@@ -123,8 +127,10 @@ class EpisodeGenerator:
         self._planned = False
         self._recording.begin(row, command)
         self._desired[row] = command.desired_return, command.desired_horizon
-        self._cap[row] = np.inf if command.cap is None else command.cap
-        self._target.bound(self._desired, self._cap)
+        if command.cap is not None:
+            self._cap[row] = command.cap
+            self._n_capped += 1
+            self._target.bound(self._desired, self._cap)
         self._parameters[row] = 0.0
         self._temperature[row] = command.temperature or 1.0
         if command.random_steps:
@@ -144,7 +150,9 @@ class EpisodeGenerator:
         over, broken = rows.step(self._active, actions)
         recording.end_round(actions, rows.reward)
         # Lines 8, 9 and 11 of Algorithm 2; nobody reads the rows of idle environments.
-        self._target.advance(self._desired, rows.reward, self._cap)
+        self._target.advance(self._desired, rows.reward)
+        if self._n_capped:
+            self._target.bound(self._desired, self._cap)
         outcomes: list[Episode | Failure] = [self._finish(*ended) for ended in over]
         return outcomes + [self._give_up(row, "step", error) for row, error in broken]
 
@@ -168,11 +176,9 @@ class EpisodeGenerator:
         """Compute the parameters of P(a | s_t, c_t) in every row."""
         if not self._calls:
             return
-        memory = self._memory
-        if memory.length == 1:
-            seen = memory.join(self._rows.observation)
-        else:
-            seen = self._recording.stacks(memory)
+        seen = self._seen
+        if seen is None:
+            seen = self._recording.stacks(self._memory)
         for call, rows in self._calls:
             seen.take(rows, axis=0, out=call.observation, mode="clip")
             self._desired.take(rows, axis=0, out=call.command, mode="clip")
@@ -212,6 +218,9 @@ class EpisodeGenerator:
         if command.random_steps:
             self._random_from[row] = _NEVER
             self._n_random -= 1
+        if command.cap is not None:
+            self._cap[row] = np.inf
+            self._n_capped -= 1
         return command
 
     def _command_of(self, row: int) -> Command:

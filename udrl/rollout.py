@@ -110,7 +110,8 @@ class Rollout:
         rounded = np.float32(reward)
         self.steps += 1
         self.episode_return += float(rounded)
-        self._target.advance(self._desired, np.array([rounded]), self._cap)
+        self._target.advance(self._desired, np.array([rounded]))
+        self._target.bound(self._desired, self._cap)
         return float(rounded)
 
     def picture(self) -> npt.NDArray[np.uint8]:

@@ -40,20 +40,16 @@ class ReturnInTime:
             desired_return = float(desired_horizon)
         return desired_return, max(1, desired_horizon)
 
-    def advance(
-        self, desired: Desired, reward: npt.NDArray[np.float32], cap: npt.NDArray[np.float64]
-    ) -> None:
+    def advance(self, desired: Desired, reward: npt.NDArray[np.float32]) -> None:
         """Count down in place, after a step: lines 8, 9 and 11 of Algorithm 2.
 
         Args:
             desired: of each row.
             reward: r_t, float32 [rows].
-            cap: the greatest desired return there may be, float64 [rows].
         """
         desired[:, 0] -= reward
         desired[:, 1] -= 1.0
-        self.bound(desired, cap)
 
     def bound(self, desired: Desired, cap: npt.NDArray[np.float64]) -> None:
-        """Lower desired returns to a cap, in place (section 2.3.6)."""
+        """Lower desired returns to a cap, float64 [rows], in place (section 2.3.6)."""
         np.minimum(desired[:, 0], cap, out=desired[:, 0])

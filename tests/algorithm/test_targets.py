@@ -13,15 +13,14 @@ def target(**values: Any) -> ReturnInTime:
 
 def test_counting_down_is_lines_8_9_and_11_of_algorithm_2() -> None:
     desired = np.array([[10.0, 5.0], [3.0, 1.0]])
-    target().advance(desired, np.array([2.5, -1.0], np.float32), np.array([np.inf, np.inf]))
+    target().advance(desired, np.array([2.5, -1.0], np.float32))
     assert desired.tolist() == [[7.5, 4.0], [4.0, 0.0]]
 
 
 def test_desired_return_never_exceeds_the_cap() -> None:
-    desired = np.array([[10.0, 5.0], [10.0, 5.0]])
-    cap = np.array([11.0, np.inf])
-    target().advance(desired, np.array([-2.0, -2.0], np.float32), cap)
-    assert desired.tolist() == [[11.0, 4.0], [12.0, 4.0]]
+    desired = np.array([[12.0, 5.0], [12.0, 5.0]])
+    target().bound(desired, np.array([11.0, np.inf]))
+    assert desired.tolist() == [[11.0, 5.0], [12.0, 5.0]]
 
 
 @pytest.mark.parametrize(("horizon", "said"), [(7, 7), (0, 1), (-3, 1)])
