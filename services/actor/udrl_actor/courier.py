@@ -14,28 +14,22 @@ from typing import NamedTuple
 from udrl.acting import Failure
 from udrl.commands import Command
 from udrl.episode import Episode
-from udrl.errors import InvalidMessage, Refused
+from udrl.errors import Refused
 from udrl.inference import ActingFunction
-from udrl.weights import decode_behavior
+from udrl_actor.behaviors import Behaviors
 from udrl_actor.outbox import Outbox
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
-from udrl_proto.codec import LARGEST, decode, encode_episode
+from udrl_proto.codec import encode_episode
 from udrl_proto.messages import (
     CommandsRequest,
     FailureMessage,
     Hello,
     JoinRequest,
-    Weights,
-    WeightsRequest,
 )
 from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
-
-
-#: Seconds that the announcement of a version may come later than a command that needs it.
-_ANNOUNCEMENT_S = 0.25
 
 
 class Order(NamedTuple):
@@ -79,10 +73,8 @@ class Courier(threading.Thread):
         self._held: set[int] = set()
         self._free = 0
         self._steps = 0
-        self._announced: bytes | None = None
         self._acknowledged = False
-        self._behaviors: dict[int, ActingFunction] = {}
-        self._newest = 0
+        self._behaviors = Behaviors(hello, asker, self._changed)
         self.ended = False
         self.error: Exception | None = None
 
@@ -128,7 +120,7 @@ class Courier(threading.Thread):
     def run(self) -> None:
         """Deliver and fetch until the run ends, ``stop`` is set, or the replay service says no."""
         key = keys.key(self._hello.run_id, keys.NEW_WEIGHTS)
-        subscriber = self._transport.subscribe(key, self._note_weights)
+        subscriber = self._transport.subscribe(key, self._behaviors.note)
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
@@ -167,11 +159,11 @@ class Courier(threading.Thread):
     @property
     def _has_news(self) -> bool:
         """Whether there may be commands that were not there when it was asked last."""
-        return self._announced is not None or self._acknowledged
+        return self._behaviors.is_announced or self._acknowledged
 
     def _fetch(self, wanted: int, rate: float) -> float:
         """Ask for commands; return when to ask again at the earliest."""
-        self._learn_announced()
+        self._behaviors.learn_announced()
         with self._changed:
             running = tuple(sorted(self._held))
         request = CommandsRequest(
@@ -180,7 +172,7 @@ class Courier(threading.Thread):
             running=running,
             spare_cores=(os.cpu_count() or 1) - os.getloadavg()[0],
             env_steps_per_s=round(rate, 1),
-            weights_version=self._newest,
+            weights_version=self._behaviors.newest,
         )
         try:
             reply = self._asker.ask(verbs.COMMANDS, request)
@@ -221,28 +213,10 @@ class Courier(threading.Thread):
             self._acknowledged = True
             self._changed.notify_all()
 
-    # Weights.
-
-    def _note_weights(self, announcement: bytes) -> None:
-        """Keep the newest announcement; it also means that there are new commands."""
-        with self._changed:
-            self._announced = announcement
-            self._changed.notify_all()
-
-    def _learn_announced(self) -> None:
-        with self._changed:
-            payload, self._announced = self._announced, None
-        if payload is None:
-            return
-        try:
-            self._learn(decode(payload, Weights, LARGEST))
-        except InvalidMessage as error:
-            log.warning("an announcement of weights was ignored: %s", error)
-
     def _order(self, command: Command) -> Order | None:
         """Return a command with its weights; None when they are gone, and the command with them."""
         try:
-            return Order(command, self._behavior(command.weights_version))
+            return Order(command, self._behaviors.of(command.weights_version))
         except Refused as refusal:
             if refusal.code != "unknown_version":
                 raise
@@ -250,30 +224,3 @@ class Courier(threading.Thread):
             with self._changed:
                 self._held.discard(command.id)
             return None
-
-    def _behavior(self, version: int) -> ActingFunction | None:
-        """Return a weights version, asking for it if it was not announced."""
-        if version == 0:
-            return None
-        if version > self._newest:
-            self._await_announcement(version)
-        if version not in self._behaviors:
-            request = WeightsRequest(version=version)
-            self._learn(self._asker.ask(verbs.WEIGHTS, request))
-        return self._behaviors[version]
-
-    def _await_announcement(self, version: int) -> None:
-        """Wait a moment for weights that may be on their way, so that they travel once."""
-        deadline = time.monotonic() + _ANNOUNCEMENT_S
-        while self._newest < version and (left := deadline - time.monotonic()) > 0:
-            with self._changed:
-                self._changed.wait_for(lambda: self._announced is not None, left)
-            self._learn_announced()
-
-    def _learn(self, message: Weights) -> None:
-        self._behaviors[message.version] = decode_behavior(self._hello.graph, message.weights)
-        self._newest = max(self._newest, message.version)
-        # Commands of lead + 1 iterations are about, each with its own version; the oldest to have
-        # been learned goes first, whatever its number, since a restored run may go back.
-        while len(self._behaviors) > self._hello.config.lead + 2:
-            del self._behaviors[next(iter(self._behaviors))]
