@@ -18,6 +18,9 @@ from udrl.streams import Stream
 #: float32 of vectors, uint8 of images, int32 of categories.
 Observations = npt.NDArray[np.float32] | npt.NDArray[np.uint8] | npt.NDArray[np.int32]
 
+#: Each has a vector of its own in the network.
+MOST_CATEGORIES = 2**20
+
 Size = Annotated[int, Meta(ge=1, le=2**20)]
 
 
@@ -115,7 +118,7 @@ class Image(Space, frozen=True, tag="image"):
 class Category(Space, frozen=True, tag="category"):
     """One of ``n``, an index from 0 on, int32 []."""
 
-    n: Annotated[int, Meta(ge=1, le=2**30)]
+    n: Annotated[int, Meta(ge=1, le=MOST_CATEGORIES)]
 
     @property
     def shape(self) -> tuple[int, ...]:

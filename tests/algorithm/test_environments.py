@@ -203,6 +203,12 @@ def test_a_discrete_observation_with_an_offset_is_shifted_to_zero(register: Regi
         assert observation == state + 1
 
 
+def test_more_states_than_there_can_be_vectors_are_refused(register: Register) -> None:
+    name = register(lambda: Blank(spaces.Discrete(2**20 + 1), spaces.Discrete(2)))
+    with pytest.raises(UnsupportedEnvironment, match=r"1,048,577 states.*at most 1,048,576"):
+        make(name)
+
+
 def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(VECTOR, spaces.Discrete(3, start=5)))
     env = make(name)

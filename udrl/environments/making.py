@@ -18,7 +18,7 @@ from msgspec import Meta
 from udrl.actions import ActionSpace, Categorical
 from udrl.config import Config
 from udrl.errors import UnsupportedEnvironment
-from udrl.spaces import ObservationSpace, observation_space
+from udrl.spaces import MOST_CATEGORIES, ObservationSpace, observation_space
 
 Environment = gym.Env[Any, Any]
 
@@ -88,6 +88,13 @@ def _remedy(error: Exception) -> str:
 def _with_plain_observations(env: Environment, name: str) -> Environment:
     space = env.observation_space
     if isinstance(space, spaces.Discrete):
+        if space.n > MOST_CATEGORIES:
+            env.close()
+            raise UnsupportedEnvironment(
+                f"environment {name!r} has {space.n:,} states, and the network would learn a "
+                f"vector for each; at most {MOST_CATEGORIES:,} are supported; wrap it, so that it "
+                f"shows numbers that describe a state"
+            )
         return env if space.start == 0 else _with_indices_from_0(env, space)
     if isinstance(space, spaces.Box) and min(space.shape, default=0) > 0:
         if len(space.shape) == 1:
