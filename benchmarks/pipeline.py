@@ -2,8 +2,9 @@
 
 A run is a function of its configuration, so its episodes, their lengths and the order of versions
 do not depend on the hardware; only time does. One run is made here and its episode lengths are
-recorded; the costs of its parts are measured; then the same run is simulated with any number of
-cores and actors. ``--check`` makes the same run with real services and prints both::
+recorded; the costs of its parts are measured, that of a version in a run with services; then the
+same run is simulated with any number of cores and actors. ``--check`` makes the same run with real
+services and prints both::
 
     python benchmarks/pipeline.py --max-env-steps 100000 --actors 1 2 4 --check
     python benchmarks/pipeline.py --max-env-steps 100000 --cores 2 4 8 16 --actors 1 3 7 15
@@ -14,6 +15,8 @@ import heapq
 import itertools
 import json
 import math
+import sqlite3
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -39,9 +42,10 @@ from udrl_launch.settings import Settings, gather
 from udrl_launch.training import train
 from udrl_replay.run import Run
 
-#: Seconds between a question and its answer on this machine, and from a version trained to a
-#: version that commands can name; measured (docs/performance.md).
-_ANSWER_S, _VERSION_S = 0.001, 0.006
+#: Seconds on this machine, in runs: between a question and its answer; from an episode's end to the
+#: sync that acknowledges it; from an iteration's end to its episodes at the learner; from a version
+#: trained to commands that name it (docs/performance.md).
+_ANSWER_S, _SYNC_S, _FETCH_S, _VERSION_S = 0.001, 0.005, 0.010, 0.0126
 
 
 class Costs(NamedTuple):
@@ -53,6 +57,8 @@ class Costs(NamedTuple):
         sleep: of a row, without CPU.
         version: from the buffer to a version trained.
         answer: between a question and its answer.
+        sync: from an episode's end to its acknowledgement.
+        fetch: from an iteration's end to its episodes at the learner.
         delivery: from a version trained to commands that name it.
     """
 
@@ -61,6 +67,8 @@ class Costs(NamedTuple):
     version: float
     sleep: float = 0.0
     answer: float = _ANSWER_S
+    sync: float = _SYNC_S
+    fetch: float = _FETCH_S
     delivery: float = _VERSION_S
 
 
@@ -106,7 +114,7 @@ class Simulation:
         self._last = max(self._of_iteration)
         self._undealt: list[int] = []
         self._left: dict[int, int] = {}
-        self._completed, self._version, self._trained = -1, 0, 0
+        self._completed, self._held, self._version, self._trained = -1, -1, 0, 0
         self._is_training = False
         self._ends: dict[int, float] = {}
         self._now = 0.0
@@ -168,7 +176,7 @@ class Simulation:
             if not actor.running[command_id]:
                 del actor.running[command_id]
                 actor.free += 1
-                self._at(self._costs.answer, "arrived", command_id)
+                self._at(self._costs.sync, "arrived", command_id)
         if actor.free and not actor.asking and self._undealt:
             actor.asking = True
             self._at(self._costs.answer, "answered", actor)
@@ -179,13 +187,17 @@ class Simulation:
         while self._completed < self._last and self._left.get(self._completed + 1) == 0:
             self._completed += 1
             self._ends[self._completed] = self._now
+            self._at(self._costs.fetch, "fetched", self._completed)
             for iteration in opened_by(self._completed, self._lead):
                 self._open(iteration)
-        self._train()
         self._wake()
 
+    def _fetched(self, iteration: int) -> None:
+        self._held = iteration
+        self._train()
+
     def _train(self) -> None:
-        if not self._is_training and self._completed >= self._trained:
+        if not self._is_training and self._held >= self._trained:
             self._is_training = True
             self._at(self._costs.version, "trained_one", None)
 
@@ -200,40 +212,34 @@ class Simulation:
         self._wake()
 
 
-def record(settings: Settings) -> tuple[Recorded, list[float]]:
-    """Make a run in this process; return it, and the seconds that each version took to train."""
+def record(settings: Settings) -> Recorded:
+    """Make a run in this process."""
     lengths: dict[int, int] = {}
-    seconds: list[float] = []
-    accept, add_version = Run.accept, Run.add_version
+    accept = Run.accept
 
     def note_episode(self: Run, arrival: Any, now: float) -> Any:
         if arrival.entry.id % COMMANDS_PER_ITERATION < CLOSING:
             lengths[arrival.entry.id] = arrival.entry.length
         return accept(self, arrival, now)
 
-    def note_version(self: Run, version: Any, train_s: float) -> Any:
-        seconds.append(train_s)
-        return add_version(self, version, train_s)
-
     with (
         tempfile.TemporaryDirectory() as folder,
         mock.patch.object(Run, "accept", note_episode),
-        mock.patch.object(Run, "add_version", note_version),
     ):
         train(settings, Path(folder) / "run", threading.Event(), in_process=True)
     complete = max(lengths) // COMMANDS_PER_ITERATION - settings.config.lead - 1
     kept = {i: n for i, n in lengths.items() if i // COMMANDS_PER_ITERATION <= complete}
-    return Recorded(kept, settings.config), seconds
+    return Recorded(kept, settings.config)
 
 
-def measure(config: Config) -> tuple[float, float]:
-    """Return the CPU seconds of a round without rows and of a row, by a fit over 1 to 8 rows."""
+def measure(config: Config, version_s: float) -> Costs:
+    """Time rounds of 1 to 8 rows alone; a version's training has been timed in a run."""
     times = {n: _round(config, n) for n in (1, 2, 4, 8)}
     mean_n, mean_t = sum(times) / len(times), sum(times.values()) / len(times)
     row = sum((n - mean_n) * (t - mean_t) for n, t in times.items()) / sum(
         (n - mean_n) ** 2 for n in times
     )
-    return max(mean_t - row * mean_n, 0.0), row
+    return Costs(max(mean_t - row * mean_n, 0.0), row, version_s)
 
 
 def _round(config: Config, rows: int) -> float:
@@ -263,8 +269,8 @@ def _command(number: int, max_steps: int) -> Command:
     )
 
 
-def real(options: argparse.Namespace, actors: int) -> float:
-    """Return the env steps per second of the services themselves."""
+def real(options: argparse.Namespace, actors: int) -> tuple[float, float]:
+    """Return the env steps per second of the services, and the median training of a version."""
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
         command = [
@@ -274,7 +280,9 @@ def real(options: argparse.Namespace, actors: int) -> float:
         ]  # fmt: skip
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         window = _window(run_dir)
-    return window.steps / window.seconds
+        with closing(sqlite3.connect(run_dir / "run.sqlite")) as file:
+            trained = [seconds for (seconds,) in file.execute("SELECT train_s FROM versions")]
+    return window.steps / window.seconds, statistics.median(trained)
 
 
 def main() -> None:
@@ -288,9 +296,9 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="make the same runs with services")
     options = parser.parse_args()
     settings = gather(options.env, options={"max_env_steps": options.max_env_steps})
-    recorded, seconds = record(settings)
-    by_round, by_row = measure(settings.config)
-    costs = Costs(by_round, by_row, sorted(seconds)[len(seconds) // 2])
+    found = {n: real(options, n) for n in (options.actors if options.check else [2])}
+    version_s = statistics.median(seconds for _, seconds in found.values())
+    recorded, costs = record(settings), measure(settings.config, version_s)
     print(json.dumps(costs._asdict()))
     pairs: Iterator[tuple[float, int]] = (
         itertools.product(options.cores, options.actors)
@@ -301,8 +309,8 @@ def main() -> None:
         speed = Simulation(recorded, costs, cores, actors, options.envs_per_actor).run()
         line = f"{cores:6.0f} cores {actors:4d} actors: {speed:10,.0f} env steps/s"
         if options.check:
-            found = real(options, actors)
-            line += f", the services {found:10,.0f} ({speed / found - 1:+.1%})"
+            services = found[actors][0]
+            line += f", the services {services:10,.0f} ({speed / services - 1:+.1%})"
         print(line, flush=True)
 
 
