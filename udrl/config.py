@@ -9,7 +9,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -177,6 +177,31 @@ def _refuse_non_finite(settings: msgspec.Struct) -> None:
         for number in value.values() if isinstance(value, dict) else [value]:
             if isinstance(number, float) and not math.isfinite(number):
                 raise ConfigError(f"{name} = {value}: must be a finite number")
+
+
+#: What some settings need to have an effect.
+_NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
+    "dataset_sha256": (lambda config: config.dataset is not None, "a dataset"),
+    "hold_steps": (lambda config: config.held_actions > 0, "held_actions above 0"),
+    "return_lambda": (lambda config: config.baseline == "value", "baseline = 'value'"),
+    "training_threads": (lambda config: config.device != "cuda", "device = 'cpu'"),
+}
+
+
+def refuse_idle(config: Config, names: Iterable[str]) -> None:
+    """Raise :class:`ConfigError` for a setting that has no effect beside the others.
+
+    Args:
+        config: all settings.
+        names: those that somebody asked for.
+    """
+    for name in names:
+        has_effect, need = _NEEDS.get(name, (lambda config: True, ""))
+        if not has_effect(config):
+            raise ConfigError(
+                f"{name} = {getattr(config, name)!r} has no effect: it needs {need}; leave it out, "
+                f"or set that too"
+            )
 
 
 def preset_names() -> list[str]:

@@ -51,3 +51,28 @@ def test_file_of_another_environment_is_refused(tmp_path: Path) -> None:
 def test_unknown_setting_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown setting '{name}'"):
         gather("CartPole-v1", options={name: 1})
+
+
+@pytest.mark.parametrize(
+    ("idle", "needed"),
+    [
+        ("hold_steps=9", "held_actions=0.5"),
+        ("return_lambda=0.5", "baseline=value"),
+        ("dataset_sha256=00", "dataset=some/thing-v0"),
+        ("training_threads=2", "device=cpu"),
+    ],
+)
+def test_setting_that_has_no_effect_is_refused(idle: str, needed: str) -> None:
+    name = idle.partition("=")[0]
+    without = ["device=cuda"] if name == "training_threads" else []
+    with pytest.raises(
+        ConfigError, match=rf"^{name} = .* has no effect: it needs .*; leave it out"
+    ):
+        gather("Figure2-v0", options={}, assignments=[*without, idle])
+    gather("Figure2-v0", options={}, assignments=[idle, needed])
+
+
+def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:
+    file = tmp_path / "config.toml"
+    file.write_text("hold_steps = 9\n")
+    assert gather("Figure2-v0", file=file, options={}).config.hold_steps == 9

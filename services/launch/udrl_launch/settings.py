@@ -15,6 +15,7 @@ from udrl.config import (
     preset,
     preset_names,
     read_toml,
+    refuse_idle,
     refuse_unknown,
 )
 from udrl.errors import ConfigError
@@ -77,7 +78,7 @@ def gather(
         assignments: those of ``--set``.
 
     Raises:
-        ConfigError: a setting is unknown or impossible.
+        ConfigError: a setting is unknown or impossible, or one of ``--set`` has no effect.
     """
     values: dict[str, Any] = dict(stored or {})
     if preset_name is None and stored is None and environment in preset_names():
@@ -87,8 +88,10 @@ def gather(
     if file is not None:
         values |= _from_file(file, environment)
     values |= {name: value for name, value in options.items() if value is not None}
+    asked_for: list[str] = []
     for text in assignments:
         name, value = parse_assignment(text)
+        asked_for.append(name)
         if name == "environment":
             raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
         values[name] = value
@@ -99,4 +102,6 @@ def gather(
     def part(kind: type[Kind]) -> Kind:
         return build(kind, {n: v for n, v in values.items() if n in kind.__struct_fields__})
 
-    return Settings(part(Config), part(Budget), part(Fleet))
+    config = part(Config)
+    refuse_idle(config, asked_for)
+    return Settings(config, part(Budget), part(Fleet))
