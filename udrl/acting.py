@@ -154,7 +154,7 @@ class EpisodeGenerator:
         if self._n_capped:
             self._target.bound(self._desired, self._cap)
         outcomes: list[Episode | Failure] = [self._finish(*ended) for ended in over]
-        return outcomes + [self._give_up(row, "step", error) for row, error in broken]
+        return outcomes + [self._give_up(row, error) for row, error in broken]
 
     def close(self) -> None:
         """Close all environments."""
@@ -205,11 +205,11 @@ class EpisodeGenerator:
             return _failure("step", command, ValueError(found))
         return episode
 
-    def _give_up(self, row: int, where: str, error: Exception) -> Failure:
+    def _give_up(self, row: int, error: Exception) -> Failure:
         self._recording.drop(row)
         command = self._release(row)
         self._rows.replace(row)
-        return _failure(where, command, error)
+        return _failure("step", command, error)
 
     def _release(self, row: int) -> Command:
         command = self._command_of(row)

@@ -1,25 +1,21 @@
 """What actions are: how they are chosen from the behavior function's outputs, and checked."""
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
-from msgspec import Meta
 
-from udrl.spaces import Space, outside
+from udrl.spaces import Indices
 
 Actions = npt.NDArray[np.integer[Any]]
 Numbers = npt.NDArray[np.float64]
 
 
-class Categorical(Space, frozen=True, tag="categorical"):
+class Categorical(Indices, frozen=True, tag="categorical"):
     """One of ``n`` actions, an index from 0 on; the behavior function gives a logit for each.
 
     An action takes one uniform number.
     """
-
-    n: Annotated[int, Meta(ge=1, le=2**31 - 1)]
 
     @property
     def n_parameters(self) -> int:
@@ -27,19 +23,9 @@ class Categorical(Space, frozen=True, tag="categorical"):
         return self.n
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """[]."""
-        return ()
-
-    @property
     def dtype(self) -> np.dtype[Any]:
         """The smaller of uint8 and int32 that holds them."""
         return np.dtype(np.uint8 if self.n <= 256 else np.int32)
-
-    @property
-    def gymnasium(self) -> spaces.Space[Any]:
-        """``Discrete``."""
-        return spaces.Discrete(self.n)
 
     def sample(self, logits: Numbers, temperature: Numbers, uniforms: Numbers) -> Actions:
         """Return an action of each row, by inverse CDF in float64.
@@ -96,9 +82,6 @@ class Categorical(Space, frozen=True, tag="categorical"):
             return int(self.mode(logits[None])[0])
         divisor = np.array([[temperature]])
         return int(self.sample(logits[None], divisor, np.array([uniform]))[0])
-
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
-        return outside(values, self.n)
 
 
 #: The kinds there are.

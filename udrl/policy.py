@@ -45,7 +45,7 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        memory = FrameStack(spec.observation_space, config)
+        self._memory = memory = FrameStack(spec.observation_space, config)
         self.observation_shape = memory.shape if memory.length > 1 else spec.observation_space.shape
         self._rng = rng or np.random.default_rng()
 
@@ -99,7 +99,7 @@ class Policy:
                 f"desired return {desired_return}, desired horizon {desired_horizon}: these and "
                 f"the observation must be finite numbers"
             )
-        stacks = FrameStack(space, self.config).join(seen.reshape(1, n, *space.shape))
+        stacks = self._memory.join(seen.reshape(1, n, *space.shape))
         row = self.behavior.logits(stacks.astype(space.dtype), desired)[0]
         logits: npt.NDArray[np.float64] = row.astype(np.float64)
         return logits

@@ -62,9 +62,6 @@ class Rows:
         self.observation: Observations = np.zeros((n, *space.shape), space.dtype)
         self.reward = np.zeros(n, np.float32)
 
-    def __len__(self) -> int:
-        return len(self._envs)
-
     def reset(self, row: int, seed: int, max_steps: int) -> Exception | None:
         """Begin an episode; what the environment raises is returned."""
         try:

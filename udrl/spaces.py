@@ -58,14 +58,28 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="
         return None
 
 
-def outside(values: npt.NDArray[Any], n: int) -> str | None:
-    """Say in what way indices are not all in [0, n), or None."""
-    if values.size == 0:
-        return None
-    least, greatest = int(values.min()), int(values.max())
-    if least >= 0 and greatest < n:
-        return None
-    return f"from {least} to {greatest}, expected 0 to {n - 1}"
+class Indices(Space, frozen=True):
+    """The whole numbers from 0 on, below ``n``."""
+
+    n: Annotated[int, Meta(ge=1, le=2**31 - 1)]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[]."""
+        return ()
+
+    @property
+    def gymnasium(self) -> spaces.Space[Any]:
+        """``Discrete``."""
+        return spaces.Discrete(self.n)
+
+    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+        if values.size == 0:
+            return None
+        least, greatest = int(values.min()), int(values.max())
+        if least >= 0 and greatest < self.n:
+            return None
+        return f"from {least} to {greatest}, expected 0 to {self.n - 1}"
 
 
 class Vector(Space, frozen=True, tag="vector"):
@@ -115,28 +129,15 @@ class Image(Space, frozen=True, tag="image"):
         return spaces.Box(0, 255, self.shape, np.uint8)
 
 
-class Category(Space, frozen=True, tag="category"):
+class Category(Indices, frozen=True, tag="category"):
     """One of ``n``, an index from 0 on, int32 []."""
 
     n: Annotated[int, Meta(ge=1, le=MOST_CATEGORIES)]
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """[]."""
-        return ()
-
-    @property
     def dtype(self) -> np.dtype[Any]:
         """int32."""
         return np.dtype(np.int32)
-
-    @property
-    def gymnasium(self) -> spaces.Space[Any]:
-        """``Discrete``."""
-        return spaces.Discrete(self.n)
-
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
-        return outside(values, self.n)
 
 
 ObservationSpace = Vector | Image | Category

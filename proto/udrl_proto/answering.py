@@ -15,9 +15,7 @@ from udrl_proto.codec import decode, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
 from udrl_proto.transport import Answer, Declaration, Query, Transport
-from udrl_proto.verbs import VERBS, Verb
-
-AnyVerb = Verb[Any, Any]
+from udrl_proto.verbs import VERBS, AnyVerb
 
 
 @dataclass(frozen=True)

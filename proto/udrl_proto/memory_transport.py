@@ -19,8 +19,8 @@ class Exchange:
     def tell(self, presence: Presence) -> None:
         """Tell who watches that a service came or went."""
         with self.lock:
-            told = [r for pattern, r in self.watching if _matches(pattern, presence.key)]
-        for receive in told:
+            watchers = [r for pattern, r in self.watching if _matches(pattern, presence.key)]
+        for receive in watchers:
             receive(presence)
 
 
@@ -51,10 +51,10 @@ class MemoryTransport:
         return _Declared(lambda: self._exchange.answering.pop(key))
 
     def publish(self, key: str, data: bytes) -> None:
-        """Tell whoever listens."""
+        """Send to all subscribers."""
         with self._exchange.lock:
-            told = [receive for held, receive in self._exchange.subscribed if held == key]
-        for receive in told:
+            subscribers = [receive for held, receive in self._exchange.subscribed if held == key]
+        for receive in subscribers:
             receive(data)
 
     def subscribe(self, key: str, receive: Callable[[bytes], None]) -> "_Declared":

@@ -69,7 +69,7 @@ class Transport(Protocol):
         ...
 
     def publish(self, key: str, data: bytes) -> None:
-        """Tell whoever listens; it may be lost."""
+        """Send to all subscribers; it may be lost."""
         ...
 
     def subscribe(self, key: str, receive: Callable[[bytes], None]) -> Declaration:

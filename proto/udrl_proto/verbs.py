@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from udrl_proto.codec import LARGEST, PAGE, SMALL
 from udrl_proto.messages import (
@@ -82,10 +82,12 @@ STATUS = Verb("status", StatusRequest, Status, _OBSERVER)
 HISTORY = Verb("history", HistoryRequest, History, _OBSERVER)
 CONTENTS = Verb("contents", ContentsRequest, Contents, _OBSERVER)
 
-VERBS: tuple[Verb[Message, Message], ...] = (
+AnyVerb = Verb[Any, Any]
+
+VERBS: tuple[AnyVerb, ...] = (
     HELLO, JOIN, COMMANDS, EPISODE, FAILURE, CHANGES, EPISODES, VERSION, STATE, WEIGHTS, STATUS,
     HISTORY, CONTENTS,
-)  # type: ignore[assignment]  # fmt: skip
+)  # fmt: skip
 
 BY_NAME = {verb.name: verb for verb in VERBS}
 

@@ -116,7 +116,8 @@ class World:
             return decode(answer.data, Problem)
         if self.service.run.progress.accepted > accepted:
             self._check_accepted(data)
-        return decode(answer.data, verbs.BY_NAME[verb].reply, 1 << 30)
+        reply: type[Message] = verbs.BY_NAME[verb].reply
+        return decode(answer.data, reply, 1 << 30)
 
     def _check_ledgers(self) -> None:
         progress, outstanding = self.service.run.progress, self.service.run.dealer.outstanding

@@ -150,6 +150,8 @@ class LearnerService:
                     if delivered is not None:
                         delivered.result()
                     delivered = pool.submit(self._deliver, message)
+                if delivered is not None:
+                    delivered.result()
             except Refused as refusal:
                 if refusal.code not in ("rewind", "unknown_episode"):
                     raise
