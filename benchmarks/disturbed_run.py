@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from udrl.errors import RunFailed, StoreError, UdrlError
-from udrl_launch.inspection import read_status
+from udrl_inspect.inspection import read_status
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Child, Supervisor
 from udrl_proto.messages import Status

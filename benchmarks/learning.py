@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-from udrl_launch.agents import evaluate, evaluation_commands, load_agent
-from udrl_launch.inspection import read_status
+from udrl_inspect.agents import evaluate, evaluation_commands, load_agent
+from udrl_inspect.inspection import read_status
 from udrl_proto.messages import Status
 
 ENVIRONMENTS = ("LunarLander-v3", "LunarLanderSparse-v3", "CartPole-v1")

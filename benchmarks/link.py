@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from udrl.errors import UdrlError
-from udrl_launch.inspection import status_of
+from udrl_inspect.inspection import status_of
 from udrl_launch.training import free_port
 from udrl_proto.messages import Status
 

@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from udrl.errors import UdrlError
-from udrl_launch.inspection import read_status
+from udrl_inspect.inspection import read_status
 
 _SIZE = (1, 32, 32)
 

@@ -50,8 +50,8 @@ from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained, use_one_thread
 from udrl.value import value_loss
-from udrl_launch.agents import load_agent
-from udrl_launch.inspection import status_of
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import status_of
 from udrl_launch.process import keep_freed_memory
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello

@@ -9,10 +9,10 @@ import pytest
 MODULES = (
     "udrl.folder", "udrl.inference", "udrl.obedience", "udrl.policy", "udrl.rollout",
     "udrl_actor.service", "udrl_replay.service", "udrl_board.app", "udrl_board.command",
-    "udrl_launch.agents", "udrl_launch.api", "udrl_launch.cli", "udrl_launch.commands.exporting",
+    "udrl_inspect.agents", "udrl_launch.api", "udrl_launch.cli", "udrl_launch.commands.exporting",
     "udrl_launch.commands.obedience", "udrl_launch.commands.playing",
-    "udrl_launch.commands.services", "udrl_launch.commands.training", "udrl_launch.event_files",
-    "udrl_launch.exporting", "udrl_launch.roles",
+    "udrl_launch.commands.services", "udrl_launch.commands.training", "udrl_show.event_files",
+    "udrl_inspect.exporting", "udrl_launch.roles",
 )  # fmt: skip
 
 WITHOUT = "import sys; sys.modules['torch'] = None; "

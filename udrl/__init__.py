@@ -16,20 +16,18 @@ Table 2 hyperparameters           :mod:`udrl.config`
 ================================  ======================================
 """
 
-from importlib import import_module
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
+
+from udrl.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from udrl.folder import load as load
     from udrl_launch.api import train as train
 
-__version__ = "0.1.0"
-
-#: What is offered at the top, and where it is: imported when wanted, since torch takes a second.
-_OFFERED = {"load": "udrl.folder", "train": "udrl_launch.api"}
-
 
 def __getattr__(name: str) -> Any:
-    if name in _OFFERED:
-        return getattr(import_module(_OFFERED[name]), name)
+    """Return what packages above this one offer here; it is imported when it is wanted."""
+    for offered in entry_points(group="udrl", name=name):
+        return offered.load()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

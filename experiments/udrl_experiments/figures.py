@@ -1,6 +1,6 @@
 """The pictures of the studies, drawn from tidy tables alone, in the layout of the paper's figures.
 
-They can be read in grey and by the colour-blind (:mod:`udrl_launch.styles`).
+They can be read in grey and by the colour-blind (:mod:`udrl_show.styles`).
 """
 
 import itertools
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from udrl.errors import ConfigError
 from udrl_experiments.records import Obtained
 from udrl_experiments.statistics import CurvePoint
-from udrl_launch.styles import line_style
+from udrl_show.styles import line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

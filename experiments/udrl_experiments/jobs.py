@@ -20,7 +20,7 @@ from udrl.config import Config
 from udrl.errors import Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.records import Evaluated
-from udrl_launch.tables import put, read
+from udrl_inspect.tables import put, read
 
 #: What is said when a study is stopped.
 INTERRUPTED = "stopped; go on with the same command and --resume"

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import udrl
+from udrl.version import __version__
 
 #: Packages whose version may change a result.
 _PACKAGES = (
@@ -18,7 +18,7 @@ _PACKAGES = (
 
 def provenance() -> dict[str, Any]:
     """Return what software and what kind of machine results come from."""
-    versions = {"udrl": udrl.__version__, "python": platform.python_version()}
+    versions = {"udrl": __version__, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)

@@ -10,9 +10,9 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained
 from udrl_experiments.study import Place, Study
-from udrl_launch.agents import evaluate_all, evaluation_commands, load_agent
-from udrl_launch.inspection import read_status
-from udrl_launch.tables import read, write
+from udrl_inspect.agents import evaluate_all, evaluation_commands, load_agent
+from udrl_inspect.inspection import read_status
+from udrl_inspect.tables import read, write
 
 #: Episodes a point.
 EPISODES = 100

@@ -8,7 +8,7 @@ import pytest
 
 import udrl
 from udrl.errors import ConfigError, StoreError, UdrlError
-from udrl_launch.agents import load_agent
+from udrl_inspect.agents import load_agent
 from udrl_proto.messages import Status
 from whole_run import SMALL, digests, small
 

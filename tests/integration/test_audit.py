@@ -11,7 +11,7 @@ import udrl_actor.courier
 from udrl.config import Budget
 from udrl.episode import Episode
 from udrl.errors import Deceived, UdrlError
-from udrl_launch.inspection import status_of
+from udrl_inspect.inspection import status_of
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.codec import encode_episode

@@ -23,13 +23,12 @@ from udrl_board.app import make_app
 from udrl_board.command import board as command
 from udrl_board.feed import Feed
 from udrl_board.source import Directory, Served, Stored
-from udrl_launch.address import Address
-from udrl_launch.agents import load_agent
+from udrl_inspect.address import ENDPOINT_FILE, Address
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import read_status
+from udrl_inspect.obedience import keep, measure, plan_commands
+from udrl_inspect.obedience_text import summary
 from udrl_launch.cli import cli as command_line
-from udrl_launch.inspection import read_status
-from udrl_launch.obedience import keep, measure, plan_commands
-from udrl_launch.obedience_text import summary
-from udrl_launch.roles import ENDPOINT_FILE
 from udrl_proto.messages import Status
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 

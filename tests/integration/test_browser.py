@@ -18,10 +18,10 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from test_take_cover import TAKE_COVER
 from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
-from udrl_launch.agents import load_agent
-from udrl_launch.inspection import read_status
-from udrl_launch.obedience import keep, measure, plan_commands
-from udrl_launch.obedience_text import summary
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import read_status
+from udrl_inspect.obedience import keep, measure, plan_commands
+from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status

@@ -15,9 +15,9 @@ from huggingface_hub import ModelCard
 
 import udrl
 from udrl.errors import ConfigError, UdrlError
-from udrl_launch.agents import load_agent
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import read_status
 from udrl_launch.cli import cli as command_line
-from udrl_launch.inspection import read_status
 from udrl_replay.store import Store
 from whole_run import Cli, small
 

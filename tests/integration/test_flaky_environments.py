@@ -11,7 +11,7 @@ import pytest
 import flaky_environments
 from udrl.config import Budget
 from udrl.errors import EnvironmentFault, RunFailed
-from udrl_launch.agents import reproduce
+from udrl_inspect.agents import reproduce
 from udrl_launch.supervisor import Supervisor
 from udrl_proto.messages import Status
 from udrl_replay.creation import create, write_config

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from test_commands import toml
 from udrl.errors import ConfigError, UdrlError
 from udrl_board.source import Directory
-from udrl_launch.agents import load_agent
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import status_of
 from udrl_launch.cli import cli as command_line
-from udrl_launch.inspection import status_of
 from udrl_proto.messages import Status
 from whole_run import (
     SMALL,

@@ -16,11 +16,11 @@ from click.testing import CliRunner
 from PIL import Image, ImageSequence
 
 from udrl.errors import ConfigError, StoreError, UdrlError
-from udrl_launch.agents import evaluate, evaluate_all, evaluation_commands, load_agent
+from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, load_agent
+from udrl_inspect.inspection import read_status
+from udrl_inspect.runs import find
 from udrl_launch.cli import cli
-from udrl_launch.curve import compare
-from udrl_launch.inspection import read_status
-from udrl_launch.runs import find
+from udrl_show.curve import compare
 
 
 def call(*arguments: object) -> str:

@@ -13,10 +13,10 @@ from click.testing import CliRunner
 
 from udrl.config import Budget, Config, build
 from udrl.errors import ConfigError, UdrlError
-from udrl_launch.agents import Agent, evaluate, evaluation_commands, load_agent
+from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
+from udrl_inspect.obedience import Obedience, keep, kept, measure, plan_commands
+from udrl_inspect.obedience_text import answer, markdown
 from udrl_launch.cli import cli as command_line
-from udrl_launch.obedience import Obedience, keep, kept, measure, plan_commands
-from udrl_launch.obedience_text import answer, markdown
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from whole_run import OBEDIENT

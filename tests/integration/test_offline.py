@@ -19,8 +19,8 @@ from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
 from udrl.offline import dataset_digest, read_dataset, write_dataset
 from udrl.spaces import Image, Vector
+from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.cli import cli as command_line
-from udrl_launch.inspection import read_status, settings_of
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
 from udrl_proto.messages import Status

@@ -13,8 +13,8 @@ import zenoh
 from udrl.config import Budget
 from udrl.errors import ConfigError, Refused
 from udrl_actor.service import ActorService
+from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_launch.address import Address
 from udrl_learner.service import LearnerService
 from udrl_proto import verbs
 from udrl_proto.asking import Asker

@@ -9,8 +9,8 @@ from pathlib import Path
 from prometheus_client.parser import text_string_to_metric_families
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from udrl_launch.event_files import EVALUATION_TAGS, FOLDER, TAGS
-from udrl_launch.inspection import read_status
+from udrl_inspect.inspection import read_status
+from udrl_show.event_files import EVALUATION_TAGS, FOLDER, TAGS
 from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 

@@ -55,7 +55,8 @@ def test_wheel_ships_presets_and_types_but_no_tests(site: Path) -> None:
     spaces = {f"udrl_experiments/spaces/{n}.toml" for n in ("LunarLander-v3", "TakeCover-v0")}
     assert spaces | {"udrl_experiments/tuned.toml"} <= files
     packages = (
-        "udrl", "udrl_proto", "udrl_actor", "udrl_learner", "udrl_replay", "udrl_launch",
+        "udrl", "udrl_proto", "udrl_actor", "udrl_learner", "udrl_replay", "udrl_inspect",
+        "udrl_show", "udrl_launch",
         "udrl_board", "udrl_experiments",
     )  # fmt: skip
     assert {f"{package}/py.typed" for package in packages} <= files

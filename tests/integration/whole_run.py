@@ -18,7 +18,7 @@ import zenoh
 from udrl.algorithm1 import Run, algorithm1
 from udrl.config import Budget, Config, build
 from udrl.errors import UdrlError
-from udrl_launch.inspection import status_of
+from udrl_inspect.inspection import status_of
 from udrl_proto.messages import Status
 
 #: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import udrl
 from udrl.actions import Categorical
 from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
 from udrl.spaces import Category
+from udrl.version import __version__
 from udrl_proto import PROTOCOL, keys
 from udrl_proto.messages import Hello
 from udrl_replay import creation
@@ -34,7 +34,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
     hello = created.fact("hello", Hello)
     assert hello == Hello(
         protocol=PROTOCOL,
-        software=udrl.__version__,
+        software=__version__,
         run_id=hello.run_id,
         config=TOY,
         environment=EnvironmentSpec(

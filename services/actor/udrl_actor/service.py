@@ -7,11 +7,11 @@ import platform
 import threading
 import time
 
-import udrl
 from udrl.acting import EpisodeGenerator, Failure
 from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
+from udrl.version import __version__
 from udrl_actor.courier import Courier
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
@@ -73,7 +73,7 @@ class ActorService:
                 id=self._name,
                 host=platform.node(),
                 pid=os.getpid(),
-                software=udrl.__version__,
+                software=__version__,
                 environments=self._environments,
                 numerics_class=acting_class(config, generator, self._hello.graph),
                 environment=generator.spec,

@@ -7,11 +7,11 @@ from typing import TypeVar
 
 import msgspec
 
-import udrl
 from udrl.errors import InvalidData, UdrlError
+from udrl.version import __version__
 from udrl_board.source import Place, Source
-from udrl_launch.obedience import Obedience
-from udrl_launch.obedience_text import summary
+from udrl_inspect.obedience import Obedience
+from udrl_inspect.obedience_text import summary
 from udrl_proto.messages import Contents, EvaluationStatus, Hello, IterationStatus, Status
 
 #: Seconds that an answer is good for.
@@ -115,7 +115,7 @@ class Feed:
             first = after + 1 if same and after < len(known) else 0
             contents = self._contents
             return News(
-                software=udrl.__version__,
+                software=__version__,
                 place=self._place,
                 hello=self._hello if first == 0 else None,
                 status=self._status,

@@ -11,10 +11,10 @@ from typing import Literal, Protocol, TypeVar
 import msgspec
 
 from udrl.errors import ConfigError, PeerError, Refused, Unreachable
-from udrl_launch.address import Address, connected
-from udrl_launch.agents import load_agent
-from udrl_launch.inspection import read_run, read_status, served_at
-from udrl_launch.obedience import Obedience, kept
+from udrl_inspect.address import Address, connected, served_at
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import read_run, read_status
+from udrl_inspect.obedience import Obedience, kept
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import (

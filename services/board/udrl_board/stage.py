@@ -27,9 +27,9 @@ from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
 from udrl.weights import decode_behavior
 from udrl_board.source import Source, Wanted
-from udrl_launch.film import Picture
-from udrl_launch.playing import filmed, fps_of
 from udrl_proto.messages import Hello
+from udrl_show.film import Picture
+from udrl_show.playing import filmed, fps_of
 
 log = logging.getLogger("udrl")
 

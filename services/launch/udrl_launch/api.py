@@ -18,8 +18,8 @@ from typing import Any
 
 from udrl.errors import ConfigError, Interrupted, UdrlError
 from udrl.policy import Policy
-from udrl_launch.agents import load_agent
-from udrl_launch.inspection import read_status, settings_of
+from udrl_inspect.agents import load_agent
+from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.settings import gather
 from udrl_launch.training import train as run_training
 from udrl_proto.messages import Status

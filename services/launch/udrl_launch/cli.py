@@ -3,14 +3,15 @@
 import os
 import sys
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import NoReturn
 
 import click
 
-import udrl
 from udrl.errors import UdrlError
+from udrl.version import __version__
 
-#: Every command and the module that holds it, in the order of the help.
+#: The commands of this package and the modules that hold them, in the order of the help.
 _COMMANDS = {
     "train": "udrl_launch.commands.training",
     "replay": "udrl_launch.commands.services",
@@ -22,16 +23,16 @@ _COMMANDS = {
     "export": "udrl_launch.commands.exporting",
     "reproduce": "udrl_launch.commands.looking",
     "status": "udrl_launch.commands.looking",
-    # Like the studies it stands above this package, and imports it.
-    "board": "udrl_board.command",
     "metrics": "udrl_launch.commands.metrics",
     "runs": "udrl_launch.commands.runs",
     "plot": "udrl_launch.commands.runs",
     "health": "udrl_launch.commands.health",
     "keys": "udrl_launch.commands.keys",
     "completion": "udrl_launch.commands.completion",
-    "study": "udrl_experiments.command",
 }
+
+#: Entry points of other packages' commands.
+_GROUP = "udrl.commands"
 
 
 def main() -> NoReturn:
@@ -55,20 +56,23 @@ def main() -> NoReturn:
 
 
 class _Commands(click.Group):
-    """Imports a command's module when it is wanted: most need torch, which takes a second."""
+    """Imports a command when it is wanted; other packages add theirs as entry points."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
+        return [*_COMMANDS, *sorted(entry_points(group=_GROUP).names - _COMMANDS.keys())]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
-            return super().get_command(ctx, cmd_name)
-        module = import_module(_COMMANDS[cmd_name])
-        command: click.Command = getattr(module, cmd_name)
-        return command
+        command: click.Command
+        if cmd_name in _COMMANDS:
+            command = getattr(import_module(_COMMANDS[cmd_name]), cmd_name)
+            return command
+        for added in entry_points(group=_GROUP, name=cmd_name):
+            command = added.load()
+            return command
+        return super().get_command(ctx, cmd_name)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(udrl.__version__, prog_name="udrl")
+@click.version_option(__version__, prog_name="udrl")
 def cli() -> None:
     """Upside-Down Reinforcement Learning, exact and distributed."""

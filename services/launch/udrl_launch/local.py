@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_launch.address import Address
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import END_S, Supervisor
 from udrl_proto.access import REPLAY

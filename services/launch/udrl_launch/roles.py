@@ -1,8 +1,6 @@
 """The three services as functions, for a process or a thread of their own."""
 
-import json
 import logging
-import os
 import sys
 import threading
 from contextlib import closing
@@ -12,7 +10,7 @@ from pathlib import Path
 from udrl.config import Budget
 from udrl.errors import ConfigError, Deceived, RunFailed
 from udrl_actor.service import ActorService
-from udrl_launch.address import Address, connected, unique_name
+from udrl_inspect.address import Address, announced, connected, unique_name
 from udrl_proto import session as sessions
 from udrl_proto.credentials import Credentials
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -20,8 +18,6 @@ from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
-
-ENDPOINT_FILE = "endpoint.json"
 
 
 def replay(
@@ -53,14 +49,9 @@ def replay(
             else sessions.connect(endpoint, Address(endpoint).patience_s, stop, credentials)
         )
         with session:
-            where = {"endpoint": endpoint, "pid": os.getpid()}
-            endpoint_file = run_dir / ENDPOINT_FILE
-            endpoint_file.write_text(json.dumps(where), encoding="utf-8")
             service = ReplayService(ZenohTransport(session), store, budget, run_dir, audit)
-            try:
+            with announced(run_dir, endpoint):
                 service.serve(stop)
-            finally:
-                endpoint_file.unlink(missing_ok=True)
             progress = service.run.progress
             if progress.state == "failed":
                 raise (Deceived if progress.deceived else RunFailed)(progress.problem)

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Protocol
 
 from udrl.errors import Interrupted, Unreachable
-from udrl_launch.address import Address, connected
-from udrl_launch.inspection import read_status
+from udrl_inspect.address import Address, connected
+from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.roles import require_torch
 from udrl_launch.settings import Settings

@@ -15,13 +15,13 @@ import time
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
-import udrl
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.episode import Episode
 from udrl.errors import Interrupted, Refused
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained, use_one_thread
 from udrl.training_class import training_class
+from udrl.version import __version__
 from udrl.weights import encode_weights
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
@@ -115,7 +115,7 @@ class LearnerService:
             id=self._name,
             host=platform.node(),
             pid=os.getpid(),
-            software=udrl.__version__,
+            software=__version__,
             numerics_class=training_class(self._config, self._spec),
         )
         self._asker.ask(verbs.JOIN, request)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import msgspec
 
-import udrl
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config
 from udrl.episode import Episode
@@ -19,6 +18,7 @@ from udrl.graph import acting_graph
 from udrl.numerics import environment_replays, settle, settle_as
 from udrl.offline import settle_dataset
 from udrl.strategies import make_strategy
+from udrl.version import __version__
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
@@ -73,7 +73,7 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         log.warning("the run is not exact: %s", progress.inexact_reason)
     hello = Hello(
         protocol=PROTOCOL,
-        software=udrl.__version__,
+        software=__version__,
         run_id=_run_id(run_dir),
         config=config,
         environment=generator.spec,

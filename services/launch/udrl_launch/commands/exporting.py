@@ -5,10 +5,10 @@ from pathlib import Path
 import click
 
 from udrl.errors import ConfigError
-from udrl_launch.agents import load_agent
+from udrl_inspect.agents import load_agent
+from udrl_inspect.exporting import export_buffer, export_folder, export_model
+from udrl_inspect.obedience import kept_of
 from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
-from udrl_launch.exporting import export_buffer, export_folder, export_model
-from udrl_launch.obedience import kept_of
 
 
 @click.command()

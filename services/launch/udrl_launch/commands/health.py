@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from udrl.errors import Unreachable
-from udrl_launch.address import Address, connected, host_name, is_of_this_machine
+from udrl_inspect.address import Address, connected, host_name, is_of_this_machine
 from udrl_launch.commands.options import KEYS, PATIENCE, RUN
 from udrl_proto import keys as expressions
 from udrl_proto.access import REPLAY

@@ -7,7 +7,7 @@ import click
 import msgspec
 
 from udrl.errors import EnvironmentFault
-from udrl_launch import agents, inspection
+from udrl_inspect import agents, inspection
 from udrl_launch.commands.options import (
     CONNECT,
     KEYS,
@@ -19,7 +19,7 @@ from udrl_launch.commands.options import (
     place,
     version,
 )
-from udrl_launch.display import panel
+from udrl_show.display import panel
 
 
 @click.command()

@@ -8,12 +8,12 @@ from pathlib import Path
 import click
 
 from udrl.errors import UdrlError
-from udrl_launch.address import Address
+from udrl_inspect.address import Address
+from udrl_inspect.inspection import status_from
 from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
-from udrl_launch.inspection import status_from
 from udrl_launch.process import log_to_stderr, run_service
-from udrl_launch.prometheus import Exporter
 from udrl_proto.messages import Status
+from udrl_show.prometheus import Exporter
 
 
 @click.command()

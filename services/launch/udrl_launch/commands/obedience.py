@@ -7,9 +7,9 @@ import click
 import msgspec
 
 from udrl.errors import ConfigError, StoreError
-from udrl_launch import obedience as reports
-from udrl_launch import obedience_text, pictures, tables
-from udrl_launch.agents import load_agent
+from udrl_inspect import obedience as reports
+from udrl_inspect import obedience_text, tables
+from udrl_inspect.agents import load_agent
 from udrl_launch.commands.options import (
     RETURNS,
     RUN_DIR,
@@ -17,7 +17,8 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.obedience_picture import draw
+from udrl_show import pictures
+from udrl_show.obedience_picture import draw
 
 _NAME = Path(reports.FILE)
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import click
 
 from udrl.errors import ConfigError
-from udrl_launch.address import Address
+from udrl_inspect.address import Address
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 import msgspec
 
-from udrl_launch.agents import evaluation_commands, load_agent
+from udrl_inspect.agents import evaluation_commands, load_agent
 from udrl_launch.commands.options import (
     RETURN,
     RUN_DIR,
@@ -13,9 +13,9 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.playing import play as play_episodes
-from udrl_launch.playing import with_seed
-from udrl_launch.window import KEYS_HELP, Window
+from udrl_show.playing import play as play_episodes
+from udrl_show.playing import with_seed
+from udrl_show.window import KEYS_HELP, Window
 
 
 @click.command()

@@ -7,10 +7,10 @@ from typing import Literal
 import click
 import msgspec
 
-from udrl_launch import curve
+from udrl_inspect.runs import Summary, find
 from udrl_launch.commands.options import RUN_DIR
-from udrl_launch.display import duration
-from udrl_launch.runs import Summary, find
+from udrl_show import curve
+from udrl_show.display import duration
 
 _HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "run"
 

@@ -11,8 +11,8 @@ from typing import Any
 import click
 
 from udrl.errors import ConfigError
+from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_launch.address import Address
 from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
 from udrl_launch.process import (

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from udrl.config import preset_names
-from udrl_launch import inspection
+from udrl_inspect import inspection
 from udrl_launch.commands.options import STEPS
 from udrl_launch.settings import Settings, gather
 from udrl_replay.creation import directory_name, exists

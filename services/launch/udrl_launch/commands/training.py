@@ -12,15 +12,15 @@ import msgspec
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
-from udrl_launch.curve import draw
-from udrl_launch.display import Display
-from udrl_launch.event_files import EventFiles
 from udrl_launch.process import log_to_stderr, run_service
-from udrl_launch.prometheus import Exporter
 from udrl_launch.settings import Settings
 from udrl_launch.training import Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.messages import Status
+from udrl_show.curve import draw
+from udrl_show.display import Display
+from udrl_show.event_files import EventFiles
+from udrl_show.prometheus import Exporter
 
 log = logging.getLogger("udrl")
 

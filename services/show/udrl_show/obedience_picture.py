@@ -4,10 +4,10 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
-from udrl_launch import pictures
-from udrl_launch.obedience import Obedience
-from udrl_launch.obedience_text import answer
-from udrl_launch.styles import line_style
+from udrl_inspect.obedience import Obedience
+from udrl_inspect.obedience_text import answer
+from udrl_show import pictures
+from udrl_show.styles import line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
 
 from udrl.errors import StoreError
-from udrl_launch import pictures
-from udrl_launch.styles import line_style
 from udrl_replay.store import EvaluationRow, Store
+from udrl_show import pictures
+from udrl_show.styles import line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,7 @@ from typing import Any
 
 from udrl.errors import ConfigError
 from udrl.rollout import Rollout
-from udrl_launch.film import Picture
+from udrl_show.film import Picture
 
 KEYS_HELP = (
     "space: pause and go on; right: one step; up, down: ask for more, for less; page up, "

@@ -26,8 +26,8 @@ from udrl.obedience import (
     spread,
 )
 from udrl.strategies import nearest
-from udrl_launch.agents import Agent, Result, evaluate_all, evaluation_commands
-from udrl_launch.tables import put
+from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
+from udrl_inspect.tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"

@@ -1,8 +1,6 @@
 """Looking at a run from outside: its status and its settings."""
 
-import json
 import logging
-import os
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,7 @@ import msgspec
 
 from udrl.config import Budget, build, read_toml
 from udrl.errors import UdrlError
-from udrl_launch.address import Address, connected
-from udrl_launch.roles import ENDPOINT_FILE
+from udrl_inspect.address import Address, connected, served_at
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Status, StatusRequest
@@ -62,17 +59,6 @@ def status_of(run_dir: Path, keys_dir: Path | None = None) -> Status:
     except UdrlError as error:
         log.debug("no live status: %s", error)
         return read_status(run_dir)
-
-
-def served_at(run_dir: Path) -> str | None:
-    """Return the endpoint at which a run is served on this machine; None: it is not."""
-    try:
-        where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))
-        os.kill(int(where["pid"]), 0)  # raises unless the service that wrote the file is there
-        return str(where["endpoint"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        log.debug("%s is not served: %s", run_dir, error)
-        return None
 
 
 def read_status(run_dir: Path) -> Status:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from udrl_launch.obedience import TOLERANCE, Obedience, Point
+from udrl_inspect.obedience import TOLERANCE, Obedience, Point
 
 #: Correlation from which on means follow their commands, even if they are not what is commanded.
 _FOLLOWS = 0.8

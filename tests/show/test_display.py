@@ -6,7 +6,6 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from udrl_launch.display import Display, duration, line, panel
 from udrl_proto.messages import (
     AuditStatus,
     BufferStatus,
@@ -17,6 +16,7 @@ from udrl_proto.messages import (
     Status,
     Waiting,
 )
+from udrl_show.display import Display, duration, line, panel
 
 STATUS = Status(
     run_id="run", state="running", environment="CartPole-v1", iteration=7, env_steps=12345,

@@ -10,11 +10,11 @@ import msgspec
 import pytest
 
 from udrl.errors import ConfigError, InvalidData, StoreError
-from udrl_launch import tables
+from udrl_inspect import tables
+from udrl_inspect.obedience import FILE, Agreement, Obedience, Point, keep, kept
+from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
 from udrl_launch.commands.options import RETURNS
-from udrl_launch.obedience import FILE, Agreement, Obedience, Point, keep, kept
-from udrl_launch.obedience_picture import draw
-from udrl_launch.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
+from udrl_show.obedience_picture import draw
 
 
 def point(desired_return: float, desired_horizon: int, mean: float, length: float = 50) -> Point:

@@ -4,6 +4,8 @@ It imports no torch, for commands that look in for a moment.
 """
 
 import hashlib
+import json
+import logging
 import os
 import platform
 import re
@@ -19,6 +21,11 @@ from udrl_proto.credentials import load
 from udrl_proto.messages import Hello
 from udrl_proto.transport import Transport
 from udrl_proto.zenoh_transport import ZenohTransport
+
+log = logging.getLogger("udrl")
+
+#: The file in a run's directory that says where it is served, while it is.
+ENDPOINT_FILE = "endpoint.json"
 
 #: Characters of a machine's name in the names of its services, which are keys.
 _LONGEST_HOST = 30
@@ -55,6 +62,28 @@ def connected(
     credentials = load(keys, role) if keys else None
     with sessions.connect(endpoint, patience_s, stop, credentials) as session:
         yield ZenohTransport(session), sessions.find_run(session, run_id, patience_s, stop)
+
+
+@contextmanager
+def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
+    """Say in a run's directory that this process serves it at an endpoint."""
+    file = run_dir / ENDPOINT_FILE
+    file.write_text(json.dumps({"endpoint": endpoint, "pid": os.getpid()}), encoding="utf-8")
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def served_at(run_dir: Path) -> str | None:
+    """Return the endpoint at which a run is served on this machine; None: it is not."""
+    try:
+        where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))
+        os.kill(int(where["pid"]), 0)  # raises unless the service that wrote the file is there
+        return str(where["endpoint"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.debug("%s is not served: %s", run_dir, error)
+        return None
 
 
 def unique_name(role: str) -> str:

@@ -8,7 +8,8 @@ from typing import Literal
 import msgspec
 
 from udrl.errors import ConfigError, UdrlError
-from udrl_launch.inspection import budget_of, served_at
+from udrl_inspect.address import served_at
+from udrl_inspect.inspection import budget_of
 from udrl_proto.messages import Hello
 from udrl_replay.progress import Progress
 from udrl_replay.store import FILE, Store

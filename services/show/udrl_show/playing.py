@@ -13,8 +13,8 @@ from udrl.environments.making import Environment, make_environment
 from udrl.errors import UnsupportedEnvironment
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
-from udrl_launch.agents import Agent
-from udrl_launch.film import Film, Picture
+from udrl_inspect.agents import Agent
+from udrl_show.film import Film, Picture
 
 #: Pictures a second where the environment does not say how fast it is.
 _USUAL_FPS = 30.0

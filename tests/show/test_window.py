@@ -7,7 +7,7 @@ import pytest
 
 from udrl.errors import ConfigError
 from udrl.rollout import Rollout
-from udrl_launch.window import Window
+from udrl_show.window import Window
 
 
 class Episode:

@@ -4,7 +4,7 @@ import platform
 
 import pytest
 
-from udrl_launch.address import host_name, is_of_this_machine, unique_name
+from udrl_inspect.address import host_name, is_of_this_machine, unique_name
 
 
 def on(host: str, monkeypatch: pytest.MonkeyPatch) -> None:

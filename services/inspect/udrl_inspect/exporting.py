@@ -4,14 +4,14 @@ import shlex
 from contextlib import closing
 from pathlib import Path
 
-import udrl
 from udrl import folder as folders
 from udrl.errors import ConfigError, StoreError
 from udrl.offline import write_dataset
-from udrl_launch.agents import Agent
-from udrl_launch.inspection import budget_of
-from udrl_launch.obedience import Obedience, kept_of
-from udrl_launch.obedience_text import markdown
+from udrl.version import __version__
+from udrl_inspect.agents import Agent
+from udrl_inspect.inspection import budget_of
+from udrl_inspect.obedience import Obedience, kept_of
+from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
@@ -194,7 +194,7 @@ def _card(
         command=shlex.join(
             ["udrl", "train", environment, "--preset", "none", "--config", "config.toml"]
         ),
-        version=udrl.__version__,
+        version=__version__,
         seed=agent.config.seed,
         weights=agent.version,
         again=again,

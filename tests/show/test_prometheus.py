@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.launch.test_display import STATUS
+from tests.show.test_display import STATUS
 from udrl.errors import ConfigError
-from udrl_launch.prometheus import Exporter
 from udrl_launch.training import Watchers
 from udrl_proto.messages import ActorStatus, Quarantined, Status
+from udrl_show.prometheus import Exporter
 
 ROOT = Path(__file__).parents[2]
 FULL = msgspec.structs.replace(
