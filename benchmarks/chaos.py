@@ -36,7 +36,7 @@ from udrl.environments.making import make_environment, specify
 from udrl.errors import RunFailed
 from udrl.replay import Entry, ReplayBuffer
 from udrl_launch.settings import Settings, gather
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 _HERE = Path(__file__).parent
 #: ``--hang-timeout`` where environments hang; elsewhere it must not notice a stopped actor.

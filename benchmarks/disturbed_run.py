@@ -18,7 +18,7 @@ from udrl.errors import RunFailed, StoreError, UdrlError
 from udrl_inspect.inspection import read_status
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Child, Supervisor
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_replay.creation import create, write_config
 from udrl_replay.progress import Progress
 from udrl_replay.store import Store

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from udrl_inspect.agents import evaluate, evaluation_commands, load_agent
 from udrl_inspect.inspection import read_status
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 ENVIRONMENTS = ("LunarLander-v3", "LunarLanderSparse-v3", "CartPole-v1")
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 from udrl.errors import UdrlError
 from udrl_inspect.inspection import status_of
 from udrl_launch.training import free_port
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 _CHUNK = 16 * 1024
 

@@ -41,14 +41,8 @@ from udrl_proto import PROTOCOL, keys, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
-from udrl_proto.messages import (
-    ChangesRequest,
-    Hello,
-    Status,
-    StatusRequest,
-    VersionMessage,
-    Weights,
-)
+from udrl_proto.messages import ChangesRequest, Hello, VersionMessage, Weights
+from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import write_config
 from udrl_replay.progress import Progress

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from udrl.errors import UdrlError
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
-from udrl_replay.store import FILE, Store
+from udrl_replay.store import Store
 
 ROLES = ("replay", "learner", "actor")
 #: Growth that counts, from the second to the last quarter of the run.

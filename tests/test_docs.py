@@ -30,10 +30,10 @@ from udrl.config import Budget, Config, preset, preset_names, read_toml
 from udrl.errors import UdrlError
 from udrl_launch.settings import Fleet, gather
 from udrl_launch.supervisor import FINAL_CODES
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
-from udrl_replay.reporting import COLUMNS
-from udrl_replay.store import FILE, Store
+from udrl_replay.store import COLUMNS, Store
 
 # Settings.
 

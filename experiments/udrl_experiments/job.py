@@ -23,7 +23,7 @@ from udrl_inspect.tables import put, read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 
 @click.command()

@@ -11,8 +11,6 @@ from udrl_proto.messages import (
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
-    Contents,
-    ContentsRequest,
     EpisodeMessage,
     EpisodeReply,
     EpisodesReply,
@@ -20,19 +18,23 @@ from udrl_proto.messages import (
     FailureMessage,
     Hello,
     HelloRequest,
-    History,
-    HistoryRequest,
     JoinReply,
     JoinRequest,
     Message,
     StateReply,
     StateRequest,
-    Status,
-    StatusRequest,
     VersionMessage,
     VersionReply,
     Weights,
     WeightsRequest,
+)
+from udrl_proto.reports import (
+    Contents,
+    ContentsRequest,
+    History,
+    HistoryRequest,
+    Status,
+    StatusRequest,
 )
 
 Request = TypeVar("Request", bound=Message)

@@ -14,15 +14,8 @@ from udrl.spaces import Vector
 from udrl_board.feed import FRESH_S, Feed
 from udrl_board.source import Place
 from udrl_inspect.obedience import Agreement, Obedience, Point
-from udrl_proto.messages import (
-    Contents,
-    EvaluationStatus,
-    Hello,
-    History,
-    IterationStatus,
-    Status,
-    Weights,
-)
+from udrl_proto.messages import Hello, Weights
+from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 
 HELLO = Hello(
     protocol=1, software="1", run_id="run", config=Config(environment="CartPole-v1"),
@@ -37,7 +30,7 @@ def iteration(number: int) -> IterationStatus:
     return IterationStatus(
         iteration=number, env_steps=100 * number, wall_s=1.0, return_min=0.0, return_mean=1.0,
         return_max=2.0, explored_return=1.0, commanded_min=None, commanded_max=None, admitted=1,
-        weights_version=number, loss=None,
+        weights_version=number, loss=None, commands=3, eval_env_steps=0,
     )  # fmt: skip
 
 

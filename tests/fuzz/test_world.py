@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from msgspec.structs import replace
 
-import udrl_replay.service
+import udrl_replay.admission
 from tests.fuzz.world import Target, World, honest_questions
 from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
@@ -77,7 +77,7 @@ def test_honest_questions_reach_every_verb_and_are_answered(
 def test_actors_are_bounded(
     questions: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udrl_replay.service, "MOST_ACTORS", 2)
+    monkeypatch.setattr(udrl_replay.admission, "MOST_ACTORS", 2)
     join = decode(next(data for verb, data in questions if verb == verbs.JOIN.name), JoinRequest)
     world = World()
     codes = [

@@ -30,20 +30,18 @@ from udrl_proto.messages import (
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
-    ContentsRequest,
     EpisodeMessage,
     EpisodesRequest,
     FailureMessage,
     HelloRequest,
-    HistoryRequest,
     JoinRequest,
     Message,
     Problem,
     StateRequest,
-    StatusRequest,
     VersionMessage,
     WeightsRequest,
 )
+from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
 from udrl_proto.transport import Answer
 from udrl_replay.creation import create
 from udrl_replay.service import ReplayService

@@ -11,7 +11,7 @@ from typing import Any, Self
 import msgspec
 import pytest
 
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import wait_for
 
 ROOT = Path(__file__).parents[2]

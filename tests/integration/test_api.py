@@ -9,7 +9,7 @@ import pytest
 import udrl
 from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl_inspect.agents import load_agent
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import SMALL, digests, small
 
 SETTINGS: dict[str, Any] = {k: v for k, v in SMALL.items() if k != "environment"}

@@ -29,7 +29,7 @@ from udrl_inspect.inspection import read_status
 from udrl_inspect.obedience import keep, measure, plan_commands
 from udrl_inspect.obedience_text import summary
 from udrl_launch.cli import cli as command_line
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 
 

@@ -24,7 +24,7 @@ from udrl_inspect.obedience import keep, measure, plan_commands
 from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_replay.store import Store
 from whole_run import (
     LANDER,

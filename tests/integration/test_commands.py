@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from udrl_launch.cli import cli as command_line
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import SMALL, TOY, Cli, arguments, digests, free_port, live_status, small, wait_for
 
 BUDGET = 3000

@@ -8,7 +8,7 @@ import pytest
 
 from compose_project import IMAGE, LEARNER_IMAGE, Project, run
 from udrl_proto import PROTOCOL
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import Cli, assert_conserved, digests, free_port, wait_for
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(2400)]

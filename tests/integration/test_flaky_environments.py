@@ -13,7 +13,7 @@ from udrl.config import Budget
 from udrl.errors import EnvironmentFault, RunFailed
 from udrl_inspect.agents import reproduce
 from udrl_launch.supervisor import Supervisor
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_replay.creation import create, write_config
 from udrl_replay.store import Store
 from whole_run import assert_conserved, digests, free_port, live_status, small, wait_for

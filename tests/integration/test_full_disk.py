@@ -11,7 +11,7 @@ from udrl.config import Budget
 from udrl.errors import StoreError
 from udrl_launch.local import Threads
 from udrl_launch.settings import Fleet, Settings
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_replay.creation import create, write_config
 from whole_run import (
     SMALL,

@@ -13,7 +13,7 @@ from udrl_board.source import Directory
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import status_of
 from udrl_launch.cli import cli as command_line
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import (
     SMALL,
     TOY,

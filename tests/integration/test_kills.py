@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import (
     SMALL,
     Cli,

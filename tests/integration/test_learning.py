@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from udrl.config import Config, build, preset
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 
 def test_cartpole_passes_200(run: Callable[..., Status]) -> None:

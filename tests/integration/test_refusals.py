@@ -19,14 +19,8 @@ from udrl_learner.service import LearnerService
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode, encode_array
-from udrl_proto.messages import (
-    EpisodeMessage,
-    Hello,
-    JoinRequest,
-    Status,
-    StatusRequest,
-    VersionMessage,
-)
+from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest, VersionMessage
+from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.session import connect, find_run
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import create

@@ -9,7 +9,7 @@ import pytest
 from udrl.config import Config, build, preset
 from udrl.errors import ConfigError
 from udrl_inspect.agents import evaluate, evaluation_commands, load_agent
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from whole_run import Cli, arguments, assert_conserved, digests, kill_at, reference
 
 pytestmark = pytest.mark.timeout(300)

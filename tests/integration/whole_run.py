@@ -19,7 +19,7 @@ from udrl.algorithm1 import Run, algorithm1
 from udrl.config import Budget, Config, build
 from udrl.errors import UdrlError
 from udrl_inspect.inspection import status_of
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 #: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
 SMALL: dict[str, Any] = {

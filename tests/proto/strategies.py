@@ -6,6 +6,7 @@ import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
 
+import udrl_proto.reports  # noqa: F401 - its messages are found too
 from udrl.config import Config
 from udrl_proto.messages import Message
 

@@ -19,8 +19,9 @@ from udrl.version import __version__
 from udrl_proto import PROTOCOL, keys
 from udrl_proto.messages import Hello
 from udrl_replay import creation
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
-from udrl_replay.store import FILE, Store
+from udrl_replay.store import Store
 
 TOY = Config(environment="Figure2-v0", max_return=2.0)
 

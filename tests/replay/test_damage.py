@@ -17,8 +17,9 @@ from tests.replay.synthetic import BLOB, create, edit, finish, reference, result
 from udrl.config import Budget
 from udrl.errors import DamagedStore, OtherConfiguration
 from udrl_proto.codec import LARGEST
+from udrl_replay.database import FILE
 from udrl_replay.run import Run
-from udrl_replay.store import FILE, Store, Version
+from udrl_replay.store import Store, Version
 from udrl_replay.tables import SEALED
 
 

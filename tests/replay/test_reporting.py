@@ -12,18 +12,10 @@ from tests.replay.synthetic import arrive, config, episode, finish, join, work
 from udrl.config import Budget
 from udrl.schedule import weights_version
 from udrl_proto.codec import decode, encode
-from udrl_proto.messages import (
-    CommandsRequest,
-    Contents,
-    EvaluationStatus,
-    History,
-    IterationStatus,
-    Status,
-    Waiting,
-)
+from udrl_proto.messages import CommandsRequest
+from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status, Waiting
 from udrl_replay import reporting
 from udrl_replay.reporting import (
-    COLUMNS,
     MetricsFile,
     Throughput,
     Waits,
@@ -32,6 +24,7 @@ from udrl_replay.reporting import (
     status,
 )
 from udrl_replay.run import Run
+from udrl_replay.store import COLUMNS
 
 MakeRun = Callable[..., Run]
 

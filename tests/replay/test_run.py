@@ -37,7 +37,8 @@ from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Refused
 from udrl.replay import Entry
 from udrl.schedule import weights_version
-from udrl_proto.messages import CommandsRequest, FailureMessage, Status
+from udrl_proto.messages import CommandsRequest, FailureMessage
+from udrl_proto.reports import Status
 from udrl_replay.arrival import Arrival
 from udrl_replay.progress import Progress
 from udrl_replay.reporting import Throughput, Waits, status

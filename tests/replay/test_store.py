@@ -12,8 +12,9 @@ from udrl.config import Budget
 from udrl.errors import DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl.evaluation import summarise
 from udrl_proto.codec import LARGEST
+from udrl_replay.database import FILE
 from udrl_replay.run import Run
-from udrl_replay.store import FILE, EvaluationRow, Store, Version
+from udrl_replay.store import EvaluationRow, Store, Version
 from udrl_replay.tables import SCHEMA
 
 

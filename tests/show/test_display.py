@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from udrl_proto.messages import (
+from udrl_proto.reports import (
     AuditStatus,
     BufferStatus,
     CommandLedger,

@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.show.test_display import STATUS
 from udrl.errors import ConfigError
 from udrl_launch.training import Watchers
-from udrl_proto.messages import ActorStatus, Quarantined, Status
+from udrl_proto.reports import ActorStatus, Quarantined, Status
 from udrl_show.prometheus import Exporter
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,8 @@ from udrl.version import __version__
 from udrl_board.source import Place, Source
 from udrl_inspect.obedience import Obedience
 from udrl_inspect.obedience_text import summary
-from udrl_proto.messages import Contents, EvaluationStatus, Hello, IterationStatus, Status
+from udrl_proto.messages import Hello
+from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Status
 
 #: Seconds that an answer is good for.
 FRESH_S = 1.0

@@ -17,16 +17,14 @@ from udrl_inspect.inspection import read_run, read_status
 from udrl_inspect.obedience import Obedience, kept
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
-from udrl_proto.messages import (
+from udrl_proto.messages import Hello, Weights, WeightsRequest
+from udrl_proto.reports import (
     Contents,
     ContentsRequest,
-    Hello,
     History,
     HistoryRequest,
     Status,
     StatusRequest,
-    Weights,
-    WeightsRequest,
 )
 from udrl_replay.reporting import contents, history
 from udrl_replay.store import Store

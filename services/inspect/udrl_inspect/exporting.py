@@ -15,8 +15,9 @@ from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
-from udrl_replay.store import FILE, EvaluationRow, Store
+from udrl_replay.store import EvaluationRow, Store
 
 _CARD = """\
 ---

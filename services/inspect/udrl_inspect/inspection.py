@@ -12,7 +12,8 @@ from udrl.errors import UdrlError
 from udrl_inspect.address import Address, connected, served_at
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
-from udrl_proto.messages import Hello, Status, StatusRequest
+from udrl_proto.messages import Hello
+from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.reporting import Throughput, Waits, status
 from udrl_replay.standing import Standing
 from udrl_replay.store import Store

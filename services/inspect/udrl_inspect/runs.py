@@ -11,8 +11,9 @@ from udrl.errors import ConfigError, UdrlError
 from udrl_inspect.address import served_at
 from udrl_inspect.inspection import budget_of
 from udrl_proto.messages import Hello
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
-from udrl_replay.store import FILE, Store
+from udrl_replay.store import Store
 
 State = Literal["running", "stopped", "ended", "failed", "unreadable"]
 

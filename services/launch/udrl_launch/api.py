@@ -22,7 +22,7 @@ from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.settings import gather
 from udrl_launch.training import train as run_training
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_replay.creation import directory_name, exists
 
 #: Called with the status of a run; what returns False stops it.

@@ -21,7 +21,7 @@ from udrl_proto import verbs
 from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
-from udrl_proto.messages import Status, StatusRequest
+from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.creation import config_of, create, exists, resume, write_config
 from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run

@@ -23,9 +23,10 @@ from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
 from udrl_replay.run import Run
-from udrl_replay.store import FILE, Store
+from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 

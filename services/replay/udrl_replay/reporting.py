@@ -11,7 +11,7 @@ from udrl.digests import replay_digest
 from udrl.errors import StoreError
 from udrl.strategies import Best
 from udrl.targets import ReturnInTime
-from udrl_proto.messages import (
+from udrl_proto.reports import (
     HISTORY_PAGE,
     MOST_SHOWN,
     ActorStatus,
@@ -22,20 +22,12 @@ from udrl_proto.messages import (
     EpisodeLedger,
     EvaluationStatus,
     History,
-    IterationStatus,
     Quarantined,
     Status,
     Waiting,
 )
 from udrl_replay.standing import Standing
-from udrl_replay.store import EvaluationRow, Store
-
-COLUMNS = (
-    "iteration", "env_steps", "eval_env_steps", "wall_s", "eval_at_env_steps", "eval_mean",
-    "eval_std", "eval_ci95_low", "eval_ci95_high", "loss", "weights_version", "return_min",
-    "return_mean", "return_max", "explored_return", "eval_desired_return", "eval_desired_horizon",
-    "commanded_min", "commanded_max", "admitted",
-)  # fmt: skip
+from udrl_replay.store import COLUMNS, EvaluationRow, Store
 
 log = logging.getLogger("udrl")
 
@@ -232,12 +224,8 @@ def _evaluated(row: EvaluationRow) -> EvaluationStatus:
 
 def history(store: Store, after: int) -> History:
     """Return what came of the iterations after one, a page of them."""
-    rows = store.metrics(after, HISTORY_PAGE + 1)
-    lines = [dict(zip(COLUMNS, row, strict=True)) for row in rows[:HISTORY_PAGE]]
-    page = tuple(
-        IterationStatus(**{name: line[name] for name in IterationStatus.__struct_fields__})
-        for line in lines
-    )
+    rows = store.iterations(after, HISTORY_PAGE + 1)
+    page = tuple(rows[:HISTORY_PAGE])
     evaluations = store.evaluations(after, page[-1].iteration) if page else []
     return History(
         iterations=page,

@@ -16,6 +16,7 @@ from udrl.evaluation import summarise
 from udrl.replay import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage
+from udrl_proto.reports import IterationStatus
 from udrl_replay.arrival import Arrival
 from udrl_replay.dealing import SUSPICIOUS
 from udrl_replay.standing import Standing
@@ -204,21 +205,27 @@ class Run(Standing):
 
         if evaluated:
             self._note_evaluation(commands[evaluated[0].id], evaluated, closing=False)
+        version = weights_version(iteration, self.config.lead)
         best = self.buffer.best(self.config.replay_size)
         returns = [e.episode_return for e in best]
+        desired = [c.desired_return for c in commands.values() if c.kind == "explore"]
         self.store.add_iteration(
-            iteration,
-            len(ids),
-            progress.env_steps,
-            progress.eval_env_steps,
-            self.wall_s,
-            returns[0],
-            math.fsum(returns) / len(returns),
-            returns[-1],
-            math.fsum(p.entry.episode_return for p in explored) / len(explored),
-            weights_version(iteration, self.config.lead),
-            *_range([c.desired_return for c in commands.values() if c.kind == "explore"]),
-            sum(e.iteration == iteration for e in best),
+            IterationStatus(
+                iteration=iteration,
+                commands=len(ids),
+                env_steps=progress.env_steps,
+                eval_env_steps=progress.eval_env_steps,
+                wall_s=round(self.wall_s, 3),
+                weights_version=version,
+                loss=self.store.loss_of(version),
+                return_min=returns[0],
+                return_mean=math.fsum(returns) / len(returns),
+                return_max=returns[-1],
+                explored_return=math.fsum(p.entry.episode_return for p in explored) / len(explored),
+                commanded_min=min(desired, default=None),
+                commanded_max=max(desired, default=None),
+                admitted=sum(e.iteration == iteration for e in best),
+            )
         )
         self.store.remove_commands(ids)
 
@@ -387,7 +394,3 @@ class Run(Standing):
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.
         self.store.remove_evicted(latest)
-
-
-def _range(numbers: list[float]) -> tuple[float | None, float | None]:
-    return (min(numbers), max(numbers)) if numbers else (None, None)

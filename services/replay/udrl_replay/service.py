@@ -30,7 +30,6 @@ from udrl_proto.messages import (
     ChangesRequest,
     CommandsReply,
     CommandsRequest,
-    ContentsRequest,
     EpisodeMessage,
     EpisodeReply,
     EpisodesReply,
@@ -38,7 +37,6 @@ from udrl_proto.messages import (
     FailureMessage,
     Hello,
     HelloRequest,
-    HistoryRequest,
     JoinReply,
     JoinRequest,
     Message,
@@ -46,16 +44,16 @@ from udrl_proto.messages import (
     Progress,
     StateReply,
     StateRequest,
-    StatusRequest,
     VersionMessage,
     VersionReply,
     Wait,
     Weights,
     WeightsRequest,
 )
+from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
 from udrl_proto.transport import Declaration, Presence, Transport
+from udrl_replay.admission import admit
 from udrl_replay.arrival import Arrival, Malformed, inspect
-from udrl_replay.dealing import MOST_ACTORS
 from udrl_replay.reporting import (
     MetricsFile,
     Throughput,
@@ -273,38 +271,8 @@ class ReplayService:
         return msgspec.structs.replace(self.run.hello, exact=self.run.progress.exact)
 
     def _join(self, request: JoinRequest, now: float) -> JoinReply:
-        hello = self.run.hello
-        if request.environment is not None and request.environment != hello.environment:
-            raise Refused(
-                "other_environment",
-                f"the run's environment is {hello.environment}, yours is {request.environment}; "
-                f"install the same version of the package that provides {hello.config.environment}",
-            )
-        field = "acting_class" if request.role == "actor" else "training_class"
-        known = getattr(hello, field)
-        if not known:
-            self.run.hello = msgspec.structs.replace(hello, **{field: request.numerics_class})
-            self._store.set_fact("hello", self.run.hello)
-        elif known != request.numerics_class:
-            if not hello.allow_inexact:
-                library = "onnxruntime" if request.role == "actor" else "torch"
-                raise Refused(
-                    "other_numerics",
-                    f"the run's {request.role}s round like class {known}, this machine like "
-                    f"{request.numerics_class}, so results would depend on who computes them; use "
-                    f"a machine with the same kind of processor and the same versions of {library} "
-                    f"and numpy, or create the run with --allow-inexact",
-                )
-            self.run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
+        admit(self.run, request)
         if request.role == "actor":
-            if request.id in self.run.quarantined:
-                raise self.run.quarantined.refusal(request.id)
-            if len(self.run.dealer.actors) >= MOST_ACTORS:
-                raise Refused(
-                    "too_many_actors",
-                    f"{MOST_ACTORS} actors have joined, which is the most; give fewer actors more "
-                    f"environments (--envs)",
-                )
             self.run.dealer.join(request, now)
         log.info("%s %s joined from %s", request.role, request.id, request.host)
         return JoinReply()

@@ -1,35 +1,35 @@
 """One SQLite file per run, the only thing in the system that is worth saving.
 
-Every change of a run is one transaction, synced before anything is acknowledged; what is on disk is
-consistent at every moment. What it holds is described in :mod:`udrl_replay.tables`.
+What it holds is described in :mod:`udrl_replay.tables`, and how it is kept in
+:mod:`udrl_replay.database`.
 """
 
-import fcntl
-import os
-import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 
 from udrl.commands import Command
 from udrl.config import COMMANDS_PER_ITERATION
-from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl.evaluation import Evaluation
 from udrl.replay import Entry
-from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal, sha256
+from udrl_proto.reports import IterationStatus
+from udrl_replay.database import Database
+from udrl_replay.tables import SEALED, sha256
 
-FILE = "run.sqlite"
-
-#: Tables whose rows may be written again.
-_REPLACED = {"facts", "evaluations", "versions"}
-
-Fact = TypeVar("Fact")
-
-#: SQLite's codes for a file that is not what was written: malformed, no database, no such table.
-_DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR}
+_FIELDS = IterationStatus.__struct_fields__
+#: Columns of evaluations in ``metrics.csv``, and in the store.
+EVALUATION_COLUMNS = {
+    "eval_at_env_steps": "env_steps",
+    "eval_desired_return": "desired_return",
+    "eval_desired_horizon": "desired_horizon",
+    "eval_mean": "mean",
+    "eval_std": "std",
+    "eval_ci95_low": "ci95_low",
+    "eval_ci95_high": "ci95_high",
+}
+#: Of ``metrics.csv``.
+COLUMNS = (*_FIELDS, *EVALUATION_COLUMNS)
 
 
 class Pending(NamedTuple):
@@ -60,169 +60,11 @@ class EvaluationRow(NamedTuple):
     evaluation: Evaluation
 
 
-class Store:
-    """The file of one run.
+class Store(Database):
+    """Commands, episodes, iterations, evaluations and weights versions of one run.
 
-    Args:
-        run_dir: its directory.
-        read_only: look at it as it is now, beside a service that goes on writing.
-
-    Raises:
-        StoreError: there is no run, or its file cannot be read.
-        RunInUse: another service writes it.
-        DamagedStore: the file is not what was written.
+    Reading raises :class:`~udrl.errors.DamagedStore` where the file is not what was written.
     """
-
-    def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
-        self._path = run_dir / FILE
-        if not self._path.exists():
-            raise StoreError(f"{run_dir} holds no run ({FILE} is missing); check the path")
-        self.read_only = read_only
-        self._lock = None if read_only else _lock(run_dir)
-        try:
-            self._open()
-        except BaseException:
-            self.close()
-            raise
-
-    def _open(self) -> None:
-        # As a URI, so that a mode can be named and the path may hold any character.
-        uri = f"{self._path.resolve().as_uri()}?mode={'ro' if self.read_only else 'rw'}"
-        try:
-            self._db = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-            if self.read_only:
-                self._db.execute("BEGIN")  # all that is read belongs to one moment
-            else:
-                self._db.execute("PRAGMA journal_mode = WAL")
-                self._db.execute("PRAGMA synchronous = FULL")
-                # Some builds overwrite what is deleted: thirteen times the time for a megabyte.
-                self._db.execute("PRAGMA secure_delete = OFF")
-        except sqlite3.Error as error:
-            raise self._fault(error) from error
-        self._db.create_function("seal", -1, seal, deterministic=True)
-        if not self.read_only:
-            ((verdict,),) = self._rows("PRAGMA integrity_check(1)")
-            if verdict != "ok":
-                raise self._damaged(" ".join(verdict.split()))  # SQLite's may have several lines
-        schema = self.fact("schema", int)
-        if schema != SCHEMA:
-            raise OtherConfiguration(
-                f"{self._path} has schema {schema}, this version of udrl reads {SCHEMA}; "
-                f"use the version that wrote it"
-            )
-        self._check_seals()
-
-    def _check_seals(self) -> None:
-        for table, columns in SEALED.items():
-            key = columns.split(",")[0]
-            broken = self._rows(
-                f"SELECT {key} FROM {table} WHERE seal IS NOT seal({columns}) LIMIT 1"  # noqa: S608
-            )
-            if broken:
-                raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
-
-    @classmethod
-    def create(cls, run_dir: Path, **facts: object) -> "Store":
-        """Make a new run's file, which holds some facts from the beginning.
-
-        Raises:
-            StoreError: there is a run already, or the directory cannot be written.
-            RunInUse: another service works in it.
-        """
-        path = run_dir / FILE
-        try:
-            run_dir.mkdir(parents=True, exist_ok=True)
-            with _lock(run_dir):
-                if path.exists():
-                    raise StoreError(
-                        f"{run_dir} holds a run already; add --resume (in Python: "
-                        f"resume=True) to go on with it, or name another --run-dir"
-                    )
-                # Written aside and renamed, so that a run's file is there as a whole or not at all.
-                unfinished = path.with_suffix(".new")
-                unfinished.unlink(missing_ok=True)
-                with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
-                    db.executescript(TABLES)
-                    for name, value in {"schema": SCHEMA, **facts}.items():
-                        encoded = msgspec.json.encode(value)
-                        row = name, encoded, seal(name, encoded)
-                        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
-                unfinished.rename(path)
-                _sync(run_dir)
-        except (OSError, sqlite3.Error) as error:
-            raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
-        return cls(run_dir)
-
-    def close(self) -> None:
-        """Close the file and let others have it."""
-        if hasattr(self, "_db"):
-            self._db.close()
-        if self._lock is not None:
-            self._lock.close()
-
-    @contextmanager
-    def transaction(self) -> Iterator[None]:
-        """Make all changes within durable together, or none of them.
-
-        Raises:
-            StoreError: they could not be written, e.g. because the disk is full.
-        """
-        try:
-            self._db.execute("BEGIN IMMEDIATE")
-            try:
-                yield
-                self._db.execute("COMMIT")
-            finally:
-                # After some errors SQLite has rolled back by itself.
-                if self._db.in_transaction:
-                    self._db.execute("ROLLBACK")
-        except sqlite3.Error as error:
-            raise self._fault(error) from error
-
-    def _insert(self, table: str, *values: Value, unsealed: Sequence[bytes] = ()) -> None:
-        """Add a row: what its seal covers, the seal, and the rest."""
-        insert = "INSERT OR REPLACE" if table in _REPLACED else "INSERT"
-        row = *values, seal(*values), *unsealed
-        self._db.execute(f"{insert} INTO {table} VALUES ({marks(row)})", row)
-
-    def _rows(self, query: str, values: Sequence[object] = ()) -> list[Any]:
-        try:
-            return self._db.execute(query, values).fetchall()
-        except sqlite3.Error as error:
-            raise self._fault(error) from error
-
-    def _fault(self, error: sqlite3.Error) -> StoreError:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
-            return self._damaged(error)
-        return StoreError(
-            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: free some disk "
-            f"space or repair the disk, and start again with --resume"
-        )
-
-    def _damaged(self, what: object) -> DamagedStore:
-        return DamagedStore(f"{self._path}: {what}; restore the run directory from a backup")
-
-    # Facts: named values, as JSON.
-
-    def fact(self, name: str, kind: type[Fact], default: Fact | None = None) -> Fact:
-        """Return a named value; the default if it was never set.
-
-        Raises:
-            DamagedStore: it is missing and there is no default, or it is of another kind.
-        """
-        rows = self._rows("SELECT value FROM facts WHERE name = ?", (name,))
-        if not rows:
-            if default is not None:
-                return default
-            raise self._damaged(f"fact {name!r} is missing")
-        try:
-            return msgspec.json.decode(rows[0][0], type=kind)
-        except (msgspec.DecodeError, ConfigError) as error:
-            raise self._damaged(f"fact {name!r}: {error}") from error
-
-    def set_fact(self, name: str, value: object) -> None:
-        """Set a named value."""
-        self._insert("facts", name, msgspec.json.encode(value))
 
     # Commands: those that are outstanding or cancelled.
 
@@ -335,14 +177,28 @@ class Store:
 
     # Iterations and evaluations: one row each, kept for good.
 
-    def add_iteration(self, *values: float | None) -> None:
-        """Add a row to ``iterations``; values in the order of its columns."""
-        self._insert("iterations", *values)
+    def add_iteration(self, done: IterationStatus) -> None:
+        """Add a completed iteration."""
+        self._insert("iterations", *msgspec.structs.astuple(done))
+
+    def iterations(self, after: int, limit: int) -> list[IterationStatus]:
+        """Return the first completed iterations after one."""
+        rows = self._rows(
+            f"SELECT {SEALED['iterations']} FROM iterations "  # noqa: S608
+            "WHERE iteration > ? ORDER BY iteration LIMIT ?",
+            (after, limit),
+        )
+        return [IterationStatus(**dict(zip(_FIELDS, row, strict=True))) for row in rows]
 
     def issued_in(self, iteration: int) -> int:
         """Return how many commands a completed iteration had."""
         rows = self._rows("SELECT commands FROM iterations WHERE iteration = ?", (iteration,))
         return int(rows[0][0]) if rows else 0
+
+    def loss_of(self, version: int) -> float | None:
+        """Return the loss that a version was trained with; version 0 has none."""
+        rows = self._rows("SELECT loss FROM versions WHERE version = ?", (version,))
+        return float(rows[0][0]) if rows else None
 
     def env_steps_after(self, iteration: int) -> int:
         """Return the env steps that a completed iteration ended with."""
@@ -383,18 +239,14 @@ class Store:
         )
         return [_evaluation(row) for row in rows]
 
-    def metrics(self, after: int, limit: int = -1) -> list[tuple[Any, ...]]:
+    def metrics(self, after: int) -> list[tuple[Any, ...]]:
         """Return the rows of ``metrics.csv`` of iterations after ``after``; -1: all of them."""
+        columns = [f"i.{c}" for c in _FIELDS] + [f"e.{c}" for c in EVALUATION_COLUMNS.values()]
         return self._rows(
-            "SELECT i.iteration, i.env_steps, i.eval_env_steps, round(i.wall_s, 3), "
-            "e.env_steps, e.mean, e.std, e.ci95_low, e.ci95_high, v.loss, i.weights_version, "
-            "i.return_min, i.return_mean, i.return_max, i.explored_return, "
-            "e.desired_return, e.desired_horizon, i.commanded_min, i.commanded_max, i.admitted "
-            "FROM iterations i "
+            f"SELECT {', '.join(columns)} FROM iterations i "  # noqa: S608
             "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.closing = 0 "
-            "LEFT JOIN versions v ON v.version = i.weights_version "
-            "WHERE i.iteration > ? ORDER BY i.iteration LIMIT ?",
-            (after, limit),
+            "WHERE i.iteration > ? ORDER BY i.iteration",
+            (after,),
         )
 
     # Weights versions: digest and loss of all, blobs of those that somebody may need.
@@ -457,28 +309,3 @@ def _evaluation(row: tuple[Any, ...]) -> EvaluationRow:
     return EvaluationRow(
         iteration, bool(closing), env_steps, desired_return, desired_horizon, result
     )
-
-
-def _sync(folder: Path) -> None:
-    """Make a renamed file's new name durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _lock(run_dir: Path) -> Any:
-    """Return the open lock file of a run directory; it is free again when it is closed."""
-    try:
-        file = (run_dir / "lock").open("a")
-    except OSError as error:
-        raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise RunInUse(
-            f"{run_dir} is in use by another replay service; stop it, or name another --run-dir"
-        ) from error
-    return file

@@ -8,12 +8,30 @@ columns are documented in ``docs/operations.md``.
 import hashlib
 from collections.abc import Iterable
 
+import msgspec
+from msgspec import inspect
+
+from udrl_proto.reports import IterationStatus
+
 SCHEMA = 5
+
+
+def _declared(kind: type[msgspec.Struct]) -> str:
+    """Return the columns of a table whose rows are messages of integers and floats."""
+    columns = []
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    for field in info.fields:
+        types = field.type.types if isinstance(field.type, inspect.UnionType) else (field.type,)
+        sql = "INTEGER" if isinstance(types[0], inspect.IntType) else "REAL"
+        columns.append(f"{field.name} {sql}{'' if len(types) > 1 else ' NOT NULL'}")
+    return ", ".join(columns)
+
 
 #: SQLite writes a whole row anew when a column changes its size; so an episode's body, which may
 #: be a megabyte and never changes, has a table of its own. Elsewhere large columns stand last:
 #: whoever reads what stands before them does not read them.
-TABLES = """
+TABLES = f"""
 CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL, seal BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE commands (
     id INTEGER PRIMARY KEY, cancelled INTEGER NOT NULL, body BLOB NOT NULL, seal BLOB NOT NULL);
@@ -24,12 +42,7 @@ CREATE TABLE episodes (
 CREATE TABLE bodies (id INTEGER PRIMARY KEY, body BLOB NOT NULL);
 CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
 CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
-CREATE TABLE iterations (
-    iteration INTEGER PRIMARY KEY, commands INTEGER NOT NULL, env_steps INTEGER NOT NULL,
-    eval_env_steps INTEGER NOT NULL, wall_s REAL NOT NULL, return_min REAL NOT NULL,
-    return_mean REAL NOT NULL, return_max REAL NOT NULL, explored_return REAL,
-    weights_version INTEGER NOT NULL, commanded_min REAL, commanded_max REAL,
-    admitted INTEGER NOT NULL, seal BLOB NOT NULL);
+CREATE TABLE iterations ({_declared(IterationStatus)}, seal BLOB NOT NULL, PRIMARY KEY (iteration));
 CREATE TABLE evaluations (
     iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
     desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
@@ -47,9 +60,7 @@ SEALED = {
     "facts": "name, value",
     "commands": "id, cancelled, body",
     "episodes": "id, episode_return, length, digest, admitted, evicted, checksum",
-    "iterations": "iteration, commands, env_steps, eval_env_steps, wall_s, return_min, "
-    "return_mean, return_max, explored_return, weights_version, commanded_min, commanded_max, "
-    "admitted",
+    "iterations": ", ".join(IterationStatus.__struct_fields__),
     "evaluations": "iteration, closing, env_steps, desired_return, desired_horizon, mean, std, "
     "ci95_low, ci95_high, episodes",
     "versions": "version, digest, loss, train_s, checksum",

@@ -9,7 +9,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from udrl_proto.messages import EvaluationStatus, Status, Waiting
+from udrl_proto.reports import EvaluationStatus, Status, Waiting
 
 _PLAIN_EVERY_S = 5.0
 

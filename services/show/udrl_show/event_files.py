@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from udrl.errors import ConfigError
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 
 #: The names that others use for the same, and the columns that they are.
 TAGS = {

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from udrl.errors import ConfigError
-from udrl_proto.messages import EvaluationStatus, Status
+from udrl_proto.reports import EvaluationStatus, Status
 
 STATES = ("running", "closing", "ended", "failed", "stopped")
 

@@ -16,7 +16,7 @@ from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.settings import Settings
 from udrl_launch.training import Watchers
 from udrl_launch.training import train as run_training
-from udrl_proto.messages import Status
+from udrl_proto.reports import Status
 from udrl_show.curve import draw
 from udrl_show.display import Display
 from udrl_show.event_files import EventFiles
