@@ -1,10 +1,8 @@
 """The courier against a scripted replay service."""
 
-import logging
 import threading
 from collections.abc import Callable, Iterator
 
-import numpy as np
 import pytest
 
 from tests.proto.scripted import Scripted
@@ -12,7 +10,6 @@ from udrl.actions import Categorical
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
-from udrl.episode import Episode
 from udrl.errors import Refused
 from udrl.graph import acting_graph
 from udrl.inference import probe_weights
@@ -25,7 +22,6 @@ from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     CommandsReply,
     CommandsRequest,
-    EpisodeReply,
     Hello,
     JoinReply,
     JoinRequest,
@@ -66,17 +62,6 @@ def command(number: int, version: int = 0) -> Command:
     )
 
 
-def episode(number: int) -> Episode:
-    return Episode(
-        command_id=number,
-        observations=np.zeros((1, 2), np.float32),
-        actions=np.zeros(1, np.uint8),
-        rewards=np.zeros(1, np.float32),
-        terminated=True,
-        truncated=False,
-    )
-
-
 class Deals:
     """Answers to one question for commands after another; then there is nothing to do."""
 
@@ -94,7 +79,6 @@ def replay() -> Scripted:
     scripted = Scripted(HELLO.run_id)
     scripted.answers(verbs.JOIN, lambda _: JoinReply())
     scripted.answers(verbs.WEIGHTS, lambda r: Weights(version=r.version, weights=WEIGHTS))
-    scripted.answers(verbs.EPISODE, lambda _: EpisodeReply(result="accepted"))
     return scripted
 
 
@@ -106,7 +90,7 @@ def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
     def begin(*answers: Message) -> Courier:
         replay.answers(verbs.COMMANDS, Deals(*answers))
         asker = Asker(replay.transport, HELLO.run_id, "actor a", stop)
-        courier = Courier(replay.transport, HELLO, JOIN, asker, stop, capacity=2)
+        courier = Courier(replay.transport, HELLO, JOIN, asker, stop)
         courier.start()
         started.append(courier)
         return courier
@@ -119,11 +103,11 @@ def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
 
 
 def take(courier: Courier, n: int) -> list[Order]:
-    """Exchange until ``n`` orders have come."""
+    """Take until ``n`` orders have come."""
     orders: list[Order] = []
 
     def more() -> bool:
-        orders.extend(courier.exchange([], n - len(orders), 0, wait_s=0.5))
+        orders.extend(courier.take(n - len(orders), 0, wait_s=0.5))
         return len(orders) == n
 
     wait_for(more, "orders", DEADLINE_S)
@@ -146,7 +130,7 @@ def test_weights_that_were_announced_are_not_asked_for(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start()
-    courier.exchange([], 1, 0, wait_s=0.0)
+    courier.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS), "a question", DEADLINE_S)
     replay.publish(keys.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
     replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
@@ -172,49 +156,40 @@ def test_command_whose_weights_are_gone_is_dropped(
     courier = start(CommandsReply(commands=(command(1, version=3), command(2))))
     assert [order.command.id for order in take(courier, 1)] == [2]
     # It is no longer among those that the actor says it holds.
-    courier.exchange([], 1, 0, wait_s=0.0)
+    courier.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
 
 
-def test_episode_is_delivered_and_its_command_no_longer_held(
+def test_command_whose_outcome_is_acknowledged_is_no_longer_held(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start(CommandsReply(commands=(command(1), command(2))))
     take(courier, 2)
-    courier.exchange([episode(1)], 1, 1, wait_s=0.0)
-    wait_for(lambda: replay.requests(verbs.EPISODE), "the episode", DEADLINE_S)
-    assert replay.requests(verbs.EPISODE)[0].command_id == 1
+    courier.take(1, 1, wait_s=0.0)
+    courier.note_acknowledged(1)
     wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
 
 
-def test_rejected_episode_is_let_go(
-    replay: Scripted, start: Callable[..., Courier], caplog: pytest.LogCaptureFixture
+def test_refusals_reach_the_loop_that_steps_environments(
+    replay: Scripted, start: Callable[..., Courier]
 ) -> None:
-    replay.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))
-    courier = start(CommandsReply(commands=(command(1),)))
-    take(courier, 1)
-    with caplog.at_level(logging.INFO, "udrl"):
-        courier.exchange([episode(1)], 1, 1, wait_s=0.0)
-        wait_for(lambda: "the run has ended" in caplog.text, "the log", DEADLINE_S)
-    assert courier.error is None
-
-
-@pytest.mark.parametrize("verb", [verbs.COMMANDS, verbs.EPISODE], ids=lambda verb: verb.name)
-def test_other_refusals_reach_the_loop_that_steps_environments(
-    verb: verbs.Verb[Message, Message], replay: Scripted, start: Callable[..., Courier]
-) -> None:
-    courier = start(CommandsReply(commands=(command(1),)))
-    take(courier, 1)
-    replay.answers(verb, lambda _: Problem(code="quarantined", message="it lied"))
-    courier.exchange([episode(1)], 1, 1, wait_s=0.0)
+    courier = start(Problem(code="quarantined", message="it lied"))
+    courier.take(1, 0, wait_s=0.0)
     wait_for(lambda: courier.error, "the error", DEADLINE_S)
     assert isinstance(courier.error, Refused)
     assert courier.error.code == "quarantined"
 
 
+def test_what_the_outbox_raises_ends_it(start: Callable[..., Courier]) -> None:
+    courier, error = start(), Refused("quarantined", "it lied")
+    courier.fail(error)
+    courier.join(DEADLINE_S)
+    assert courier.error is error
+
+
 def test_end_of_the_run_ends_it(start: Callable[..., Courier]) -> None:
     courier = start(CommandsReply(ended=True))
-    courier.exchange([], 1, 0, wait_s=DEADLINE_S)
+    courier.take(1, 0, wait_s=DEADLINE_S)
     courier.join(DEADLINE_S)
     assert courier.ended
     assert courier.error is None

@@ -1,5 +1,6 @@
 """Deliveries: several at once, large ones alone, and what ends them."""
 
+import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -7,10 +8,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from tests.proto.scripted import Scripted
 from udrl.acting import Failure
+from udrl.commands import Command
 from udrl.episode import Episode
+from udrl.errors import EnvironmentFault, Refused
 from udrl_actor import outbox as outboxes
-from udrl_actor.outbox import Outbox
+from udrl_actor.outbox import Outbox, deliver
+from udrl_proto import verbs
+from udrl_proto.asking import Asker
+from udrl_proto.messages import Acknowledged, EpisodeReply, Problem
 from whole_run import wait_for
 
 DEADLINE_S = 10.0
@@ -110,3 +117,49 @@ def test_closed_one_begins_nothing(replay: ReplayService, outbox: Outbox) -> Non
     replay.may_answer.release()
     wait_for(lambda: len(outbox) == 1, "the end of the first")
     assert replay.came.empty()
+
+
+# One delivery.
+
+
+@pytest.fixture
+def scripted() -> Scripted:
+    return Scripted("scripted")
+
+
+@pytest.fixture
+def asker(scripted: Scripted) -> Asker:
+    return Asker(scripted.transport, "scripted", "actor a", threading.Event())
+
+
+def test_episode_is_delivered(scripted: Scripted, asker: Asker) -> None:
+    scripted.answers(verbs.EPISODE, lambda _: EpisodeReply(result="accepted"))
+    assert deliver(asker, "a", episode(7)) == 7
+    (message,) = scripted.requests(verbs.EPISODE)
+    assert (message.actor, message.command_id) == ("a", 7)
+
+
+def test_failure_is_told(scripted: Scripted, asker: Asker) -> None:
+    scripted.answers(verbs.FAILURE, lambda _: Acknowledged())
+    told = Command(
+        id=8, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=1,
+        stream_key=bytes(16), weights_version=0, max_steps=1,
+    )  # fmt: skip
+    assert deliver(asker, "a", Failure(told, EnvironmentFault("it broke"))) == 8
+    (message,) = scripted.requests(verbs.FAILURE)
+    assert (message.actor, message.command_id, message.error) == ("a", 8, "it broke")
+
+
+def test_rejected_episode_is_let_go(
+    scripted: Scripted, asker: Asker, caplog: pytest.LogCaptureFixture
+) -> None:
+    scripted.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))
+    with caplog.at_level(logging.INFO, "udrl"):
+        assert deliver(asker, "a", episode(7)) == 7
+    assert "the run has ended" in caplog.text
+
+
+def test_other_refusals_are_raised(scripted: Scripted, asker: Asker) -> None:
+    scripted.answers(verbs.EPISODE, lambda _: Problem(code="quarantined", message="it lied"))
+    with pytest.raises(Refused, match="it lied"):
+        deliver(asker, "a", episode(7))

@@ -1,7 +1,6 @@
-"""The actor's messenger: a thread that fetches commands and weights; an outbox delivers episodes.
+"""The actor's messenger: a thread that fetches commands and the weights that they name.
 
-The loop that steps environments never waits for the network while it has something to do; the
-loop rests when ``capacity`` episodes wait for delivery.
+The loop that steps environments never waits for the network while it has something to do.
 """
 
 import logging
@@ -11,19 +10,14 @@ import time
 from collections import deque
 from typing import NamedTuple
 
-from udrl.acting import Failure
 from udrl.commands import Command
-from udrl.episode import Episode
 from udrl.errors import Refused
 from udrl.inference import ActingFunction
 from udrl_actor.behaviors import Behaviors
-from udrl_actor.outbox import Outbox
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
-from udrl_proto.codec import encode_episode
 from udrl_proto.messages import (
     CommandsRequest,
-    FailureMessage,
     Hello,
     JoinRequest,
 )
@@ -40,7 +34,7 @@ class Order(NamedTuple):
 
 
 class Courier(threading.Thread):
-    """Talks to the replay service for one actor.
+    """Asks the replay service for work for one actor.
 
     Args:
         transport: reaches the run.
@@ -48,7 +42,6 @@ class Courier(threading.Thread):
         join: who the actor is.
         asker: its line to the replay service.
         stop: ends everything.
-        capacity: episodes that may wait for delivery.
     """
 
     def __init__(
@@ -58,7 +51,6 @@ class Courier(threading.Thread):
         join: JoinRequest,
         asker: Asker,
         stop: threading.Event,
-        capacity: int,
     ) -> None:
         super().__init__(name=f"courier of {join.id}", daemon=True)
         self._transport = transport
@@ -66,10 +58,8 @@ class Courier(threading.Thread):
         self._join = join
         self._asker = asker
         self._stop_event = stop
-        self._capacity = capacity
         self._changed = threading.Condition()
         self._orders: deque[Order] = deque()
-        self._outbox = Outbox(f"outbox of {join.id}", self._deliver, self._fail)
         self._held: set[int] = set()
         self._free = 0
         self._steps = 0
@@ -80,18 +70,14 @@ class Courier(threading.Thread):
 
     # Called by the loop that steps environments.
 
-    def exchange(
-        self, outcomes: list[Episode | Failure], free: int, steps: int, *, wait_s: float
-    ) -> list[Order]:
-        """Hand over finished episodes and take new orders.
+    def take(self, free: int, steps: int, *, wait_s: float) -> list[Order]:
+        """Take orders for environments that have nothing to do.
 
         Args:
-            outcomes: what ended.
-            free: environments that have nothing to do.
+            free: how many have nothing to do.
             steps: env steps made since the last call.
             wait_s: seconds to wait for news when there are no orders.
         """
-        self._outbox.put(outcomes)
         with self._changed:
             self._free = free
             self._steps += steps
@@ -104,13 +90,23 @@ class Courier(threading.Thread):
 
     @property
     def has_orders(self) -> bool:
-        """Whether :meth:`exchange` would return orders at once."""
+        """Whether :meth:`take` would return orders at once."""
         return bool(self._orders)
 
-    @property
-    def is_full(self) -> bool:
-        """Whether so many episodes wait for delivery that no more should be made."""
-        return len(self._outbox) >= self._capacity
+    # Called by the lines of the outbox.
+
+    def note_acknowledged(self, command_id: int) -> None:
+        """Note that a command's outcome is acknowledged, so that there may be new ones."""
+        with self._changed:
+            self._held.discard(command_id)
+            self._acknowledged = True
+            self._changed.notify_all()
+
+    def fail(self, error: Exception) -> None:
+        """Have the loop that steps environments raise an error."""
+        with self._changed:
+            self.error = error
+            self._changed.notify_all()
 
     def _alive(self) -> bool:
         return not (self.ended or self._stop_event.is_set() or self.error is not None)
@@ -118,23 +114,17 @@ class Courier(threading.Thread):
     # The courier's own thread.
 
     def run(self) -> None:
-        """Deliver and fetch until the run ends, ``stop`` is set, or the replay service says no."""
+        """Fetch until the run ends, ``stop`` is set, or the replay service says no."""
         key = keys.key(self._hello.run_id, keys.NEW_WEIGHTS)
         subscriber = self._transport.subscribe(key, self._behaviors.note)
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
-            self._fail(error)
+            self.fail(error)
         finally:
-            self._outbox.close()
             subscriber.undeclare()
             with self._changed:
                 self._changed.notify_all()
-
-    def _fail(self, error: Exception) -> None:
-        with self._changed:
-            self.error = error
-            self._changed.notify_all()
 
     def _work(self) -> None:
         ask_at = 0.0
@@ -190,28 +180,6 @@ class Courier(threading.Thread):
             self._orders.extend(orders)
             self._changed.notify_all()
         return time.monotonic() + (reply.wait.retry_after_s if reply.wait else 0.0)
-
-    def _deliver(self, outcome: Episode | Failure) -> None:
-        if isinstance(outcome, Failure):
-            command_id = outcome.command.id
-            failure = FailureMessage(
-                actor=self._join.id, command_id=command_id, error=str(outcome.error)[:4000]
-            )
-            self._asker.ask(verbs.FAILURE, failure)
-        else:
-            command_id = outcome.command_id
-            try:
-                message = encode_episode(outcome, self._join.id)
-                self._asker.ask(verbs.EPISODE, message)
-            except Refused as refusal:
-                if refusal.code != "rejected":
-                    raise  # malformed: the next one would be too
-                # Cancelled: the run has ended meanwhile.
-                log.info("episode %d was rejected: %s", command_id, refusal)
-        with self._changed:
-            self._held.discard(command_id)
-            self._acknowledged = True
-            self._changed.notify_all()
 
     def _order(self, command: Command) -> Order | None:
         """Return a command with its weights; None when they are gone, and the command with them."""

@@ -5,18 +5,49 @@ back, fifty a second. Large episodes go one after another all the same, since th
 link, and an answer that is late is asked for again.
 """
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 
 from udrl.acting import Failure
 from udrl.episode import Episode
+from udrl.errors import Refused
+from udrl_proto import verbs
+from udrl_proto.asking import Asker
+from udrl_proto.codec import encode_episode
+from udrl_proto.messages import FailureMessage
+
+log = logging.getLogger("udrl")
 
 _LINES = 8
 #: Bytes of observations that may be under way together; a larger episode is under way alone.
 _BYTES_UNDER_WAY = 256 * 1024
 #: Seconds after which a line looks whether it was closed meanwhile.
 _LOOK_S = 0.5
+
+
+def deliver(asker: Asker, actor: str, outcome: Episode | Failure) -> int:
+    """Deliver what came of a command; return the command's id when that is acknowledged.
+
+    Raises:
+        Refused: the replay service cannot read it, so it could not read the next one either.
+        Unreachable: nobody has answered for long.
+    """
+    if isinstance(outcome, Failure):
+        command_id = outcome.command.id
+        error = str(outcome.error)[:4000]
+        failure = FailureMessage(actor=actor, command_id=command_id, error=error)
+        asker.ask(verbs.FAILURE, failure)
+        return command_id
+    try:
+        asker.ask(verbs.EPISODE, encode_episode(outcome, actor))
+    except Refused as refusal:
+        if refusal.code != "rejected":
+            raise
+        # Cancelled: the run has ended meanwhile.
+        log.info("episode %d was rejected: %s", outcome.command_id, refusal)
+    return outcome.command_id
 
 
 class Outbox:

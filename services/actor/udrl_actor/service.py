@@ -13,6 +13,7 @@ from udrl.errors import Interrupted
 from udrl.numerics import acting_class
 from udrl.version import __version__
 from udrl_actor.courier import Courier
+from udrl_actor.outbox import Outbox, deliver
 from udrl_proto import keys, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, JoinRequest
@@ -80,11 +81,17 @@ class ActorService:
             )
             asker.ask(verbs.JOIN, join)
             token = self._transport.appear(keys.alive(run_id, "actor", self._name))
-            courier = Courier(
-                self._transport, self._hello, join, asker, self._stop, capacity=self._environments
-            )
+            courier = Courier(self._transport, self._hello, join, asker, self._stop)
+
+            def deliver_one(outcome: Episode | Failure) -> None:
+                courier.note_acknowledged(deliver(asker, self._name, outcome))
+
+            outbox = Outbox(f"outbox of {self._name}", deliver_one, courier.fail)
             courier.start()
-            self._act(generator, courier)
+            try:
+                self._act(generator, courier, outbox)
+            finally:
+                outbox.close()
         except Interrupted as interruption:
             log.info("%s", interruption)
         finally:
@@ -93,22 +100,23 @@ class ActorService:
                 token.undeclare()
             generator.close()
 
-    def _act(self, generator: EpisodeGenerator, courier: Courier) -> None:
+    def _act(self, generator: EpisodeGenerator, courier: Courier, outbox: Outbox) -> None:
+        """Step environments; rest while as many episodes as these wait for delivery."""
         outcomes: list[Episode | Failure] = []
         steps = running = 0
         armed = time.monotonic()
         while not (courier.ended or self._stop.is_set()):
             if courier.error is not None:
                 raise courier.error
-            busy = running and not courier.is_full
+            busy = running and len(outbox) < self._environments
             if outcomes or courier.has_orders or not busy:
-                wait_s = 0.0 if busy else 0.5
-                orders = courier.exchange(outcomes, generator.free, steps, wait_s=wait_s)
+                outbox.put(outcomes)
+                orders = courier.take(generator.free, steps, wait_s=0.0 if busy else 0.5)
                 steps = 0
                 failures = [generator.start(*order) for order in orders]
                 outcomes = [f for f in failures if f is not None]
                 running = len(generator.running)
-            if running and not courier.is_full:
+            if running and len(outbox) < self._environments:
                 ended = generator.step()
                 steps += running
                 running -= len(ended)
