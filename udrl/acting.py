@@ -202,7 +202,7 @@ class EpisodeGenerator:
         command = self._release(row)
         if found := fault(episode, self.spec):
             self._rows.replace(row)
-            return _failure("step", command, ValueError(found))
+            return _failure("step", command, EnvironmentFault(found))
         return episode
 
     def _give_up(self, row: int, error: Exception) -> Failure:
@@ -230,9 +230,12 @@ class EpisodeGenerator:
 
 
 def _failure(where: str, command: Command, error: Exception) -> Failure:
+    what = str(error)
+    if not isinstance(error, EnvironmentFault):
+        what = f"{where}() raised {type(error).__name__}: {error}"
     fault = EnvironmentFault(
-        f"the environment failed in {where}() under command {command.id} "
-        f"(seed {command.environment_seed}): {type(error).__name__}: {error}"
+        f"the environment failed under command {command.id} (seed {command.environment_seed}): "
+        f"{what}"
     )
     fault.__cause__ = error
     return Failure(command, fault)

@@ -5,21 +5,24 @@ are its warm-up (section 2.3.1). A dataset has one observation more than steps, 
 nobody acted. Episodes here have none, so in what is written the last one is there twice.
 """
 
+import logging
 import re
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 
 from udrl.config import Config
 from udrl.digests import episode_digest, replay_digest
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.conversions import Conversion, action_conversion, observation_conversion
+from udrl.environments.making import EnvironmentSpec, make_environment
 from udrl.episode import Episode, fault
-from udrl.errors import ConfigError
-from udrl.spaces import Space
+from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
+
+log = logging.getLogger("udrl")
 
 
 def _minari() -> Any:
@@ -47,7 +50,8 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
     minari = _minari()
     try:
         dataset = minari.load_dataset(name)
-        episodes = [_episode(i, data, name, spec) for i, data in enumerate(dataset)]
+        reader = _Reader(name, dataset, spec)
+        episodes = [reader.episode(i, data) for i, data in enumerate(dataset)]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
             f"dataset {name!r}: {error}; name one that `minari list local` shows"
@@ -85,36 +89,47 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
     return settled, episodes
 
 
-def _episode(number: int, data: Any, name: str, spec: EnvironmentSpec) -> Episode:
-    if not (isinstance(data.observations, np.ndarray) and isinstance(data.actions, np.ndarray)):
-        raise ConfigError(
-            f"dataset {name!r} has observations or actions of several parts; supported are those "
-            f"that are one array"
-        )
-    rewards = np.asarray(data.rewards, np.float32)
-    terminated = bool(data.terminations[-1])
-    episode = Episode(
-        command_id=number,
-        observations=_as(spec.observation_space, data.observations[: len(rewards)]),
-        actions=_as(spec.action_space, data.actions),
-        rewards=rewards,
-        terminated=terminated,
-        truncated=not terminated,
-    )
-    if found := fault(episode, spec):
-        raise ConfigError(
-            f"dataset {name!r}, episode {number}: {found}; name a dataset of the run's environment"
-        )
-    return episode
+class _Reader:
+    """Makes episodes of a dataset's, whose spaces become plain as an environment's do."""
 
+    def __init__(self, name: str, dataset: Any, spec: EnvironmentSpec) -> None:
+        self._name = name
+        self._spec = spec
+        seen, done = dataset.observation_space, dataset.action_space
+        observations, actions = observation_conversion(seen), action_conversion(done)
+        if (
+            observations is None
+            or actions is None
+            or (observations.plain, actions.plain) != (spec.observation_space, spec.action_space)
+        ):
+            raise ConfigError(
+                f"dataset {name!r} has observations {seen} and actions {done}, the run's "
+                f"environment has {spec.observation_space} and {spec.action_space}; name a "
+                f"dataset of the run's environment"
+            )
+        self._observations, self._actions = observations, actions
 
-def _as(space: Space, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return values in the dtype of a space, if none changes by more than rounding."""
-    if values.dtype.kind not in "biuf":
-        return values
-    converted = values.astype(space.dtype)
-    whole = values.dtype.kind in "iu" and bool((converted == values).all())
-    return converted if whole or space.dtype.kind == "f" else values
+    def episode(self, number: int, data: Any) -> Episode:
+        rewards = np.asarray(data.rewards, np.float32)
+        terminated = bool(data.terminations[-1])
+        try:
+            episode = Episode(
+                command_id=number,
+                observations=self._observations.all(data.observations[: len(rewards)]),
+                actions=self._actions.all(data.actions),
+                rewards=rewards,
+                terminated=terminated,
+                truncated=not terminated,
+            )
+            found = fault(episode, self._spec)
+        except InvalidData as error:
+            found = str(error)
+        if found:
+            raise ConfigError(
+                f"dataset {self._name!r}, episode {number}: {found}; name a dataset of the run's "
+                f"environment"
+            )
+        return episode
 
 
 def dataset_digest(episodes: Sequence[Episode]) -> str:
@@ -125,7 +140,10 @@ def dataset_digest(episodes: Sequence[Episode]) -> str:
 def write_dataset(
     name: str, episodes: Iterable[Episode], config: Config, spec: EnvironmentSpec
 ) -> None:
-    """Write episodes as a Minari dataset, every bit of them.
+    """Write episodes as a Minari dataset, every bit of them, as their environment shows them.
+
+    Where the environment cannot be made, they are written as the algorithm sees them, and the
+    dataset does not name it.
 
     Args:
         name: of the dataset, as Minari has them, e.g. ``LunarLander/udrl-v0``.
@@ -144,11 +162,14 @@ def write_dataset(
     minari = _minari()
     from minari.data_collector import EpisodeBuffer
 
+    form = _form(config, spec)
     buffers = [
         EpisodeBuffer(
             id=number,
-            observations=list(np.concatenate([e.observations, e.observations[-1:]])),
-            actions=list(e.actions.astype(np.int64)),
+            observations=list(
+                form.observations.back(np.concatenate([e.observations, e.observations[-1:]]))
+            ),
+            actions=list(form.actions.back(e.actions)),
             rewards=list(e.rewards),
             terminations=[False] * (e.length - 1) + [e.terminated],
             truncations=[False] * (e.length - 1) + [e.truncated],
@@ -161,8 +182,9 @@ def write_dataset(
             minari.create_dataset_from_buffers(
                 name,
                 buffers,
-                observation_space=spec.observation_space.gymnasium,
-                action_space=spec.action_space.gymnasium,
+                env=form.env,
+                observation_space=form.observations.declared,
+                action_space=form.actions.declared,
                 algorithm_name="Upside-Down Reinforcement Learning",
                 description=f"Episodes of a udrl run on {config.environment}, seed {config.seed}; "
                 f"the last observation of each is there twice.",
@@ -172,3 +194,39 @@ def write_dataset(
         raise ConfigError(
             f"dataset {name!r}: {error}; choose another name, or a version that is not there yet"
         ) from error
+
+
+class _Form(NamedTuple):
+    """How episodes are written: as what, and of which environment, if one can be named."""
+
+    observations: Conversion
+    actions: Conversion
+    env: EnvSpec | None
+
+
+def _form(config: Config, spec: EnvironmentSpec) -> _Form:
+    try:
+        env = make_environment(config)
+    except UnsupportedEnvironment as error:
+        log.warning("the dataset will not name its environment: %s", error)
+    else:
+        named, observations, actions = env.env.spec, env.observations, env.actions
+        env.close()
+        if (observations.plain, actions.plain) == (spec.observation_space, spec.action_space):
+            return _Form(observations, actions, named if _can_be_written(named) else None)
+    observations_, actions_ = (
+        observation_conversion(spec.observation_space.gymnasium),
+        action_conversion(spec.action_space.gymnasium),
+    )
+    assert observations_ is not None
+    assert actions_ is not None
+    return _Form(observations_, actions_, None)
+
+
+def _can_be_written(spec: EnvSpec | None) -> bool:
+    """Say whether Gymnasium can write down how an environment is made: not with a callable."""
+    try:
+        return spec is not None and bool(spec.to_json())
+    except (ValueError, TypeError) as error:
+        log.warning("the dataset will not name its environment: %s", error)
+        return False

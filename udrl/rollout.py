@@ -151,13 +151,23 @@ class Rollout:
 
     def _plain(self, observation: Any) -> npt.NDArray[Any]:
         """Return an observation of one's own, in the dtype that the network was trained on."""
-        return np.array(observation, self._policy.spec.observation_space.dtype)
+        space = self._policy.spec.observation_space
+        plain = np.array(observation, space.dtype)
+        if found := space.fault(plain[None], 1):
+            raise EnvironmentFault(
+                f"the environment failed, {self.steps} steps into the episode of seed "
+                f"{self.command.environment_seed}: observations are {found}"
+            )
+        return plain
 
     def _carefully(self, where: str, call: Callable[[], Result]) -> Result:
         try:
             return call()
         except Exception as error:
+            what = str(error)
+            if not isinstance(error, EnvironmentFault):
+                what = f"{where}() raised {type(error).__name__}: {error}"
             raise EnvironmentFault(
-                f"the environment failed in {where}(), {self.steps} steps into the episode of seed "
-                f"{self.command.environment_seed}: {type(error).__name__}: {error}"
+                f"the environment failed, {self.steps} steps into the episode of seed "
+                f"{self.command.environment_seed}: {what}"
             ) from error

@@ -1,6 +1,5 @@
 """Many environments side by side, stepped one after another in one thread."""
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -99,8 +98,7 @@ class Rows:
 
     def replace(self, row: int) -> None:
         """Make an environment anew that can no longer be trusted."""
-        with contextlib.suppress(Exception):  # it is broken already, and goes
-            self._envs[row].close()
+        self._envs[row].close()
         self._envs[row] = self._make(self._config)
         self._limits[row] = self.spec.max_episode_steps
 

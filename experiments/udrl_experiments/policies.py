@@ -135,7 +135,7 @@ def make(
 
 
 def _environment(config: Config, part: int, index: int) -> Environment:
-    env = make_environment(config)
+    env: Environment = make_environment(config)
     # Even with one frame, a dimension of their own keeps Stable-Baselines3 from guessing which one
     # of an image's holds the channels.
     env = gym.wrappers.FrameStackObservation(env, config.frame_stack)

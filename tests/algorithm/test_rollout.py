@@ -135,5 +135,5 @@ class Broken(gym.Wrapper[Any, Any, Any, Any]):
 def test_an_environment_that_breaks_is_named() -> None:
     policy, env = agent()
     rollout = Rollout(policy, Broken(env), command())
-    with pytest.raises(EnvironmentFault, match=r"step\(\), 0 steps.*seed 11.*wheels came off"):
+    with pytest.raises(EnvironmentFault, match=r"0 steps.*seed 11: step\(\) .*wheels came off"):
         rollout.step()

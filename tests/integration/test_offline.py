@@ -91,9 +91,9 @@ def test_a_name_that_is_taken_or_unknown() -> None:
     ("spec", "says"),
     [
         (replace(VECTOR, observation_space=Vector(size=5)),
-         r"observations are float32 \(3, 4\), expected float32 \(3, 5\)"),
+         r"has observations Box.* and actions .* environment has Vector\(size=5\)"),
         (replace(VECTOR, action_space=Categorical(n=1)),
-         "actions are from 0 to 1, expected 0 to 0"),
+         r"and actions Discrete\(2\), .* and Categorical\(n=1\)"),
         (replace(VECTOR, max_episode_steps=8), "rewards are .* one dimension of 1 to 8 steps"),
         (IMAGE, "name a dataset of the run's environment"),
     ],

@@ -1,22 +1,23 @@
 """Making an environment from a run's settings, and saying what it looks like to the algorithm.
 
 However an environment presents itself, the algorithm sees observations of the kinds in
-:mod:`udrl.spaces` and actions of those in :mod:`udrl.actions`: an image's channels are moved to the
-front, a ``Discrete`` space with an offset is shifted to 0. Everything else is refused, with what is
-supported.
+:mod:`udrl.spaces` and actions of those in :mod:`udrl.actions`. Everything else is refused, with
+what is supported.
 """
 
+import errno
+import threading
 from typing import Annotated, Any
 
 import gymnasium as gym
 import msgspec
-import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from msgspec import Meta
 
 from udrl.actions import ActionSpace, Categorical
 from udrl.config import Config
+from udrl.environments.adapter import Adapter, close
+from udrl.environments.conversions import action_conversion, observation_conversion
 from udrl.errors import UnsupportedEnvironment
 from udrl.spaces import MOST_CATEGORIES, ObservationSpace, observation_space
 
@@ -46,12 +47,12 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         return self.observation_space.n_bytes + self.action_space.n_bytes + 4
 
 
-def make_environment(config: Config) -> Environment:
+def make_environment(config: Config) -> Adapter:
     """Return the environment of a run, with observations and actions as the algorithm sees them.
 
     Raises:
         UnsupportedEnvironment: it does not exist, cannot be made, has no time limit, or has spaces
-            that are not supported.
+            that are not supported; all that is wrong is said at once.
     """
     name = config.environment
     # The limit is handed over only when it is set: None would mean "no limit" to Gymnasium.
@@ -62,89 +63,92 @@ def make_environment(config: Config) -> Environment:
         env: Environment = gym.make(
             name, disable_env_checker=True, **(limit | config.environment_kwargs)
         )
-    except (gym.error.DependencyNotInstalled, ImportError) as error:
-        raise UnsupportedEnvironment(f"environment {name!r}: {error}; {_remedy(error)}") from error
     except Exception as error:
         raise UnsupportedEnvironment(
-            f"environment {name!r} cannot be made: {type(error).__name__}: {error}; name an id "
-            f"registered with Gymnasium, or an importable one as package.module:Env-v0"
+            f"environment {name!r} cannot be made: {type(error).__name__}: {error}; "
+            f"{_remedy(error, config)}"
         ) from error
-    if env.spec is None or env.spec.max_episode_steps is None:
-        env.close()
-        raise UnsupportedEnvironment(
-            f"environment {name!r} has no step limit, so an episode might never end; "
-            f"set max_episode_steps, e.g. --set max_episode_steps=1000"
-        )
-    return _with_plain_actions(_with_plain_observations(env, name), name)
+    return adapt(env, name)
 
 
-def _remedy(error: Exception) -> str:
-    for package, extra in _EXTRAS.items():
-        if package.lower() in str(error).lower():
-            return f'install it with: pip install "udrl[{extra}]"'
-    return "install the package that provides it"
+def adapt(env: Environment, name: str) -> Adapter:
+    """Return an environment with observations and actions as the algorithm sees them, and checked.
 
+    Args:
+        env: has a step limit.
+        name: what messages call it.
 
-def _with_plain_observations(env: Environment, name: str) -> Environment:
-    space = env.observation_space
-    if isinstance(space, spaces.Discrete):
-        if space.n > MOST_CATEGORIES:
-            env.close()
-            raise UnsupportedEnvironment(
-                f"environment {name!r} has {space.n:,} states, and the network would learn a "
-                f"vector for each; at most {MOST_CATEGORIES:,} are supported; wrap it, so that it "
-                f"shows numbers that describe a state"
-            )
-        return env if space.start == 0 else _with_indices_from_0(env, space)
-    if isinstance(space, spaces.Box) and min(space.shape, default=0) > 0:
-        if len(space.shape) == 1:
-            return env
-        if len(space.shape) in (2, 3) and space.dtype == np.uint8:
-            return _with_channels_first(env, space)
-    env.close()
-    raise UnsupportedEnvironment(
-        f"environment {name!r} has observations {space}; supported are Box vectors (one "
-        f"dimension), Box images of uint8 (two or three dimensions) and Discrete; wrap it, e.g. "
-        f"in gymnasium.wrappers.FlattenObservation"
-    )
-
-
-def _with_indices_from_0(env: Environment, space: "spaces.Discrete[Any]") -> Environment:
-    start = int(space.start)
-    return gym.wrappers.TransformObservation(
-        env, lambda observation: observation - start, spaces.Discrete(int(space.n))
-    )
-
-
-def _with_channels_first(env: Environment, space: spaces.Box) -> Environment:
-    """Return an environment of images as [channels, height, width].
-
-    Which dimension holds the channels, nobody declares; as everywhere, it is the smallest.
+    Raises:
+        UnsupportedEnvironment: it has no time limit, or spaces that are not supported; all that is
+            wrong is said at once, and the environment is closed.
     """
-    shape = space.shape
-    if len(shape) == 3 and shape[0] <= min(shape):
-        return env
-
-    def move(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        return image[None] if image.ndim == 2 else np.moveaxis(image, -1, 0)
-
-    channels = 1 if len(shape) == 2 else shape[-1]
-    moved = spaces.Box(0, 255, (channels, *shape[:2]), np.uint8)
-    return gym.wrappers.TransformObservation(env, move, moved)
-
-
-def _with_plain_actions(env: Environment, name: str) -> Environment:
-    space = env.action_space
-    if not isinstance(space, spaces.Discrete):
-        env.close()
-        raise UnsupportedEnvironment(
-            f"environment {name!r} has actions {space}; supported is Discrete"
+    observations = observation_conversion(env.observation_space)
+    actions = action_conversion(env.action_space)
+    problems = []
+    if observations is None:
+        problems.append(_unsupported_observations(env.observation_space))
+    if actions is None:
+        problems.append(f"its actions are {env.action_space}; supported is Discrete")
+    if env.spec is None or env.spec.max_episode_steps is None:
+        problems.append(
+            "it has no step limit, so an episode might never end; set one, e.g. "
+            "--set max_episode_steps=1000"
         )
-    if space.start == 0:
-        return env
-    start = int(space.start)
-    return gym.wrappers.TransformAction(
-        env, lambda action: action + start, spaces.Discrete(int(space.n))
+    if observations is None or actions is None or problems:
+        close(env)
+        raise UnsupportedEnvironment(f"environment {name!r}: {'; besides, '.join(problems)}")
+    return Adapter(env, observations, actions)
+
+
+def _remedy(error: Exception, config: Config) -> str:
+    """Return what to do about an exception that an environment's making raised."""
+    text = str(error)
+    if isinstance(error, gym.error.DependencyNotInstalled | ImportError):
+        for package, extra in _EXTRAS.items():
+            if package.lower() in text.lower():
+                return f'install it with: pip install "udrl[{extra}]"'
+        if isinstance(error, ModuleNotFoundError) and ":" in config.environment:
+            return (
+                "install the package that provides it, or start in the directory that the module "
+                "is in"
+            )
+        return "install the package that provides it"
+    if isinstance(error, gym.error.Error):
+        return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
+    if threading.current_thread() is not threading.main_thread() and _is_of_threads(text):
+        return (
+            "it has to be made in the main thread of a process; train with a process for each "
+            "service (in Python: in_process=False)"
+        )
+    if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+        return (
+            "another copy of it, or another program, has that port; if only one copy can run at a "
+            "time, add --actors 1 --envs-per-actor 1"
+        )
+    if isinstance(error, TypeError) and "argument" in text:
+        return "environment_kwargs has its arguments; leave out those that it does not take"
+    return (
+        f"the fault is in the environment or its arguments; in Python, "
+        f"gymnasium.make({config.environment!r}) shows where"
+    )
+
+
+def _is_of_threads(text: str) -> bool:
+    """Say whether an exception's text is one of those that come from a thread of one's own."""
+    return any(word in text.lower() for word in ("main thread", "event loop", "signal"))
+
+
+def _unsupported_observations(space: spaces.Space[Any]) -> str:
+    if isinstance(space, spaces.Discrete):
+        return (
+            f"it has {space.n:,} states, and the network would learn a vector for each; at most "
+            f"{MOST_CATEGORIES:,} are supported; wrap it, so that it shows numbers that describe a "
+            f"state"
+        )
+    return (
+        f"its observations are {space}; supported are Box vectors (one dimension), Box images of "
+        f"uint8 (two or three dimensions) and Discrete; wrap it, e.g. in "
+        f"gymnasium.wrappers.FlattenObservation"
     )
 
 

@@ -4,7 +4,7 @@ import logging
 import re
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from pathlib import Path
 
@@ -58,14 +58,14 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
     Raises:
         ConfigError: the command strategy cannot be made, or the dataset cannot be used.
         UnsupportedEnvironment: the environment does not exist or is not supported.
+        EnvironmentFault: it raises, or returns what it may not.
         StoreError: the directory holds a run already, or cannot be written.
     """
     config = settle(config)
     make_strategy(config)
-    generator = EpisodeGenerator(config, 1)
-    config, offline = settle_dataset(config, generator.spec)
-    exact = environment_replays(config, generator)
-    generator.close()
+    with closing(EpisodeGenerator(config, 1)) as generator:
+        config, offline = settle_dataset(config, generator.spec)
+        exact = environment_replays(config, generator)
     progress = Progress(exact=exact)
     if not exact:
         progress.inexact_reason = (

@@ -1,0 +1,123 @@
+"""A foreign environment as the algorithm sees it; everything that it returns is checked."""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from udrl.environments.conversions import Array, Conversion, describe
+from udrl.errors import EnvironmentFault, InvalidData
+
+log = logging.getLogger("udrl")
+
+_RESET = "(observation, info)"
+_STEP = "(observation, reward, terminated, truncated, info)"
+#: The largest reward.
+_LARGEST = float(np.finfo(np.float32).max)
+#: What Python says where an environment returns what Gym before version 0.26 wanted.
+_OLD_STEP = "not enough values to unpack (expected 5, got 4)"
+
+
+class Adapter(gym.Wrapper[Any, Any, Any, Any]):
+    """Shows plain observations and takes plain actions (:mod:`udrl.environments.conversions`).
+
+    Args:
+        env: the environment.
+        observations: how what it shows becomes plain.
+        actions: how plain actions become its own.
+    """
+
+    def __init__(
+        self, env: gym.Env[Any, Any], observations: Conversion, actions: Conversion
+    ) -> None:
+        super().__init__(env)
+        self.observations = observations
+        self.actions = actions
+        self.observation_space = observations.plain.gymnasium
+        self.action_space = actions.plain.gymnasium
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode.
+
+        Raises:
+            EnvironmentFault: the environment returned what it may not.
+        """
+        returned: Any = self.env.reset(seed=seed, options=options)
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise _wrong("reset", describe(returned), _RESET)
+        observation, info = returned
+        if not isinstance(info, Mapping):
+            raise _wrong("reset", f"{describe(info)} as info", "a dictionary")
+        return self._seen("reset", observation), dict(info)
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        Args:
+            action: plain.
+
+        Raises:
+            EnvironmentFault: the environment returned what it may not.
+        """
+        try:
+            returned: Any = self.env.step(self.actions.back_one(action))
+        except ValueError as error:
+            if str(error).endswith(_OLD_STEP):  # Gymnasium's wrappers unpack it first
+                raise _wrong("step", "a tuple of 4", f"{_STEP}, as since Gym 0.26") from error
+            raise
+        if type(returned) is not tuple or len(returned) != 5:
+            raise _wrong("step", describe(returned), _STEP)
+        observation, reward, terminated, truncated, info = returned
+        if type(reward) is not float:
+            reward = _number(reward)
+        if not -_LARGEST <= reward <= _LARGEST:
+            raise _wrong("step", f"the reward {reward}", "a finite number that float32 can hold")
+        if type(terminated) is not bool:
+            terminated = _flag("terminated", terminated)
+        if type(truncated) is not bool:
+            truncated = _flag("truncated", truncated)
+        return self._seen("step", observation), reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Close the environment; what it raises then is logged and does no harm."""
+        close(self.env)
+
+    def _seen(self, where: str, observation: Any) -> Array:
+        try:
+            return self.observations.one(observation)
+        except InvalidData as error:
+            raise EnvironmentFault(f"{where}() returned as observation {error}") from error
+
+
+def close(env: gym.Env[Any, Any]) -> None:
+    """Close a foreign environment; what it raises then is logged and does no harm."""
+    try:
+        env.close()
+    except Exception as error:  # noqa: BLE001 - whatever foreign code raises
+        log.warning("environment %s failed in close(): %s: %s", env, type(error).__name__, error)
+
+
+def _wrong(where: str, returned: str, expected: str) -> EnvironmentFault:
+    return EnvironmentFault(f"{where}() returned {returned}, expected {expected}")
+
+
+def _number(reward: Any) -> float:
+    """Return a number, or the one element of an array, as a float."""
+    if isinstance(reward, np.ndarray) and reward.size == 1:
+        reward = reward.item()
+    if isinstance(reward, int | float | np.integer | np.floating | np.bool_):
+        return float(reward)
+    raise _wrong("step", f"{describe(reward)} as reward", "a number")
+
+
+def _flag(name: str, value: Any) -> bool:
+    """Return a truth value, or the one element of an array."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1)):
+        return bool(value)
+    raise _wrong("step", f"{describe(value)} as {name}", "True or False")
