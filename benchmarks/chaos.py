@@ -185,7 +185,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     status = run.status()
     counts = {
         "env_failures": status.env_failures,
-        "restarts": sum(len(c.restarts) for c in run.children("actor", "learner", "replay")),
+        "restarts": sum(c.starts - 1 for c in run.children("actor", "learner", "replay")),
     }
     if fault.shows_in is not None and not counts[fault.shows_in]:
         remarks.append(f"WRONG: it never happened, {fault.shows_in} is 0")

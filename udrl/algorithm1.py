@@ -20,7 +20,7 @@ from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
-from udrl.training import TrainingState, train, untrained, use_one_thread
+from udrl.training import TrainingState, exact_arithmetic, train, untrained
 
 
 @dataclass
@@ -65,6 +65,7 @@ class Run:
         return replay_digest(self.digests[entry.id] for entry in self.buffer).hex()
 
 
+@exact_arithmetic()
 def algorithm1(
     config: Config,
     budget: Budget,
@@ -83,7 +84,6 @@ def algorithm1(
         raise ConfigError(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
-    use_one_thread()
     config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)

@@ -44,6 +44,10 @@ class TrainingState:
         return weights_of(self.behavior)
 
 
+#: What CUDA's matrix products need to be deterministic.
+_WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
+
+
 def weights_of(behavior: BehaviorFunction) -> Weights:
     """Return a behavior function's parameters as arrays of their own."""
     return {n: t.detach().cpu().numpy().copy() for n, t in behavior.state_dict().items()}
@@ -53,8 +57,25 @@ def use_one_thread() -> None:
     """Let torch compute deterministically in one thread."""
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # CUDA's matrix products too
+    os.environ.setdefault(_WORKSPACE, ":4096:8")  # CUDA's matrix products too
     torch.use_deterministic_algorithms(mode=True)
+
+
+@contextlib.contextmanager
+def exact_arithmetic() -> Iterator[None]:
+    """Let torch compute deterministically in one thread, and leave it as it was."""
+    threads = torch.get_num_threads()
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    warns_only = torch.is_deterministic_algorithms_warn_only_enabled()
+    workspace = os.environ.get(_WORKSPACE)
+    use_one_thread()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
+        if workspace is None:
+            os.environ.pop(_WORKSPACE, None)
 
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:

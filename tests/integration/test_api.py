@@ -63,7 +63,7 @@ def test_a_new_directory_is_made_in_runs(tmp_path: Path, monkeypatch: pytest.Mon
         "Figure2-v0", max_env_steps=60, n_warm_up_episodes=5, n_episodes_per_iter=5,
         n_updates_per_iter=2, last_few=3, eval_episodes=2,
     )  # fmt: skip
-    assert trained.run_dir.parent == Path("runs")
+    assert trained.run_dir.parent == tmp_path / "runs"
     assert (trained.run_dir / "run.sqlite").exists()
 
 

@@ -107,11 +107,28 @@ def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, s
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device here")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # their pipes
 def test_a_full_disk_ends_a_film(ended_run: Path, tmp_path: Path) -> None:
     (tmp_path / "film.mp4").symlink_to("/dev/full")
-    with pytest.raises(ConfigError, match="is the disk full"):
+    with pytest.raises(ConfigError, match="No space left on device"):
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / "film.mp4")
+
+
+def test_what_ffmpeg_says_is_told_and_no_empty_film_remains(
+    ended_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ffmpeg = tmp_path / "ffmpeg"
+    ffmpeg.write_text("#!/bin/sh\necho 'Unknown encoder libx264' >&2\nexit 1\n")
+    ffmpeg.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(ffmpeg))
+    with pytest.raises(ConfigError, match="ffmpeg cannot write it: Unknown encoder libx264"):
+        call("play", ended_run, "--episodes", 1, "--video", tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize("name", ["seed:7.mp4", "-x.gif", "a film%03d.mp4"])
+def test_films_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> None:
+    call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
+    assert (tmp_path / name).stat().st_size > 1000
 
 
 def test_play_needs_a_run(tmp_path: Path) -> None:

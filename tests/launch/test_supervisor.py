@@ -63,11 +63,47 @@ def test_error_that_would_be_repeated_is_final(supervisor: Supervisor, code: int
     assert failure.value.exit_code == code
 
 
-def test_child_that_keeps_dying_is_given_up(supervisor: Supervisor) -> None:
-    start(supervisor, "child", "raise SystemExit(1)")
-    with pytest.raises(RunFailed, match="child ended with code 1"):
+def test_child_that_dies_without_getting_on_is_given_up(supervisor: Supervisor) -> None:
+    start(supervisor, "child", "print('why'); raise SystemExit(1)")
+    says = "child ended with code 1 6 times without getting on:\nwhy"
+    with pytest.raises(RunFailed, match=says):
         check_until(supervisor, lambda: False)
-    assert len(supervisor.children[0].restarts) == 5
+
+
+def test_child_that_gets_on_is_started_again_for_ever(supervisor: Supervisor) -> None:
+    supervisor.start("actor-1", "actor", prefix=(sys.executable, "-c", "raise SystemExit(1)"))
+    child, started = supervisor.children[0], set[int]()
+
+    def often() -> bool:
+        assert child.process is not None
+        started.add(child.process.pid)
+        supervisor.work["actor"] = len(started) // 4
+        return len(started) >= 20
+
+    check_until(supervisor, often)
+
+
+def test_signal_is_called_by_its_name_and_what_it_usually_means(supervisor: Supervisor) -> None:
+    start(supervisor, "child", "import os; os.kill(os.getpid(), 9)")
+    says = r"child ended by SIGKILL \(somebody killed it, or memory ran out\) 6 times"
+    with pytest.raises(RunFailed, match=says):
+        check_until(supervisor, lambda: False)
+    assert module.how_it_ended(-11) == "ended by SIGSEGV (a crash in native code)"
+    assert module.how_it_ended(-40) == "ended by signal 40"
+
+
+def test_log_without_end_is_shortened(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LONGEST_LOG", 4000)
+    chatty = "n = 0\nwhile n < 20_000: n += 1; print('line', n, flush=True)"
+    start(supervisor, "child", chatty)
+    check_until(supervisor, lambda: supervisor.done)
+    supervisor.children[0].shorten_log()
+    log_file = supervisor.children[0].log_file
+    assert log_file.stat().st_size <= 4000
+    assert log_file.read_text().splitlines()[0] == "... what stood here was dropped"
+    assert supervisor.children[0].last_words().splitlines()[-1] == "line 20000"
 
 
 def test_end_kills_a_child_that_does_not_listen(
@@ -93,7 +129,7 @@ def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) 
     check_until(supervisor, lambda: supervisor.children[0].done)
     start(supervisor, "other", "raise SystemExit(1)")
     check_until(supervisor, lambda: supervisor.done)
-    assert supervisor.children[1].restarts == []
+    assert supervisor.children[1].starts == 1
 
 
 def test_who_does_not_end_after_the_first_is_not_waited_for(

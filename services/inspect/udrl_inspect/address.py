@@ -21,6 +21,7 @@ from udrl_proto.credentials import load
 from udrl_proto.messages import Hello
 from udrl_proto.transport import Transport
 from udrl_proto.zenoh_transport import ZenohTransport
+from udrl_replay.database import is_locked
 
 log = logging.getLogger("udrl")
 
@@ -68,7 +69,8 @@ def connected(
 def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
     """Say in a run's directory that this process serves it at an endpoint."""
     file = run_dir / ENDPOINT_FILE
-    file.write_text(json.dumps({"endpoint": endpoint, "pid": os.getpid()}), encoding="utf-8")
+    where = {"endpoint": endpoint, "host": platform.node(), "pid": os.getpid()}
+    file.write_text(json.dumps(where), encoding="utf-8")
     try:
         yield
     finally:
@@ -76,14 +78,18 @@ def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
 
 
 def served_at(run_dir: Path) -> str | None:
-    """Return the endpoint at which a run is served on this machine; None: it is not."""
+    """Return the endpoint at which a run is served; None: nobody works on it.
+
+    Whoever serves a run holds its lock. A process id would say nothing of other machines and
+    containers, nor of other users' processes.
+    """
     try:
         where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))
-        os.kill(int(where["pid"]), 0)  # raises unless the service that wrote the file is there
-        return str(where["endpoint"])
+        endpoint = str(where["endpoint"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.debug("%s is not served: %s", run_dir, error)
         return None
+    return endpoint if is_locked(run_dir) else None
 
 
 def unique_name(role: str) -> str:

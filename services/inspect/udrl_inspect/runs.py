@@ -53,20 +53,24 @@ def find(folder: Path) -> list[Summary]:
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such directory; name the one that your runs are in")
-    return sorted(map(summarise, _places(folder)), key=lambda s: s.changed, reverse=True)
+    return sorted(map(summarise, _places(folder, set())), key=lambda s: s.changed, reverse=True)
 
 
-def _places(folder: Path) -> Iterator[Path]:
-    """Yield the directories of runs; what is below one is its own affair."""
+def _places(folder: Path, seen: set[Path]) -> Iterator[Path]:
+    """Yield the directories of runs, once each; what is below one is its own affair."""
     try:
+        real = folder.resolve()
+        if real in seen:  # links may lead around
+            return
+        seen.add(real)
         if (folder / FILE).exists():
             yield folder
             return
-        below = sorted(f for f in folder.iterdir() if f.is_dir() and not f.is_symlink())
+        below = sorted(f for f in folder.iterdir() if f.is_dir())
     except OSError:
         return  # other people's, or gone meanwhile
     for one in below:
-        yield from _places(one)
+        yield from _places(one, seen)
 
 
 def summarise(run_dir: Path) -> Summary:

@@ -20,6 +20,7 @@ from udrl.errors import ConfigError, Interrupted, UdrlError
 from udrl.policy import Policy
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status, settings_of
+from udrl_launch.paths import new_run_dir
 from udrl_launch.settings import gather
 from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
@@ -80,16 +81,15 @@ def train(
     """
     if resume and run_dir is None:
         raise ConfigError("resume needs run_dir: the directory of the run to go on with")
-    going_on = resume and run_dir is not None and exists(Path(run_dir))
+    chosen = None if run_dir is None else Path(run_dir).absolute()
+    going_on = resume and chosen is not None and exists(chosen)
     gathered = gather(
         environment,
         preset_name=preset,
-        stored=settings_of(Path(run_dir)) if going_on and run_dir is not None else None,
+        stored=settings_of(chosen) if going_on and chosen is not None else None,
         options=settings,
     )
-    folder = (
-        Path(run_dir) if run_dir is not None else Path("runs") / directory_name(gathered.config)
-    )
+    folder = chosen or new_run_dir(directory_name(gathered.config))
     stop = threading.Event()
     watcher = _Callbacks([callbacks] if callable(callbacks) else list(callbacks), stop)
     try:

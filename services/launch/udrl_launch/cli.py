@@ -10,6 +10,8 @@ import click
 
 from udrl.errors import UdrlError
 from udrl.version import __version__
+from udrl_launch import output
+from udrl_launch.paths import find_modules_of_the_user
 
 #: The commands of this package and the modules that hold them, in the order of the help.
 _COMMANDS = {
@@ -37,8 +39,13 @@ _GROUP = "udrl.commands"
 
 def main() -> NoReturn:
     """Run the command line; errors of ours are one line, without a traceback."""
+    find_modules_of_the_user()
+    if "--json" in sys.argv:
+        output.keep_for_json()
     try:
         code = cli(standalone_mode=False)
+    except BrokenPipeError:  # nobody reads on, e.g. `| head`
+        code = 0
     except UdrlError as error:
         click.echo(f"udrl: error: {error}", err=True)
         code = error.exit_code
@@ -50,8 +57,7 @@ def main() -> NoReturn:
     # Not sys.exit: Zenoh's threads may still be in a callback, and when the interpreter ends under
     # them the process now and then aborts, after all its work. No command leaves work to exit
     # handlers, and what is left of it is memory.
-    sys.stdout.flush()
-    sys.stderr.flush()
+    output.flush()
     os._exit(code or 0)
 
 

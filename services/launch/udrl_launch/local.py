@@ -1,5 +1,6 @@
 """All services of a run on this machine: a process each, or threads of this one."""
 
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -9,10 +10,12 @@ from typing import Protocol
 
 from udrl_inspect.address import Address
 from udrl_launch import roles
+from udrl_launch.process import switch_threads_soon
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import END_S, Supervisor
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
+from udrl_proto.reports import Status
 from udrl_replay.store import Store
 
 #: Seconds that freshly started services look for the replay service.
@@ -29,6 +32,10 @@ class Local(Protocol):
 
     def check(self) -> None:
         """Start again what has died; raise what cannot be mended."""
+        ...
+
+    def note(self, status: Status) -> None:
+        """Learn how far the run is."""
         ...
 
     def end(self) -> None:
@@ -79,6 +86,14 @@ class Processes:
         """Start again what has died; raise what cannot be mended."""
         self._supervisor.check()
 
+    def note(self, status: Status) -> None:
+        """Learn how far the run is, so that those who die without getting on are given up."""
+        self._supervisor.work = {
+            "replay": status.episodes.delivered,
+            "learner": status.weights_version,
+            "actor": status.episodes.accepted,
+        }
+
     def end(self) -> None:
         """End all of them."""
         self._supervisor.end()
@@ -103,6 +118,7 @@ class Threads:
         self._errors: list[BaseException] = []
         self._threads: list[threading.Thread] = []
         self._run_ended: float | None = None
+        self._switched_before = switch_threads_soon()
         self._start(
             "replay",
             partial(
@@ -150,8 +166,12 @@ class Threads:
         if self._errors:
             raise self._errors[0]
 
+    def note(self, status: Status) -> None:
+        """Nothing is started again here."""
+
     def end(self) -> None:
         """End all of them."""
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
+        sys.setswitchinterval(self._switched_before)

@@ -1,7 +1,6 @@
 """The three services as functions, for a process or a thread of their own."""
 
 import logging
-import sys
 import threading
 from contextlib import closing
 from importlib.util import find_spec
@@ -87,8 +86,5 @@ def actor(
         stop: ends everything.
         hang_s: end the whole process when a round of steps takes longer; None: do not.
     """
-    # The courier's thread must get the interpreter soon while the loop steps environments: at the
-    # default of 5 ms a query takes 5 ms instead of 0.2.
-    sys.setswitchinterval(0.0005)
     with connected("actor", address, stop) as (transport, hello):
         ActorService(transport, hello, unique_name("actor"), environments, stop, hang_s).run()

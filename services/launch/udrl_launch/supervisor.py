@@ -6,19 +6,21 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from udrl.errors import RunFailed
+from udrl_launch.paths import STARTED_IN, environment_of_children
 
 log = logging.getLogger("udrl")
 
 #: Exit codes that starting again would only repeat (``docs/operations.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
-#: A child that ended so often within ``_PERIOD_S`` seconds is given up.
-_MAX_RESTARTS = 5
-_PERIOD_S = 60.0
+#: A child that ended so often, and whose work did not get on meanwhile, is given up.
+_MOST_DEATHS = 6
+#: Bytes of a child's log, of which a quarter is kept.
+_LONGEST_LOG = 1 << 20
 #: Seconds that services have to end after the run has ended or after SIGTERM.
 END_S = 4.5
 
@@ -31,7 +33,9 @@ class Child:
         name: for logs, and the name of its log file.
         arguments: of the ``udrl`` command.
         prefix: another program, with its arguments, that runs it, e.g. in a container.
-        restarts: when it was started again.
+        starts: how often it was started.
+        deaths: since its work last got on.
+        work: how far that was then.
     """
 
     name: str
@@ -39,22 +43,28 @@ class Child:
     log_file: Path
     prefix: tuple[str, ...] = ()
     process: subprocess.Popen[bytes] | None = None
-    restarts: list[float] = field(default_factory=list)
+    starts: int = 0
+    deaths: int = 0
+    work: int = -1
     done: bool = False
 
     def start(self) -> None:
         """Start the process."""
+        self.starts += 1
         with self.log_file.open("ab") as output:
             self.process = subprocess.Popen(  # noqa: S603 - our own program
                 [
                     *self.prefix,
                     sys.executable,
+                    "-P",  # a file of the user's must not stand before a module of Python's
                     "-m",
                     "udrl_launch",
                     *self.arguments,
                     "--parent",
                     str(os.getpid()),
                 ],
+                cwd=STARTED_IN,
+                env=environment_of_children(),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -63,8 +73,48 @@ class Child:
 
     def last_words(self) -> str:
         """Return the end of its log."""
-        lines = self.log_file.read_text(encoding="utf-8", errors="replace").splitlines()
-        return "\n".join(lines[-5:])
+        return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
+
+    def shorten_log(self) -> None:
+        """Keep the end of a log that has become long: environments may print without end."""
+        if self.log_file.stat().st_size > _LONGEST_LOG:
+            end = _end_of(self.log_file, _LONGEST_LOG // 4)
+            # The child appends, so it goes on behind whatever is there.
+            with self.log_file.open("r+", encoding="utf-8") as log_file:
+                log_file.truncate(0)
+                log_file.write(f"... what stood here was dropped\n{end}")
+
+
+def _end_of(file: Path, size: int) -> str:
+    """Return the last so many bytes of a file, without the line that they begin in."""
+    with file.open("rb") as opened:
+        length = opened.seek(0, os.SEEK_END)
+        opened.seek(max(0, length - size))
+        end = opened.read(size).decode("utf-8", errors="replace")
+    return end if length <= size else end.partition("\n")[2]
+
+
+#: What ends a process from outside, and what it usually means.
+_SIGNALS = {
+    signal.SIGKILL: "somebody killed it, or memory ran out",
+    signal.SIGSEGV: "a crash in native code",
+    signal.SIGABRT: "native code gave up",
+    signal.SIGBUS: "a crash in native code, or a full disk behind shared memory",
+    signal.SIGILL: "native code for another processor",
+    signal.SIGFPE: "native code divided by zero",
+}
+
+
+def how_it_ended(code: int) -> str:
+    """Say how a process ended; ``code`` as :class:`subprocess.Popen` has it."""
+    if code >= 0:
+        return f"ended with code {code}"
+    try:
+        number = signal.Signals(-code)
+    except ValueError:
+        return f"ended by signal {-code}"
+    meaning = f" ({_SIGNALS[number]})" if number in _SIGNALS else ""
+    return f"ended by {number.name}{meaning}"
 
 
 class Supervisor:
@@ -75,12 +125,17 @@ class Supervisor:
 
     Args:
         log_dir: where their output goes, a file each.
+
+    Attributes:
+        work: how far the children of each role are (``actor``: episodes, ``learner``: versions):
+            who dies again and again while that stands still is given up, however slowly it dies.
     """
 
     def __init__(self, log_dir: Path) -> None:
         log_dir.mkdir(parents=True, exist_ok=True)
         self._log_dir = log_dir
         self.children: list[Child] = []
+        self.work: dict[str, int] = {}
         self._first_done: float | None = None
 
     def start(self, name: str, *arguments: str, prefix: tuple[str, ...] = ()) -> None:
@@ -97,6 +152,7 @@ class Supervisor:
         """
         for child in self.children:
             assert child.process is not None
+            child.shorten_log()
             code = child.process.poll()
             if code is None or child.done:
                 continue
@@ -105,16 +161,20 @@ class Supervisor:
                 self._first_done = now
             if code == 0 or self._first_done is not None:
                 if code != 0:
-                    log.warning("%s ended with code %d when all was done", child.name, code)
+                    log.warning("%s %s when all was done", child.name, how_it_ended(code))
                 child.done = True
                 continue
-            child.restarts = [t for t in child.restarts if now - t < _PERIOD_S]
-            if code in FINAL_CODES or len(child.restarts) >= _MAX_RESTARTS:
-                failure = RunFailed(f"{child.name} ended with code {code}:\n{child.last_words()}")
+            work = self.work.get(child.arguments[0] if child.arguments else "", 0)
+            child.deaths = 1 if work != child.work else child.deaths + 1
+            child.work = work
+            if code in FINAL_CODES or child.deaths >= _MOST_DEATHS:
+                often = "" if code in FINAL_CODES else f" {child.deaths} times without getting on"
+                failure = RunFailed(
+                    f"{child.name} {how_it_ended(code)}{often}:\n{child.last_words()}"
+                )
                 failure.exit_code = code if code in FINAL_CODES else failure.exit_code
                 raise failure
-            log.warning("%s ended with code %d and is started again", child.name, code)
-            child.restarts.append(now)
+            log.warning("%s %s and is started again", child.name, how_it_ended(code))
             child.start()
 
     @property

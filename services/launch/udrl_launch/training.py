@@ -14,6 +14,7 @@ from udrl.errors import Interrupted, Unreachable
 from udrl_inspect.address import Address, connected
 from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
+from udrl_launch.paths import shown
 from udrl_launch.roles import require_torch
 from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
@@ -137,7 +138,7 @@ def train(
         raise Interrupted(
             "stopped; go on with: "
             + shlex.join(
-                ["udrl", "train", config.environment, "--run-dir", str(run_dir), "--resume"]
+                ["udrl", "train", config.environment, "--run-dir", shown(run_dir), "--resume"]
             )
         )
     return read_status(run_dir)
@@ -159,6 +160,7 @@ def _watch(
             except (Unreachable, Interrupted) as error:
                 log.debug("no status: %s", error)
                 continue
+            services.note(status)
             if watcher is not None:
                 watcher.show(status)
 

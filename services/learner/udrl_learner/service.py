@@ -19,7 +19,7 @@ from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.episode import Episode
 from udrl.errors import Interrupted, Refused
 from udrl.segments import Experience
-from udrl.training import TrainingState, train, untrained, use_one_thread
+from udrl.training import TrainingState, exact_arithmetic, train, untrained
 from udrl.training_class import training_class
 from udrl.version import __version__
 from udrl.weights import encode_weights
@@ -81,6 +81,7 @@ class LearnerService:
         self._asker = Asker(transport, hello.run_id, f"learner {name}", stop)
         self._progress = threading.Event()
 
+    @exact_arithmetic()
     def run(self) -> None:
         """Train until the run ends or ``stop`` is set.
 
@@ -88,7 +89,6 @@ class LearnerService:
             Refused: the run does not want this learner.
             Unreachable: the replay service has not answered for long.
         """
-        use_one_thread()
         run_id = self._hello.run_id
         declared: list[Any] = []
         try:

@@ -4,7 +4,7 @@ import logging
 import re
 import uuid
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -61,6 +61,15 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         EnvironmentFault: it raises, or returns what it may not.
         StoreError: the directory holds a run already, or cannot be written.
     """
+    try:
+        return _create(run_dir.absolute(), config, allow_inexact=allow_inexact)
+    except BaseException:
+        with suppress(OSError):
+            run_dir.rmdir()  # empty: it was made for this run
+        raise
+
+
+def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
     config = settle(config)
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:

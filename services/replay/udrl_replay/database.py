@@ -7,6 +7,7 @@ consistent at every moment, and a row that is not what was written is noticed.
 import fcntl
 import os
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,6 +19,9 @@ from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse,
 from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal
 
 FILE = "run.sqlite"
+LOCK = "lock"
+#: Seconds in which somebody who only asks for the lock has given it back.
+_LOOK_S = 0.2
 
 #: Tables whose rows may be written again.
 _REPLACED = {"facts", "evaluations", "versions"}
@@ -54,13 +58,11 @@ class Database:
             raise
 
     def _open(self) -> None:
-        # As a URI, so that a mode can be named and the path may hold any character.
-        uri = f"{self._path.resolve().as_uri()}?mode={'ro' if self.read_only else 'rw'}"
         try:
-            self._db = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
             if self.read_only:
-                self._db.execute("BEGIN")  # all that is read belongs to one moment
+                self._db = self._connect_to_read()
             else:
+                self._db = self._connect("mode=rw")
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("PRAGMA synchronous = FULL")
                 # Some builds overwrite what is deleted: thirteen times the time for a megabyte.
@@ -79,6 +81,23 @@ class Database:
                 f"use the version that wrote it"
             )
         self._check_seals()
+
+    def _connect(self, how: str) -> sqlite3.Connection:
+        # As a URI, so that a mode can be named and the path may hold any character.
+        uri = f"{self._path.resolve().as_uri()}?{how}"
+        return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+
+    def _connect_to_read(self) -> sqlite3.Connection:
+        """Connect so that all that is read belongs to one moment."""
+        wal = self._path.with_name(f"{FILE}-wal")
+        # SQLite keeps an index beside the file while somebody reads. Where it may not write one,
+        # and nobody can change the file, it can do without.
+        may_write = os.access(self._path.parent, os.W_OK)
+        is_still = not (wal.exists() and wal.stat().st_size) and not is_locked(self._path.parent)
+        db = self._connect("mode=ro" if may_write or not is_still else "mode=ro&immutable=1")
+        db.execute("BEGIN")
+        db.execute("SELECT 1 FROM facts").fetchone()  # opens it
+        return db
 
     def _check_seals(self) -> None:
         for table, columns in SEALED.items():
@@ -202,17 +221,37 @@ def _sync(folder: Path) -> None:
         os.close(descriptor)
 
 
+def is_locked(run_dir: Path) -> bool:
+    """Say whether a service works on a run, on this machine or another that shares its disk.
+
+    Where the lock may not even be read, the answer is yes.
+    """
+    try:
+        with (run_dir / LOCK).open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
 def _lock(run_dir: Path) -> Any:
     """Return the open lock file of a run directory; it is free again when it is closed."""
     try:
-        file = (run_dir / "lock").open("a")
+        file = (run_dir / LOCK).open("a")
     except OSError as error:
         raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise RunInUse(
-            f"{run_dir} is in use by another replay service; stop it, or name another --run-dir"
-        ) from error
-    return file
+    deadline = time.monotonic() + _LOOK_S
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if time.monotonic() < deadline:  # whoever asks is_locked() has it for a moment
+                time.sleep(_LOOK_S / 10)
+                continue
+            file.close()
+            raise RunInUse(
+                f"{run_dir} is in use by another replay service; stop it, or name another --run-dir"
+            ) from error
+        return file

@@ -1,9 +1,9 @@
 """Films of episodes: MP4 or GIF, a caption under every picture."""
 
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+import subprocess
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,17 @@ _CAPTION_HEIGHT = 26
 _LEAST_WIDTH = 320
 #: What GIFs have at most; browsers slow down faster ones.
 _GIF_FPS = 25
-# One palette for all pictures would have to see them all first: ffmpeg holds them meanwhile.
-_GIF_FILTER = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none"
+#: Options of ffmpeg for each kind of file.
+_KINDS = {
+    ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "15"),
+    # One palette for all pictures has to see them all first: ffmpeg holds them meanwhile.
+    ".gif": (
+        "-filter_complex",
+        "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
+    ),
+}
+#: Seconds that ffmpeg gets to finish a file.
+_FINISH_S = 60.0
 
 
 class Film:
@@ -33,7 +42,7 @@ class Film:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        if path.suffix not in (".mp4", ".gif"):
+        if path.suffix not in _KINDS:
             raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
         try:
             import imageio_ffmpeg
@@ -42,13 +51,14 @@ class Film:
             raise ConfigError(
                 f'films need {error.name}; install it with: pip install "udrl[play]"'
             ) from error
-        self._ffmpeg, self._image, self._draw = imageio_ffmpeg, Image, ImageDraw
+        self._ffmpeg, self._image, self._draw = imageio_ffmpeg.get_ffmpeg_exe, Image, ImageDraw
         self._font = ImageFont.load_default(14)
         self._path = path
         self._every = max(1, round(fps / _GIF_FPS)) if path.suffix == ".gif" else 1
         self._fps = fps / self._every
         self._seen = 0
-        self._writer: Generator[None, Any, None] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the film
 
     def add(self, picture: Picture, caption: str) -> None:
         """Append a picture, uint8 [height, width, 3]; the first says how large the film is."""
@@ -56,10 +66,13 @@ class Film:
         if (self._seen - 1) % self._every:
             return
         frame = self.frame(picture, caption)
-        if self._writer is None:
-            self._writer = self._open(frame)
-        with self._told():
-            self._writer.send(np.ascontiguousarray(frame))
+        if self._process is None:
+            self._process = self._open(frame)
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(np.ascontiguousarray(frame).data)
+        except OSError as error:
+            raise self._failed() from error
 
     def frame(self, picture: Picture, caption: str) -> Picture:
         """Return a picture with its caption below it, both sides even, as H.264 wants them."""
@@ -72,27 +85,40 @@ class Film:
         return np.asarray(page)
 
     def close(self) -> None:
-        """Finish the file; a film without pictures leaves none."""
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            with self._told():
-                writer.close()
+        """Finish the file; a film without pictures leaves none.
 
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Tell what ffmpeg cannot do, without its page of other affairs."""
+        Raises:
+            ConfigError: ffmpeg could not write it.
+        """
+        if self._process is not None and self._finish() != 0:
+            raise self._failed()
+        self._said.close()
+
+    def _finish(self) -> int:
+        """Wait for the end of ffmpeg and return its exit code."""
+        process, self._process = self._process, None
+        assert process is not None
         try:
-            yield
-        except (OSError, RuntimeError) as error:
-            self._writer = None
-            raise ConfigError(
-                f"--video {self._path}: ffmpeg cannot write it ({type(error).__name__}); is the "
-                f"disk full?"
-            ) from error
+            process.communicate(timeout=_FINISH_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+        return process.returncode
 
-    def _open(self, frame: Picture) -> Generator[None, Any, None]:
+    def _failed(self) -> ConfigError:
+        """Return an error with the first thing that ffmpeg said; nothing is left of the film."""
+        if self._process is not None:
+            self._finish()
+        self._said.seek(0)
+        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        self._said.close()
+        self._path.unlink(missing_ok=True)
+        why = lines[0].strip() if lines else "it ended without a word"
+        return ConfigError(f"--video {self._path}: ffmpeg cannot write it: {why}")
+
+    def _open(self, frame: Picture) -> subprocess.Popen[bytes]:
         height, width, _ = frame.shape
-        # Here and not by ffmpeg, whose message would be a page of its own affairs.
+        # Here and not by ffmpeg, which would not say it as shortly.
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.open("wb").close()
@@ -100,15 +126,12 @@ class Film:
             raise ConfigError(
                 f"--video {self._path}: {error.strerror}; name a file that you may write"
             ) from error
-        kind: dict[str, Any] = {"codec": "libx264", "quality": 7, "macro_block_size": 2}
-        if self._path.suffix == ".gif":
-            kind = {
-                "codec": "gif", "pix_fmt_out": "pal8", "macro_block_size": 1,
-                "output_params": ["-filter_complex", _GIF_FILTER],
-            }  # fmt: skip
-        writer: Generator[None, Any, None] = self._ffmpeg.write_frames(
-            str(self._path), (width, height), fps=self._fps, ffmpeg_log_level="error", **kind
-        )
-        with self._told():
-            next(writer)
-        return writer
+        return subprocess.Popen(  # noqa: S603 - the library's own program
+            [
+                self._ffmpeg(), "-y", "-loglevel", "error",
+                "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+                "-r", f"{self._fps:g}", "-i", "-", *_KINDS[self._path.suffix],
+                f"file:{self._path}",
+            ],
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
+        )  # fmt: skip

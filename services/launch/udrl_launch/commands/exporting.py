@@ -8,17 +8,17 @@ from udrl.errors import ConfigError
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_buffer, export_folder, export_model
 from udrl_inspect.obedience import kept_of
-from udrl_launch.commands.options import RUN_DIR, WEIGHTS, version
+from udrl_launch.commands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
 
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
 @click.option(
-    "--folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    "--folder", type=FOLDER, metavar="DIR",
     help="The agent for udrl.load(DIR): weights, settings, and a model card.",
 )  # fmt: skip
 @click.option(
-    "--onnx", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--onnx", type=FILE, metavar="FILE",
     help="The agent as an ONNX model; inputs: observation and command (desired return, desired "
     "horizon); output: logits.",
 )  # fmt: skip

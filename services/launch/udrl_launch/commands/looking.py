@@ -4,7 +4,6 @@ import traceback
 from pathlib import Path
 
 import click
-import msgspec
 
 from udrl.errors import EnvironmentFault
 from udrl_inspect import agents, inspection
@@ -19,6 +18,7 @@ from udrl_launch.commands.options import (
     place,
     version,
 )
+from udrl_launch.output import print_json
 from udrl_show.display import panel
 
 
@@ -61,7 +61,7 @@ def evaluate(
             "desired_horizon": result.desired_horizon,
             **result.evaluation._asdict(), "returns": result.returns,
         }  # fmt: skip
-        click.echo(msgspec.json.encode(report).decode())
+        print_json(report)
         return 0
     found = result.evaluation
     click.echo(
@@ -108,7 +108,7 @@ def status(
     """
     found = inspection.status_from(place(run_dir, connect, run_id, keys), keys)
     if as_json:
-        click.echo(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
         from rich.console import Console
 

@@ -11,12 +11,14 @@ from udrl_inspect import obedience as reports
 from udrl_inspect import obedience_text, tables
 from udrl_inspect.agents import load_agent
 from udrl_launch.commands.options import (
+    FILE,
     RETURNS,
     RUN_DIR,
     WEIGHTS,
     chosen_temperature,
     version,
 )
+from udrl_launch.output import print_json
 from udrl_show import pictures
 from udrl_show.obedience_picture import draw
 
@@ -40,7 +42,7 @@ _NAME = Path(reports.FILE)
               "evaluations.")  # fmt: skip
 @click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
 @WEIGHTS
-@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+@click.option("--output", "-o", type=FILE, metavar="FILE",
               help="The picture: .png, .svg or .pdf. Default: obedience.png in RUN_DIR, where "
               "matplotlib is installed.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the report as one JSON document.")
@@ -78,7 +80,7 @@ def obedience(
             "run_dir": str(run_dir), "answer": obedience_text.answer(report),
             **msgspec.to_builtins(report),
         }  # fmt: skip
-        click.echo(msgspec.json.encode(document).decode())
+        print_json(document)
     else:
         click.echo(obedience_text.table(report))
     if output is not None:

@@ -1,6 +1,7 @@
 """Options that several commands have."""
 
 import math
+import os
 import re
 from decimal import Decimal
 from pathlib import Path
@@ -16,12 +17,24 @@ from udrl_proto.session import check_endpoint
 #: No return is beyond this.
 _MOST = 1e9
 
-RUN_DIR = click.Path(path_type=Path, file_okay=False)
+
+class _AbsolutePath(click.Path):
+    """A path that means the same wherever an environment goes to."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        if not str(value):
+            self.fail("'' is no path; name one, e.g. runs/mine", param, ctx)
+        return Path(os.fsdecode(super().convert(value, param, ctx))).absolute()
+
+
+FILE = _AbsolutePath(path_type=Path, dir_okay=False)
+FOLDER = _AbsolutePath(path_type=Path, file_okay=False)
+RUN_DIR = FOLDER
 PARENT = click.option("--parent", type=int, hidden=True)
 PATIENCE = click.option("--patience", type=click.FloatRange(0), default=3.0, show_default=True,
                          help="Seconds to look for the run.")  # fmt: skip
 KEYS = click.option(
-    "--keys", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    "--keys", type=FOLDER, metavar="DIR",
     help="Authenticate and encrypt with these keys (`udrl keys create DIR`); endpoints are then "
     "tls/HOST:PORT.",
 )  # fmt: skip

@@ -3,16 +3,18 @@
 from pathlib import Path
 
 import click
-import msgspec
 
 from udrl_inspect.agents import evaluation_commands, load_agent
 from udrl_launch.commands.options import (
+    FILE,
     RETURN,
     RUN_DIR,
     WEIGHTS,
     chosen_temperature,
     version,
 )
+from udrl_launch.output import print_json
+from udrl_launch.paths import shown
 from udrl_show.playing import play as play_episodes
 from udrl_show.playing import with_seed
 from udrl_show.window import KEYS_HELP, Window
@@ -33,7 +35,7 @@ from udrl_show.window import KEYS_HELP, Window
               "evaluations.")  # fmt: skip
 @click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
 @WEIGHTS
-@click.option("--video", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+@click.option("--video", type=FILE, metavar="FILE",
               help="Film them: FILE.mp4 or FILE.gif.")  # fmt: skip
 @click.option(
     "--window", "opens_window", is_flag=True,
@@ -85,7 +87,7 @@ def play(
                 "terminated": rollout.terminated,
                 "truncated": rollout.truncated,
             }
-            click.echo(msgspec.json.encode(report).decode())
+            print_json(report)
         else:
             ending = "" if rollout.terminated else ", cut by its time limit"
             click.echo(
@@ -93,5 +95,5 @@ def play(
                 f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
             )
     if video is not None and not as_json:
-        click.echo(f"film: {video}")
+        click.echo(f"film: {shown(video)}")
     return 0

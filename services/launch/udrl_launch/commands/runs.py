@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Literal
 
 import click
-import msgspec
 
 from udrl_inspect.runs import Summary, find
-from udrl_launch.commands.options import RUN_DIR
+from udrl_launch.commands.options import FILE, RUN_DIR
+from udrl_launch.output import print_json
 from udrl_show import curve
 from udrl_show.display import duration
 
@@ -26,7 +26,7 @@ def runs(folder: Path, as_json: bool) -> int:
     found = find(folder)
     if as_json:
         for summary in found:
-            click.echo(msgspec.json.encode(summary).decode())
+            print_json(summary)
         return 0
     if not found:
         click.echo(f"no runs in {folder}; begin one: udrl train LunarLander-v3", err=True)
@@ -55,7 +55,7 @@ def _cells(summary: Summary) -> tuple[str, ...]:
 
 @click.command()
 @click.argument("run_dirs", metavar="RUN_DIR...", type=RUN_DIR, nargs=-1, required=True)
-@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+@click.option("--output", "-o", type=FILE, metavar="FILE",
               default=Path("learning_curves.png"), show_default=True,
               help="The picture: .png, .svg or .pdf.")  # fmt: skip
 @click.option("--x", type=click.Choice(["env_steps", "wall_s"]), default="env_steps",

@@ -14,18 +14,20 @@ from udrl.errors import ConfigError
 from udrl_inspect.address import Address
 from udrl_launch import roles
 from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
-from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
+from udrl_launch.commands.settings import gather_settings, settings_options
+from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import (
     die_with_parent,
     keep_freed_memory,
     log_to_stderr,
     run_service,
+    switch_threads_soon,
 )
 from udrl_launch.settings import Settings
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
-from udrl_replay.creation import config_of, create, exists, resume, write_config
+from udrl_replay.creation import config_of, create, directory_name, exists, resume, write_config
 
 log = logging.getLogger("udrl")
 
@@ -73,10 +75,10 @@ def replay(
     check_endpoint(listen or connect or "", secure=keys is not None)
     credentials = load(keys, REPLAY) if keys else None
     settings = gather_settings(env, given, run_dir, go_on=resume)
-    run_dir = run_dir or new_run_dir(settings)
+    run_dir = run_dir or new_run_dir(directory_name(settings.config))
 
     def service(stop: threading.Event) -> None:
-        log.info("the run's directory is %s", run_dir)
+        log.info("the run's directory is %s", shown(run_dir))
         store = _open(run_dir, settings, go_on=resume, allow_inexact=allow_inexact)
         roles.replay(
             run_dir, store, settings.budget, stop, listen=listen, connect=connect,
@@ -149,5 +151,6 @@ def actor(
     Example: udrl actor --connect tcp/127.0.0.1:7447 --envs 16
     """
     os.nice(nice)
+    switch_threads_soon()
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
     return _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))

@@ -8,9 +8,9 @@ import click
 
 from udrl.config import preset_names
 from udrl_inspect import inspection
-from udrl_launch.commands.options import STEPS
+from udrl_launch.commands.options import FILE, STEPS
 from udrl_launch.settings import Settings, gather
-from udrl_replay.creation import directory_name, exists
+from udrl_replay.creation import exists
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -21,7 +21,7 @@ def settings_options(command: Command) -> Command:
         click.option("--preset", "preset_name", metavar="NAME",
                      help=f"Shipped settings: {', '.join(preset_names())}. "
                      "Or none. Default: the one named like ENV, if any."),
-        click.option("--config", "file", type=click.Path(path_type=Path), metavar="FILE",
+        click.option("--config", "file", type=FILE, metavar="FILE",
                      help="Settings from a TOML file."),
         click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
                      help="Set any setting, e.g. --set batch_size=512; may be repeated."),
@@ -54,8 +54,3 @@ def gather_settings(
         assignments=given.pop("assignments"),
         options=given,
     )
-
-
-def new_run_dir(settings: Settings) -> Path:
-    """Return a directory for a new run."""
-    return Path("runs") / directory_name(settings.config)

@@ -7,16 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import click
-import msgspec
 
 from udrl.errors import ConfigError, UdrlError
 from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
-from udrl_launch.commands.settings import gather_settings, new_run_dir, settings_options
+from udrl_launch.commands.settings import gather_settings, settings_options
+from udrl_launch.output import print_json
+from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.settings import Settings
 from udrl_launch.training import Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
+from udrl_replay.creation import directory_name
 from udrl_show.curve import draw
 from udrl_show.display import Display
 from udrl_show.event_files import EventFiles
@@ -72,7 +74,7 @@ def train(
     if resume and run_dir is None:
         raise ConfigError("--resume needs --run-dir: the directory of the run to go on with")
     settings = gather_settings(env, given, run_dir, go_on=resume)
-    run_dir = run_dir or new_run_dir(settings)
+    run_dir = run_dir or new_run_dir(directory_name(settings.config))
     log_to_stderr(logging.WARNING)
     _warn_of_idle_actors(settings)
 
@@ -94,7 +96,7 @@ def train(
             watchers.show(status)
         _finish(run_dir, status)
         if as_json:
-            click.echo(msgspec.json.encode(status).decode())
+            print_json(status)
         if status.problem:
             raise UdrlError(status.problem)
 
@@ -125,11 +127,11 @@ def _finish(run_dir: Path, status: Status) -> None:
         )
     if status.weights_version:
         weights = run_dir / "weights.safetensors"
-        click.echo(f"weights:        {weights} (version {status.weights_version})")
+        click.echo(f"weights:        {shown(weights)} (version {status.weights_version})")
     else:
         click.echo("weights:        none; the budget was spent in the warm-up")
-    click.echo(f"metrics:        {run_dir / 'metrics.csv'}")
+    click.echo(f"metrics:        {shown(run_dir / 'metrics.csv')}")
     try:
-        click.echo(f"learning curve: {draw(run_dir, status.environment)}")
+        click.echo(f"learning curve: {shown(draw(run_dir, status.environment))}")
     except ConfigError as error:
         click.echo(f"learning curve: {error}")
