@@ -31,7 +31,7 @@ from disturbed_run import DisturbedRun, TooLate, digests, is_balanced
 from faults import FAULTS, Fault
 from severed_link import SeveredLink
 from udrl.commands import CommandSampler
-from udrl.config import Config
+from udrl.config import Config, change
 from udrl.environments.making import make_environment, specify
 from udrl.errors import RunFailed
 from udrl.replay import Entry, ReplayBuffer
@@ -126,7 +126,7 @@ def _settings(options: argparse.Namespace, environment: str | None) -> Settings:
     if environment is None:
         return settings
     limit = gym.spec(options.env).max_episode_steps
-    config = msgspec.structs.replace(
+    config = change(
         settings.config,
         environment=f"disturbed_environments:{environment}-v0",
         environment_kwargs={"inner": options.env},
@@ -205,7 +205,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
 
 def _curse(config: Config, chance: random.Random) -> int:
     """Return the environment seed of an exploratory command, early in a run."""
-    any_buffer = ReplayBuffer(config)  # the seeds do not depend on what is in it
+    any_buffer = ReplayBuffer(config.buffer)  # the seeds do not depend on what is in it
     any_buffer.admit([Entry(0.0, 0, 1)])
     with closing(make_environment(config)) as env:
         sampler = CommandSampler(config, specify(env, config))

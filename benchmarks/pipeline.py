@@ -244,7 +244,7 @@ def measure(config: Config, version_s: float) -> Costs:
 
 def _round(config: Config, rows: int) -> float:
     with closing(EpisodeGenerator(config, rows)) as generator:
-        graph = acting_graph(config, generator.spec)
+        graph = acting_graph(config.network, generator.spec)
         behavior = ActingFunction(graph, probe_weights(graph))
         numbers = itertools.count()
         rounds, began = 0, time.process_time()

@@ -29,7 +29,7 @@ import numpy as np
 from fleet import RUN, Load, Measured
 from udrl.actions import Categorical
 from udrl.checkpoint import encode_optimizer
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.errors import Interrupted
 from udrl.graph import acting_graph
@@ -153,23 +153,26 @@ def replay_service(run_dir: Path, hello: Hello, endpoint: str) -> Iterator[int]:
 def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[str, float]:
     """Return the figures of one fleet."""
     spec = spec_of(kilobytes)
-    config = Config(
-        environment="Synthetic-v0",
-        hidden=(64, 128, 128),
-        n_warm_up_episodes=max(100, 2 * actors),
-        n_episodes_per_iter=max(100, 2 * actors),
-        replay_size=options.replay_size,
-        last_few=50,
-        lead=2,
-        eval_every=2**31 - 1,
+    config = build(
+        Config,
+        {
+            "environment": "Synthetic-v0",
+            "hidden": [64, 128, 128],
+            "n_warm_up_episodes": max(100, 2 * actors),
+            "n_episodes_per_iter": max(100, 2 * actors),
+            "replay_size": options.replay_size,
+            "last_few": 50,
+            "lead": 2,
+            "eval_every": 2**31 - 1,
+        },
     )
     hello = Hello(
         protocol=PROTOCOL,
         software="0",
         run_id=RUN,
-        config=config,
+        settings=flat(config),
         environment=spec,
-        graph=acting_graph(config, spec),
+        graph=acting_graph(config.network, spec),
     )
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stop = threading.Event()

@@ -33,13 +33,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import torch
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
 from udrl.commands import TRAINING_SEEDS
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, change
 from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
@@ -135,7 +134,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     window = _window(run_dir)
     config, episodes = _recorded(run_dir)
     cores = os.cpu_count() or 1
-    per_step = config.n_updates_per_iter * window.iterations / window.steps
+    per_step = config.training.n_updates_per_iter * window.iterations / window.steps
 
     def limit(parts: Parts, per_step: float = per_step, cores: int = cores) -> float:
         training = parts.update * per_step
@@ -145,7 +144,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     system = window.steps / window.seconds
     reference = _reference_run(config, options.reference_steps)
     reference_speed = reference.steps / reference.seconds
-    reference_per_step = config.n_updates_per_iter * reference.iterations / reference.steps
+    reference_per_step = config.training.n_updates_per_iter * reference.iterations / reference.steps
     return {
         "bare environment step, us": parts.step * 1e6,
         "bare environment, random actions, env steps/s per core": _random_speed(config),
@@ -256,7 +255,7 @@ def _time_parts(run_dir: Path, processes: int) -> Parts:
 
 def _parts(config: Config, episodes: list[Episode]) -> Parts:
     # The limit counts the time of cores; more threads an update would take more of them.
-    config = msgspec.structs.replace(config, training_threads=1)
+    config = change(config, training_threads=1)
     generator = EpisodeGenerator(config, 1)
     spec = generator.spec
     env = make_environment(config)
@@ -269,7 +268,7 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
         steps += episode.length
     step = (time.perf_counter() - began) / steps
 
-    graph = acting_graph(config, spec)
+    graph = acting_graph(config.network, spec)
     call = ActingFunction(graph, probe_weights(graph)).call(_ROWS)
     inference = _seconds(call.run, 5000) / _ROWS
 
@@ -278,7 +277,7 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
         experience.add(episode)
     state = untrained(config, spec)
     ranked = experience.by_rank([e.command_id for e in episodes])
-    update = _seconds(lambda: train(state, ranked, config), 5) / config.n_updates_per_iter
+    update = _seconds(lambda: train(state, ranked, config), 5) / config.training.n_updates_per_iter
     return Parts(step, inference, update, _bare_update(config, spec))
 
 
@@ -287,9 +286,9 @@ def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
 
     With a value function, of its update too.
     """
-    state, n = untrained(config, spec), config.batch_size
+    state, n = untrained(config, spec), config.training.batch_size
     seen = spec.observation_space
-    shape = FrameStack(seen, config).shape
+    shape = FrameStack(seen, config.network.frame_stack).shape
     observation = (torch.rand(n, *shape) * 255).to(getattr(torch, seen.dtype.name))
     command, action = torch.rand(n, 2), torch.randint(spec.action_space.n, (n,))
 
@@ -340,7 +339,7 @@ def _reference_run(config: Config, steps: int) -> Window:
     """Return the second half of a short run of the reference implementation."""
     reports: list[Window] = []
     algorithm1(
-        msgspec.structs.replace(config, lead=0, eval_every=2**30),
+        change(config, lead=0, eval_every=2**30),
         Budget(max_env_steps=steps),
         report=lambda run: reports.append(
             Window(time.perf_counter(), run.env_steps, run.iteration)

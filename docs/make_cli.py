@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from click.types import FloatRange, IntRange
 
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, setting_names
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet
 
@@ -41,7 +41,7 @@ Settings that have no option of their own are set with `--set NAME=VALUE`, or in
 `--config`: see [configuration](configuration.md).
 """
 
-_SETTINGS = {name for kind in (Config, Budget, Fleet) for name in kind.__struct_fields__}
+_SETTINGS = {name for kind in (Config, Budget, Fleet) for name in setting_names(kind)}
 _TYPES = {"float": "NUMBER", "float range": "NUMBER", "integer range": "INTEGER"}
 
 

@@ -25,6 +25,7 @@ from tests.markdown import (
     section,
     text_of,
 )
+from tests.proto.strategies import setting_fields
 from udrl import errors
 from udrl.config import Budget, Config, preset, preset_names, read_toml
 from udrl.errors import UdrlError
@@ -101,10 +102,8 @@ def default_of(field: inspect.Field) -> str:
 def test_every_setting_is_documented_with_its_type_default_and_range(
     kind: Any, heading: str
 ) -> None:
-    info = inspect.type_info(kind)
-    assert isinstance(info, inspect.StructType)
     expected = {}
-    for field in info.fields:
+    for field in setting_fields(kind):
         name, allowed = described(field.type)
         expected[f"`{field.name}`"] = [name, default_of(field), allowed]
     rows = records(section("docs/configuration.md", heading), "setting")
@@ -116,7 +115,7 @@ def test_every_preset_is_documented_with_what_differs_from_the_defaults() -> Non
     defaults = {
         field.name: list(field.default) if isinstance(field.default, tuple) else field.default
         for kind in (Config, Budget, Fleet)
-        for field in msgspec.structs.fields(kind)
+        for field in setting_fields(kind)
     }
     expected = {
         name: {n: v for n, v in preset(name).items() if n != "environment" and v != defaults[n]}

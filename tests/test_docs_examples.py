@@ -13,7 +13,7 @@ import pytest
 
 import udrl.environments  # noqa: F401 - registers environments
 from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
-from udrl.config import Budget, Config, parse_assignment
+from udrl.config import Budget, Config, parse_assignment, setting_names
 from udrl.errors import UdrlError
 from udrl_experiments.protocol import TASKS, Plan, parse_seeds
 from udrl_launch.cli import cli
@@ -96,7 +96,7 @@ def check_udrl(words: list[str]) -> None:
             given["assignments"],
         ).config(TASKS["lander"], 1)
     elif "assignments" in given:
-        settings = {*Config.__struct_fields__, *Budget.__struct_fields__, *Fleet.__struct_fields__}
+        settings = {name for kind in (Config, Budget, Fleet) for name in setting_names(kind)}
         options = {n: v for n, v in given.items() if n in settings}
         gather(
             given["env"],

@@ -12,7 +12,7 @@ Algorithm 1                       :mod:`udrl.algorithm1`
 2.3.6 evaluation                  :mod:`udrl.commands`, :mod:`udrl.evaluation`
 Algorithm 2, step by step         :mod:`udrl.policy`, :mod:`udrl.rollout`
 3.1, 3.4 environments             :mod:`udrl.environments`
-Table 2 hyperparameters           :mod:`udrl.config`
+Table 2 hyperparameters           :mod:`udrl.config`, :mod:`udrl.setting_groups`
 ================================  ======================================
 """
 

@@ -70,11 +70,11 @@ class EpisodeGenerator:
     ) -> None:
         self._rows = Rows(config, n_environments, make)
         self.spec = self._rows.spec
-        self._memory = FrameStack(self.spec.observation_space, config)
+        self._memory = FrameStack(self.spec.observation_space, config.network.frame_stack)
         # What the networks see where it is no more than what is observed.
         single = self._memory.length == 1
         self._seen = self._memory.join(self._rows.observation) if single else None
-        self._target = ReturnInTime(config)
+        self._target = ReturnInTime(config.network)
         self._recording = Recording(self.spec, n_environments)
         self._commands: list[Command | None] = [None] * n_environments
         self._behaviors: list[Acting | None] = [None] * n_environments

@@ -88,16 +88,16 @@ def algorithm1(
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec)
-    graph = acting_graph(config, generator.spec)
+    graph = acting_graph(config.network, generator.spec)
 
     # 1: initialise replay buffer with warm-up episodes using random actions (or others')
     run = Run(
-        ReplayBuffer(config),
+        ReplayBuffer(config.buffer),
         untrained(config, generator.spec),  # 2: initialise a behavior function
         Experience(config, generator.spec),
     )
     run.add(offline or generate_episodes(generator, sample.warm_up(), None))
-    due = evaluation_due(0, 0, run.env_steps, config.eval_every)
+    due = evaluation_due(0, 0, run.env_steps, config.evaluation.eval_every)
     report(run)
 
     # 3: while stopping criteria is not reached
@@ -116,7 +116,7 @@ def algorithm1(
         if due:
             episodes = generate_episodes(generator, evaluation, behavior)
             run.evaluations[run.iteration] = summarise([e.episode_return for e in episodes])
-        due = evaluation_due(run.iteration, before, run.env_steps, config.eval_every)
+        due = evaluation_due(run.iteration, before, run.env_steps, config.evaluation.eval_every)
         stop = run.env_steps >= budget.max_env_steps or _lands(run, budget)
         report(run)
     generator.close()

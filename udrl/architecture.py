@@ -7,7 +7,7 @@ They are what the behavior function in torch (:mod:`udrl.behavior`) and the acti
 import math
 from collections.abc import Sequence
 
-from udrl.config import Config
+from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Image, ObservationSpace
 
 # Appendix B.2.
@@ -27,14 +27,14 @@ SQUAREPLUS = 2.0
 DEVIATIONS = 2.0
 
 
-def layer_widths(space: ObservationSpace, config: Config) -> tuple[int, ...]:
+def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:
     """Return the widths of the behavior function: of its encoder, and of the layers that follow.
 
     An image's convolutions stand before all layers of ``hidden``, any other encoder is the first.
     """
     if isinstance(space, Image):
-        return (n_features(space, config.convolutions, 0), *config.hidden)
-    return config.hidden
+        return (n_features(space, network.convolutions, 0), *network.hidden)
+    return network.hidden
 
 
 def n_features(space: ObservationSpace, channels: Sequence[int], width: int) -> int:

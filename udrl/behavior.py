@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from udrl.architecture import layer_widths
 from udrl.config import Config
-from udrl.encoders import ACTIVATIONS, apply, fully_connected, make_encoder
+from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
@@ -34,13 +34,16 @@ class BehaviorFunction(nn.Module):
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
-        self._activation = activation = ACTIVATIONS[config.activation]
-        first, *_ = widths = layer_widths(spec.observation_space, config)
-        self.encoder = make_encoder(spec.observation_space, config, first, activation)
+        network, precision = config.network, PRECISIONS[config.arithmetic.precision]
+        self._activation = activation = ACTIVATIONS[network.activation]
+        first, *_ = widths = layer_widths(spec.observation_space, network)
+        self.encoder = make_encoder(spec.observation_space, network, first, activation, precision)
         self.command = fully_connected(ReturnInTime.size, first)
         self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
         self.action = fully_connected(widths[-1], spec.action_space.n_parameters)
-        self.value = ValueFunction(spec, config) if config.baseline == "value" else None
+        self.value = (
+            ValueFunction(spec, network, precision) if network.baseline == "value" else None
+        )
 
     def forward(self, observation: Tensor, command: Tensor) -> Tensor:
         """Return the parameters of P(a | s, c).
@@ -81,7 +84,7 @@ def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
     behavior = BehaviorFunction(spec, config)
     stream = Stream(stream_key(config.seed, Purpose.INITIALISE))
     generator = torch.Generator().manual_seed(int(stream.integers(1, 0, 2**52)[0]))
-    gain = nn.init.calculate_gain(config.activation)
+    gain = nn.init.calculate_gain(config.network.activation)
     for name, layer in behavior.named_modules():
         if isinstance(layer, nn.Embedding):
             # Vectors as different as can be, as long as those of the first layer for one-hot input.
@@ -92,7 +95,7 @@ def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
             continue
         bound = layer.weight[0].numel() ** -0.5
         assert layer.bias is not None
-        if config.initialisation == "orthogonal":
+        if config.network.initialisation == "orthogonal":
             hidden = name not in ("command", "action", "value.expected")
             nn.init.orthogonal_(layer.weight, gain if hidden else 1.0, generator)
             nn.init.zeros_(layer.bias)

@@ -36,12 +36,12 @@ def decode_state(
     behavior = BehaviorFunction(spec, config)
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items()}
     behavior.load_state_dict(_tensors(decode_weights(weights, shapes)))
-    behavior.to(config.device)
+    behavior.to(config.arithmetic.device)
     tensors = _tensors(decode_weights(optimizer, optimizer_shapes(shapes)))
-    adam = make_optimizer(behavior, config)
+    adam = make_optimizer(behavior, config.training)
     for name, parameter in behavior.named_parameters():
         adam.state[parameter] = {
-            k: tensors[f"{k}.{name}"].to(config.device) for k in ("step", *MOMENTS)
+            k: tensors[f"{k}.{name}"].to(config.arithmetic.device) for k in ("step", *MOMENTS)
         }
     return TrainingState(version, behavior, adam)
 

@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from udrl.config import COMMANDS_PER_ITERATION, Config, Temperature
+from udrl.config import COMMANDS_PER_ITERATION, Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
+from udrl.setting_groups import Temperature
 from udrl.strategies import Best, CommandStrategy, ask, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
@@ -101,8 +102,9 @@ class CommandSampler:
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         self._config = config
+        self._settings = config.commands
         self._spec = spec
-        self._target = ReturnInTime(config)
+        self._target = ReturnInTime(config.network)
         longest = spec.max_episode_steps
         self._max_train_steps = min(longest, config.max_train_steps or longest)
 
@@ -112,9 +114,8 @@ class CommandSampler:
 
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
-        n = self._config.n_warm_up_episodes
+        n, hold = self._settings.n_warm_up_episodes, self._settings.warm_up_hold
         commands = self._commands("warm_up", 0, 0, [(0.0, 0)] * n, TRAINING_SEEDS)
-        hold = self._config.warm_up_hold
         return [
             msgspec.structs.replace(c, random_steps=c.max_steps, random_hold=hold) for c in commands
         ]
@@ -130,8 +131,8 @@ class CommandSampler:
         Raises:
             ConfigError: the strategy cannot be imported, or asks for what cannot be.
         """
-        best = buffer.best(self._config.last_few)
-        n = self._config.n_episodes_per_iter
+        best = buffer.best(self._settings.last_few)
+        n = self._settings.n_episodes_per_iter
         u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
         desired = [self._target.settle(*ask(self._strategy, best, number)) for number in u]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
@@ -139,17 +140,17 @@ class CommandSampler:
             msgspec.structs.replace(
                 c,
                 random_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon)),
-                random_steps=self._config.hold_steps,
-                random_hold=self._config.hold_steps,
+                random_steps=self._settings.hold_steps,
+                random_hold=self._settings.hold_steps,
             )
-            if w[k] < self._config.held_actions
+            if w[k] < self._settings.held_actions
             else c
             for k, c in enumerate(commands)
         ]
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
-        first = self._config.n_episodes_per_iter
+        first = self._settings.n_episodes_per_iter
         return self._evaluation(iteration, first, buffer)
 
     def close(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
@@ -158,18 +159,19 @@ class CommandSampler:
         return [msgspec.structs.replace(c, weights_version=iteration) for c in closing]
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
-        best = Best.of(buffer.best(self._config.last_few))
+        evaluation = self._config.evaluation
+        best = Best.of(buffer.best(self._settings.last_few))
         c0 = self._target.settle(best.mean, best.horizon)
-        seeds = EVALUATION_SEEDS if self._config.eval_seeds == "final" else SEARCH_SEEDS
+        seeds = EVALUATION_SEEDS if evaluation.eval_seeds == "final" else SEARCH_SEEDS
         commands = self._commands(
-            "evaluate", iteration, first, [c0] * self._config.eval_episodes, seeds
+            "evaluate", iteration, first, [c0] * evaluation.eval_episodes, seeds
         )
         return [
             msgspec.structs.replace(
                 c,
                 cap=self._spec.max_return,
                 max_steps=self._spec.max_episode_steps,
-                temperature=self._config.eval_temperature,
+                temperature=evaluation.eval_temperature,
             )
             for c in commands
         ]

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from udrl.architecture import FILTER, PADDING, STRIDE
-from udrl.config import Config
 from udrl.memory import FrameStack
+from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Category, Image, ObservationSpace
 
 Activation = Callable[[Tensor], Tensor]
@@ -118,21 +118,25 @@ class ImageEncoder(Encoder):
 
 
 def make_encoder(
-    space: ObservationSpace, config: Config, width: int, activation: Activation
+    space: ObservationSpace,
+    network: NetworkSettings,
+    width: int,
+    activation: Activation,
+    precision: torch.dtype,
 ) -> Encoder:
     """Return an encoder of a kind of observations.
 
     Args:
         space: of single observations.
-        config: ``frame_stack``, ``convolutions``, ``precision``.
+        network: ``frame_stack``, ``convolutions``.
         width: of the features; what an image's convolutions leave is as wide as it is.
         activation: after each layer.
+        precision: that it computes in.
     """
-    precision = PRECISIONS[config.precision]
-    shape = FrameStack(space, config).shape
+    shape = FrameStack(space, network.frame_stack).shape
     match space:
         case Image():
-            return ImageEncoder(shape[0], config.convolutions, activation, precision)
+            return ImageEncoder(shape[0], network.convolutions, activation, precision)
         case Category(n=n):
             return CategoryEncoder(n, shape[0], width, activation, precision)
     return VectorEncoder(shape[0], width, activation, precision)

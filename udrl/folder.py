@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from udrl.config import Config
+from udrl.config import Configured, FlatSettings, flat
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidData, UdrlError
 from udrl.graph import acting_graph
@@ -25,19 +25,21 @@ _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
 _MOST_BYTES = 4 << 30
 
 
-class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Description(
+    Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """What a folder's weights are.
 
     Attributes:
         format: of the folder, :data:`FORMAT`.
-        config: the settings that they were trained with.
+        settings: what they were trained with.
         environment: what it looks like to the network.
         desired_return: what the agent is asked for in evaluations (2.3.6).
         desired_horizon: in how many steps.
     """
 
     format: int
-    config: Config
+    settings: FlatSettings = msgspec.field(name="config")
     environment: EnvironmentSpec
     desired_return: float
     desired_horizon: int
@@ -64,7 +66,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
     assert policy.desired_horizon is not None
     description = Description(
         format=FORMAT,
-        config=policy.config,
+        settings=flat(policy.config),
         environment=policy.spec,
         desired_return=policy.desired_return,
         desired_horizon=policy.desired_horizon,
@@ -108,11 +110,12 @@ def load(folder: str | Path) -> Policy:
         raise InvalidData(
             f"{folder / _DESCRIPTION}: {error}; export the run again, with this version of udrl"
         ) from error
-    graph = acting_graph(description.config, description.environment)
+    config = description.config
+    graph = acting_graph(config.network, description.environment)
     behavior = decode_behavior(graph, weights)
     return Policy(
         behavior,
-        description.config,
+        config,
         description.environment,
         desired_return=description.desired_return,
         desired_horizon=description.desired_horizon,

@@ -30,10 +30,10 @@ from udrl.architecture import (
     layer_widths,
     n_features,
 )
-from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.memory import FrameStack
+from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Category, Image
 from udrl.targets import ReturnInTime
 
@@ -46,9 +46,9 @@ _OPSET, _IR_VERSION = 13, 7
 _OPERATORS = {"relu": "Relu", "tanh": "Tanh"}
 
 
-def acting_graph(config: Config, spec: EnvironmentSpec) -> bytes:
+def acting_graph(network: NetworkSettings, spec: EnvironmentSpec) -> bytes:
     """Return the graph of a run, an ONNX model whose weights have no values yet."""
-    graph = _Builder(config, spec)
+    graph = _Builder(network, spec)
     graph.logits()
     return graph.model()
 
@@ -65,12 +65,12 @@ def weight_shapes(graph: bytes) -> dict[str, tuple[int, ...]]:
 class _Builder:
     """Appends nodes; each method returns the name of a result."""
 
-    def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
-        self._config = config
+    def __init__(self, network: NetworkSettings, spec: EnvironmentSpec) -> None:
+        self._network = network
         self._seen = spec.observation_space
-        self._shape = FrameStack(self._seen, config).shape
+        self._shape = FrameStack(self._seen, network.frame_stack).shape
         self._n_parameters = spec.action_space.n_parameters
-        self._target = ReturnInTime(config)
+        self._target = ReturnInTime(network)
         self._nodes: list[onnx.NodeProto] = []
         self._tensors: list[onnx.TensorProto] = []
 
@@ -105,12 +105,12 @@ class _Builder:
 
     def logits(self) -> str:
         """Append the network of section 3.2; see :class:`udrl.behavior.BehaviorFunction`."""
-        config = self._config
-        activation = _OPERATORS[config.activation]
+        network = self._network
+        activation = _OPERATORS[network.activation]
         command = self._command()
-        if config.baseline == "value":
+        if network.baseline == "value":
             command = self._relative(command)
-        first, *_ = widths = layer_widths(self._seen, config)
+        first, *_ = widths = layer_widths(self._seen, network)
         features = self._encode("encoder", activation, first)
         gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
         features = self._append("Mul", features, gate)
@@ -132,7 +132,7 @@ class _Builder:
     def _relative(self, command: str) -> str:
         """Append the desired return relative to V(s) and D(s); see :mod:`udrl.value`."""
         features = self._encode("value.encoder", "Tanh", VALUE_WIDTH)
-        width = n_features(self._seen, self._config.convolutions, VALUE_WIDTH)
+        width = n_features(self._seen, self._network.convolutions, VALUE_WIDTH)
         features = self._append("Tanh", self._layer("value.hidden", features, width, VALUE_WIDTH))
         expected = self._layer("value.expected", features, VALUE_WIDTH, 2)
         d = self._column(expected, 1)
@@ -171,7 +171,7 @@ class _Builder:
     def _convolutions(self, name: str, activation: str) -> str:
         features = self._append("Cast", "observation", to=TensorProto.FLOAT)
         features = self._append("Mul", features, self._number(1 / 255))
-        channels = pairwise((self._shape[0], *self._config.convolutions))
+        channels = pairwise((self._shape[0], *self._network.convolutions))
         for k, (n_in, n_out) in enumerate(channels):
             weight = self._weight(f"{name}.{k}.weight", n_out, n_in, FILTER, FILTER)
             bias = self._weight(f"{name}.{k}.bias", n_out)

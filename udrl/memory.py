@@ -3,7 +3,6 @@
 import numpy as np
 import numpy.typing as npt
 
-from udrl.config import Config
 from udrl.spaces import Category, Observations, ObservationSpace
 
 
@@ -14,15 +13,15 @@ class FrameStack:
 
     Args:
         space: of single observations.
-        config: ``frame_stack``.
+        length: how many, ``frame_stack``.
 
     Attributes:
         length: how many.
         shape: of what the networks see; of a category [length].
     """
 
-    def __init__(self, space: ObservationSpace, config: Config) -> None:
-        self.length = length = config.frame_stack
+    def __init__(self, space: ObservationSpace, length: int) -> None:
+        self.length = length
         first, *rest = (1,) if isinstance(space, Category) else space.shape
         self.shape: tuple[int, ...] = (length * first, *rest)
 

@@ -9,11 +9,9 @@ import ctypes
 import hashlib
 from pathlib import Path
 
-import msgspec
-
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import TRAINING_SEEDS, Command
-from udrl.config import Config
+from udrl.config import Config, change, flat
 from udrl.digests import arrays_digest, episode_digest
 from udrl.episode import Episode
 from udrl.inference import Acting, ActingFunction, probe_rows, probe_weights
@@ -26,21 +24,22 @@ PROBE_ROWS = 16
 
 def settle(config: Config) -> Config:
     """Return the settings of a new run: what says ``auto`` is chosen for this machine."""
-    device, precision = config.device, config.precision
+    device, precision = config.arithmetic.device, config.arithmetic.precision
     if device == "auto":
         device = "cuda" if _has_cuda() else "cpu"
     if precision == "auto":
         precision = "bfloat16" if _is_fast_in_bfloat16() else "float32"
-    return msgspec.structs.replace(config, device=device, precision=precision)
+    return change(config, device=device, precision=precision)
 
 
 def settle_as(held: Config, config: Config) -> Config:
     """Return settings with what they leave open as it was chosen for another run."""
-    chosen = {n: getattr(held, n) for n in ("device", "precision") if getattr(config, n) == "auto"}
-    if config.dataset is not None and config.dataset == held.dataset:
-        chosen["n_warm_up_episodes"] = held.n_warm_up_episodes
-        chosen["dataset_sha256"] = config.dataset_sha256 or held.dataset_sha256
-    return msgspec.structs.replace(config, **chosen)
+    asked, known = flat(config), flat(held)
+    chosen = {name: known[name] for name in ("device", "precision") if asked[name] == "auto"}
+    if asked["dataset"] is not None and asked["dataset"] == known["dataset"]:
+        chosen["n_warm_up_episodes"] = known["n_warm_up_episodes"]
+        chosen["dataset_sha256"] = asked["dataset_sha256"] or known["dataset_sha256"]
+    return change(config, **chosen)
 
 
 def _is_fast_in_bfloat16() -> bool:
@@ -91,7 +90,7 @@ def _short_episode(
     command = Command(
         id=index,
         kind="explore",
-        desired_return=1.0 / config.return_scale,
+        desired_return=1.0 / config.network.return_scale,
         desired_horizon=steps,
         environment_seed=TRAINING_SEEDS[0] + index,
         stream_key=stream_key(0, Purpose.PROBE, 1, index),

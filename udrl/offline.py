@@ -11,11 +11,10 @@ import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from udrl.config import Config
+from udrl.config import Config, change
 from udrl.digests import episode_digest, replay_digest
 from udrl.environments.conversions import Conversion, action_conversion, observation_conversion
 from udrl.environments.making import EnvironmentSpec, make_environment
@@ -74,19 +73,17 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
     Raises:
         ConfigError: the dataset cannot be used, or is another one than the settings say.
     """
-    if config.dataset is None:
+    name, known = config.commands.dataset, config.commands.dataset_sha256
+    if name is None:
         return config, None
-    episodes = read_dataset(config.dataset, config, spec)
+    episodes = read_dataset(name, config, spec)
     digest = dataset_digest(episodes)
-    if config.dataset_sha256 not in ("", digest):
+    if known not in ("", digest):
         raise ConfigError(
-            f"dataset {config.dataset!r} has the digest {digest}, the settings name "
-            f"{config.dataset_sha256}; it is another one than the run began with"
+            f"dataset {name!r} has the digest {digest}, the settings name {known}; it is another "
+            f"one than the run began with"
         )
-    settled = msgspec.structs.replace(
-        config, dataset_sha256=digest, n_warm_up_episodes=len(episodes)
-    )
-    return settled, episodes
+    return change(config, dataset_sha256=digest, n_warm_up_episodes=len(episodes)), episodes
 
 
 class _Reader:

@@ -45,7 +45,7 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        self._memory = memory = FrameStack(spec.observation_space, config)
+        self._memory = memory = FrameStack(spec.observation_space, config.network.frame_stack)
         self.observation_shape = memory.shape if memory.length > 1 else spec.observation_space.shape
         self._rng = rng or np.random.default_rng()
 
@@ -62,9 +62,9 @@ class Policy:
         env = make_environment(
             msgspec.structs.replace(self.config, environment_kwargs=known | kwargs)
         )
-        if self.config.frame_stack == 1:
+        if self.config.network.frame_stack == 1:
             return env
-        return gym.wrappers.FrameStackObservation(env, self.config.frame_stack)
+        return gym.wrappers.FrameStackObservation(env, self.config.network.frame_stack)
 
     def logits(
         self, observation: npt.ArrayLike, desired_return: float, desired_horizon: float
@@ -87,7 +87,7 @@ class Policy:
                 something is not finite, or the temperature less than 0.
         """
         seen = np.asarray(observation)
-        space, n = self.spec.observation_space, self.config.frame_stack
+        space, n = self.spec.observation_space, self.config.network.frame_stack
         if seen.shape not in (self.observation_shape, (n, *space.shape)):
             raise InvalidData(
                 f"an observation of shape {seen.shape}: expected {self.observation_shape}; show "

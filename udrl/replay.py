@@ -11,7 +11,8 @@ import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from udrl.config import COMMANDS_PER_ITERATION, Config
+from udrl.config import COMMANDS_PER_ITERATION
+from udrl.setting_groups import BufferSettings
 
 
 class Entry(NamedTuple):
@@ -33,15 +34,15 @@ class ReplayBuffer:
     It ranks episodes; who needs their steps keeps them (:class:`udrl.segments.Experience`).
 
     Args:
-        config: ``replay_size``, how many of the greatest it keeps; ``recent_size``, how many of the
-            newest, those among the greatest counted; ``max_age``, for how many iterations.
+        settings: ``replay_size``, how many of the greatest it keeps; ``recent_size``, how many of
+            the newest, those among the greatest counted; ``max_age``, for how many iterations.
         entries: what it holds at first.
     """
 
-    def __init__(self, config: Config, entries: Iterable[Entry] = ()) -> None:
-        self._capacity = config.replay_size
-        self._recent = config.recent_size
-        self._max_age = config.max_age
+    def __init__(self, settings: BufferSettings, entries: Iterable[Entry] = ()) -> None:
+        self._capacity = settings.replay_size
+        self._recent = settings.recent_size
+        self._max_age = settings.max_age
         self._entries = sorted(entries)
 
     def __len__(self) -> int:

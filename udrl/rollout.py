@@ -54,12 +54,12 @@ class Rollout:
         self.action: int | None = None
         self._policy = policy
         self._env = env
-        self._target = ReturnInTime(policy.config)
+        self._target = ReturnInTime(policy.config.network)
         self._cap = np.array([math.inf if command.cap is None else command.cap])
         self._numbers = np.empty(0)
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
-        n = policy.config.frame_stack
+        n = policy.config.network.frame_stack
         self._recent = deque([self._plain(observation)] * n, maxlen=n)
         self.tell(command.desired_return, command.desired_horizon)
 

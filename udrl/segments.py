@@ -88,11 +88,11 @@ class Experience:
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         longest = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
         pages_per_episode = -(-longest // _PAGE)
-        n_episodes = config.replay_size + config.recent_size
+        n_episodes = config.buffer.replay_size + config.buffer.recent_size
         n_pages = n_episodes * pages_per_episode
         steps = n_pages * _PAGE
         seen, acted = spec.observation_space, spec.action_space
-        self._memory = FrameStack(seen, config)
+        self._memory = FrameStack(seen, config.network.frame_stack)
         self._observations = np.empty((steps, *seen.shape), seen.dtype)
         self._actions = np.empty((steps, *acted.shape), acted.dtype)
         self._earned = np.empty(steps)  # P[t]: rewards earned before step t

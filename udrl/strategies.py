@@ -141,7 +141,7 @@ def make_strategy(config: Config) -> CommandStrategy:
     Raises:
         ConfigError: there is none of that name, or it cannot be imported or made.
     """
-    name = config.command_strategy
+    name = config.commands.command_strategy
     if name in STRATEGIES:
         return STRATEGIES[name](config)
     module, colon, attribute = name.partition(":")

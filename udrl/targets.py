@@ -5,7 +5,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from udrl.config import Config
+from udrl.setting_groups import NetworkSettings
 
 #: Rows of what is desired: float64 [rows, ReturnInTime.size].
 Desired = npt.NDArray[np.float64]
@@ -15,7 +15,7 @@ class ReturnInTime:
     """The paper's: a desired return within a desired horizon (section 2.2).
 
     Args:
-        config: ``return_scale``, ``horizon_scale``, ``desired_horizon``.
+        network: ``return_scale``, ``horizon_scale``, ``desired_horizon``.
 
     Attributes:
         horizon_follows: the horizon is the desired return, as an integer, always (section 3.1,
@@ -28,10 +28,10 @@ class ReturnInTime:
     #: Numbers of a target.
     size = 2
 
-    def __init__(self, config: Config) -> None:
-        self.horizon_follows = config.desired_horizon == "return"
+    def __init__(self, network: NetworkSettings) -> None:
+        self.horizon_follows = network.desired_horizon == "return"
         self.least = (1.0 if self.horizon_follows else -math.inf, 1.0)
-        self.scales = (config.return_scale, config.horizon_scale)
+        self.scales = (network.return_scale, network.horizon_scale)
 
     def settle(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0 as it is said: with a horizon of 1 at least, and one that follows."""

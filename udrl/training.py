@@ -16,6 +16,7 @@ from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
 from udrl.segments import RankedExperience, Segments, draw_segments
+from udrl.setting_groups import TrainingSettings
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 from udrl.value import ValueFunction, relative, value_loss
@@ -80,13 +81,13 @@ def exact_arithmetic() -> Iterator[None]:
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
     """Return version 0, a function of the seed."""
-    behavior = initialise(config, spec).to(config.device)
-    return TrainingState(0, behavior, make_optimizer(behavior, config))
+    behavior = initialise(config, spec).to(config.arithmetic.device)
+    return TrainingState(0, behavior, make_optimizer(behavior, config.training))
 
 
-def make_optimizer(behavior: BehaviorFunction, config: Config) -> torch.optim.Adam:
+def make_optimizer(behavior: BehaviorFunction, training: TrainingSettings) -> torch.optim.Adam:
     """Return a new Adam for a behavior function."""
-    return torch.optim.Adam(behavior.parameters(), lr=config.learning_rate, fused=True)
+    return torch.optim.Adam(behavior.parameters(), lr=training.learning_rate, fused=True)
 
 
 def train(state: TrainingState, experience: RankedExperience, config: Config) -> None:
@@ -94,18 +95,18 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
 
     The numbers that choose the examples come from the stream (seed, training, new version).
     """
-    version = state.version + 1
+    training, version = config.training, state.version + 1
     stream = Stream(stream_key(config.seed, Purpose.TRAINING, version))
-    uniforms = stream.uniforms(3 * config.n_updates_per_iter * config.batch_size)
+    uniforms = stream.uniforms(3 * training.n_updates_per_iter * training.batch_size)
     segments = draw_segments(
-        uniforms.reshape(3, config.n_updates_per_iter, config.batch_size),
+        uniforms.reshape(3, training.n_updates_per_iter, training.batch_size),
         experience.lengths,
-        config.segments,
+        training.segments,
     )
-    with _threads(config.training_threads):
+    with _threads(config.arithmetic.training_threads):
         losses = _update(state, experience, segments, config)
     state.version = version
-    state.loss = losses / config.n_updates_per_iter
+    state.loss = losses / training.n_updates_per_iter
 
 
 def _update(
@@ -113,8 +114,8 @@ def _update(
 ) -> float:
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
     batches = _Batches(config, experience)
-    losses = torch.zeros((), dtype=torch.float64, device=config.device)
-    one = torch.ones((), device=config.device)
+    losses = torch.zeros((), dtype=torch.float64, device=config.arithmetic.device)
+    one = torch.ones((), device=config.arithmetic.device)
     parameters = list(state.behavior.parameters())
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
@@ -138,7 +139,7 @@ def _learn_value(
     V and D do not change any more in this version, so the examples carry them from here on.
     """
     parameters = list(state.behavior.parameters())
-    one = torch.ones((), device=config.device)
+    one = torch.ones((), device=config.arithmetic.device)
     experience.expected = None
     _label(value, experience, config)
     for observation, command, _ in batches.gather(segments):
@@ -153,11 +154,11 @@ def _label(
     """Label all steps of the buffer with lambda-returns; return V and D at each."""
     with torch.inference_mode():
         parts = [
-            value(torch.from_numpy(part).clone().to(config.device)).cpu().numpy()
+            value(torch.from_numpy(part).clone().to(config.arithmetic.device)).cpu().numpy()
             for part in experience.observations()
         ]
     expected: npt.NDArray[np.float32] = np.concatenate(parts)
-    experience.label(expected[:, 0] / config.return_scale, config.return_lambda)
+    experience.label(expected[:, 0] / config.network.return_scale, config.training.return_lambda)
     return expected
 
 
@@ -191,17 +192,18 @@ class _Batches:
 
     def __init__(self, config: Config, experience: RankedExperience) -> None:
         self._experience = experience
+        training = config.training
         shape, dtype = experience.observation_shape, experience.observation_dtype
-        bytes_each = config.batch_size * math.prod(shape) * dtype.itemsize
-        self._at_once = max(1, min(config.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
-        n = self._at_once, config.batch_size
+        bytes_each = training.batch_size * math.prod(shape) * dtype.itemsize
+        self._at_once = max(1, min(training.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
+        n = self._at_once, training.batch_size
         self._tensors = (
             torch.empty(*n, *shape, dtype=getattr(torch, dtype.name)),
             torch.empty(*n, ReturnInTime.size),
             torch.empty(n, dtype=torch.int64),
         )
-        self._device = config.device
-        self._scales = np.array(ReturnInTime(config).scales)
+        self._device = config.arithmetic.device
+        self._scales = np.array(ReturnInTime(config.network).scales)
 
     def gather(self, segments: Segments) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield observations, scaled commands and actions of each update, where the network is.

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from udrl.config import Config
+from udrl.config import Config, change
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
@@ -19,9 +19,7 @@ _EPISODE = 1000
 
 def training_class(config: Config, spec: EnvironmentSpec) -> str:
     """Return the digest of the weights after two updates on an episode of noise."""
-    small = msgspec.structs.replace(
-        config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1
-    )
+    small = change(config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1)
     stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
     length = min(PROBE_STEPS, spec.max_episode_steps)
     seen, acted = spec.observation_space, spec.action_space

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from udrl.architecture import DEVIATIONS, LEAST_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
-from udrl.config import Config
 from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
+from udrl.setting_groups import NetworkSettings
 
 
 class ValueFunction(nn.Module):
@@ -26,15 +26,18 @@ class ValueFunction(nn.Module):
 
     Args:
         spec: observation space.
-        config: ``frame_stack``, ``convolutions`` (of images), ``precision``.
+        network: ``frame_stack``, ``convolutions`` (of images).
+        precision: that it computes in.
     """
 
-    def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
+    def __init__(
+        self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
+    ) -> None:
         super().__init__()
         space = spec.observation_space
-        self.encoder = make_encoder(space, config, VALUE_WIDTH, torch.tanh_)
+        self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
         self.hidden = fully_connected(
-            n_features(space, config.convolutions, VALUE_WIDTH), VALUE_WIDTH
+            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
         )
         self.expected = fully_connected(VALUE_WIDTH, 2)
 

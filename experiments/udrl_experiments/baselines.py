@@ -20,7 +20,7 @@ from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config, KeywordValue
+from udrl.config import Config, KeywordValue, change
 from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
 from udrl.memory import FrameStack
@@ -137,11 +137,12 @@ def run(
                 policies.restore(model, held, state.counters)
         held.clear()
         policies.explore_for(model, state.exploration_steps)
-        generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.eval_episodes))
+        generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.evaluation.eval_episodes))
         opened.callback(generator.close)
-        shape = FrameStack(generator.spec.observation_space, config).shape
+        shape = FrameStack(generator.spec.observation_space, config.network.frame_stack).shape
+        every = config.evaluation.eval_every
         while (env_steps := model.num_timesteps) < max_env_steps:
-            due = (env_steps // config.eval_every + 1) * config.eval_every
+            due = (env_steps // every + 1) * every
             model.learn(
                 min(due, max_env_steps) - env_steps,
                 callback=lambda local, shared: not stop.is_set(),
@@ -179,9 +180,10 @@ def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> l
     """Return the commands of an evaluation: the seeds of UDRL's in the iteration ``number``."""
     config = baseline.config
     if baseline.algorithm == "DQN":
-        config = msgspec.structs.replace(config, eval_temperature=0.0)
+        config = change(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec)
-    return sampler.evaluate(number, ReplayBuffer(config, [Entry(0.0, 0, 1)]))  # nobody hears these
+    unheard = ReplayBuffer(config.buffer, [Entry(0.0, 0, 1)])  # nobody hears these
+    return sampler.evaluate(number, unheard)
 
 
 def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:

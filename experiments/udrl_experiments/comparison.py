@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from udrl.config import Config, KeywordValue
+from udrl.config import Config, KeywordValue, flat
 from udrl_experiments import figures
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, Algorithm, Plan, Task
@@ -42,7 +42,8 @@ def job(task: Task, plan: Plan, algorithm: Algorithm, seed: int) -> Job:
     """Return an algorithm's run on a task."""
     steps = plan.steps(task, algorithm)
     if algorithm == "UDRL":
-        return Job(algorithm=algorithm, config=plan.config(task, seed), max_env_steps=steps)
+        settings = flat(plan.config(task, seed))
+        return Job(algorithm=algorithm, settings=settings, max_env_steps=steps)
     chosen = tuned(algorithm, task.environment)
     return baseline(algorithm, plan.baseline(task, seed), chosen, steps)
 
@@ -57,7 +58,7 @@ def baseline(
     exploration = float(hyperparameters.get("exploration_fraction", 0.0))
     return Job(
         algorithm=algorithm,
-        config=config,
+        settings=flat(config),
         hyperparameters=hyperparameters,
         exploration_steps=round(exploration * max_env_steps),
         max_env_steps=max_env_steps,
@@ -71,7 +72,7 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, place: Place) -> 
         A line for each curve: where it ends.
     """
     rows: list[Evaluated] = [row for job in jobs for row in job.evaluations(place.root)]
-    points = curves(rows, jobs[0].config.eval_every)
+    points = curves(rows, jobs[0].config.evaluation.eval_every)
     write(place.folder / "evaluations.csv", Evaluated, rows)
     write(place.folder / "curves.csv", CurvePoint, points)
     write(place.folder / "reached.csv", Reached, reached(rows, task.thresholds))

@@ -101,7 +101,7 @@ def _evaluations(job: Job, run_dir: Path, status: Status) -> list[Evaluated]:
         return Evaluated(
             environment=job.config.environment, algorithm=job.algorithm, variant="",
             seed=job.config.seed, env_steps=env_steps, wall_s=wall_s, mean=mean, std=std,
-            episodes=job.config.eval_episodes,
+            episodes=job.config.evaluation.eval_episodes,
         )  # fmt: skip
 
     with (run_dir / "metrics.csv").open(newline="", encoding="utf-8") as file:

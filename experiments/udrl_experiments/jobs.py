@@ -16,8 +16,8 @@ from pathlib import Path
 
 import msgspec
 
-from udrl.config import Config
-from udrl.errors import Interrupted, InvalidData, RunFailed
+from udrl.config import Configured, FlatSettings, flat
+from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.records import Evaluated
 from udrl_inspect.tables import put, read
@@ -31,12 +31,12 @@ _POLL_S = 0.2
 _END_S = 10.0
 
 
-class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A run that a study needs.
 
     Attributes:
         algorithm: who learns.
-        config: UDRL's settings; of another algorithm's, environment, networks and evaluations.
+        settings: UDRL's; of another algorithm's, environment, networks and evaluations.
         hyperparameters: of DQN and A2C.
         exploration_steps: over which DQN's part of random actions falls is a part of so many.
         max_env_steps: how far.
@@ -44,7 +44,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """
 
     algorithm: Algorithm
-    config: Config
+    settings: FlatSettings = msgspec.field(name="config")
     hyperparameters: dict[str, bool | int | float | str] = {}
     exploration_steps: int = 0
     max_env_steps: int
@@ -54,7 +54,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def name(self) -> str:
         """A name that only runs of equal settings have."""
         identity = msgspec.json.encode(
-            [self.algorithm, self.config, self.hyperparameters, self.exploration_steps],
+            [self.algorithm, flat(self.config), self.hyperparameters, self.exploration_steps],
             order="sorted",
         )
         digest = hashlib.sha256(identity).hexdigest()[:12]
@@ -89,7 +89,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         Raises:
             InvalidData: they cannot be read.
         """
-        every = self.config.eval_every
+        every = self.config.evaluation.eval_every
         return [
             msgspec.structs.replace(row, variant=self.variant)
             for row in read(self.folder(root) / "evaluations.csv", Evaluated)
@@ -105,7 +105,7 @@ def read_job(folder: Path) -> Job:
     """
     try:
         return msgspec.json.decode((folder / "job.json").read_bytes(), type=Job)
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, msgspec.DecodeError, ConfigError) as error:
         raise InvalidData(f"{folder / 'job.json'}: {error}; expected a study's run") from error
 
 

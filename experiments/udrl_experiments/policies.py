@@ -109,17 +109,19 @@ def make(
         [partial(_environment, config, part, i) for i in range(chosen.pop("n_envs", 1))]
     )
     networks: dict[str, Any] = {
-        "net_arch": list(config.hidden),
+        "net_arch": list(config.network.hidden),
         "activation_fn": _ACTIVATIONS[chosen.pop("activation")],
     }
     policy = "MlpPolicy"
     if len(envs.observation_space.shape or ()) == 4:
         policy = "CnnPolicy"
         networks["features_extractor_class"] = Convolutions
-        networks["features_extractor_kwargs"] = {"channels": config.convolutions}
+        networks["features_extractor_kwargs"] = {"channels": config.network.convolutions}
     # numpy's global generator, which Stable-Baselines3 seeds, takes 32 bits.
     (seed,) = Stream(stream_key(config.seed, Purpose.INITIALISE, part)).integers(1, 0, 2**32)
-    common: dict[str, Any] = {"policy_kwargs": networks, "seed": int(seed), "device": config.device}
+    common: dict[str, Any] = {
+        "policy_kwargs": networks, "seed": int(seed), "device": config.arithmetic.device,
+    }  # fmt: skip
     model: DQN | A2C
     if algorithm == "DQN":
         del chosen["exploration_fraction"]  # see `explore_for`
@@ -138,7 +140,7 @@ def _environment(config: Config, part: int, index: int) -> Environment:
     env: Environment = make_environment(config)
     # Even with one frame, a dimension of their own keeps Stable-Baselines3 from guessing which one
     # of an image's holds the channels.
-    env = gym.wrappers.FrameStackObservation(env, config.frame_stack)
+    env = gym.wrappers.FrameStackObservation(env, config.network.frame_stack)
     return TrainingResets(env, Stream(stream_key(config.seed, Purpose.TRAINING, part, index)))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from udrl.config import Config, build, parse_assignment, preset
+from udrl.config import Config, build, flat, parse_assignment, preset
 from udrl.errors import ConfigError
 
 Algorithm = Literal["UDRL", "DQN", "A2C"]
@@ -126,8 +126,8 @@ class Plan(NamedTuple):
         Raises:
             ConfigError: a setting is unknown or impossible.
         """
-        config = self.config(task, seed, **changes)
-        return Config(**{name: getattr(config, name) for name in _SHARED})
+        settings = flat(self.config(task, seed, **changes))
+        return build(Config, {name: settings[name] for name in _SHARED})
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from udrl.config import preset
+from udrl.config import flat, preset
 from udrl.streams import Stream
 from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
@@ -137,7 +137,7 @@ def _job(plan: Plan, task: Task, algorithm: Algorithm, number: int, seed: int) -
     steps = plan.steps(task, algorithm)
     if algorithm == "UDRL":
         config = plan.config(task, seed, paper=True, eval_seeds="search", **drawn)
-        return Job(algorithm=algorithm, config=config, max_env_steps=steps)
+        return Job(algorithm=algorithm, settings=flat(config), max_env_steps=steps)
     networks = {k: drawn.pop(k) for k in ("hidden", "convolutions") if k in drawn}
     config = plan.baseline(task, seed, eval_seeds="search", **networks)
     return baseline(algorithm, config, drawn, steps)

@@ -107,7 +107,7 @@ def _require(study: Study) -> None:
                 f"the study {study.name} needs the module {module}, which is not installed; "
                 f'install it with: pip install "udrl[box2d,doom,studies]"'
             )
-    strategies = {job.config.command_strategy: job.config for job in study.jobs}
+    strategies = {job.config.commands.command_strategy: job.config for job in study.jobs}
     for config in strategies.values():
         make_strategy(config)
 

@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from udrl.config import Count, KeywordValue, PositiveInt, build
+from udrl.config import KeywordValue, build
 from udrl.errors import ConfigError
+from udrl.setting_groups import Count, PositiveInt
 
 Part = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(gt=0, le=10)]

@@ -7,6 +7,7 @@ calls for a study of other ways to choose exploratory commands, and lead is ours
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from udrl.config import flat
 from udrl.strategies import STRATEGIES
 from udrl_experiments.comparison import draw_curves, report_curves
 from udrl_experiments.jobs import Job
@@ -59,7 +60,7 @@ def _variants(
         task: [
             Job(
                 algorithm="UDRL",
-                config=plan.config(task, seed, **changes),
+                settings=flat(plan.config(task, seed, **changes)),
                 max_env_steps=plan.steps(task),
                 variant=variant,
             )

@@ -16,7 +16,7 @@ import numpy as np
 
 from udrl.actions import Categorical
 from udrl.commands import Command
-from udrl.config import Config
+from udrl.config import Config, build, flat
 from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
@@ -73,26 +73,29 @@ from udrl_proto.reports import (
 
 FOLDER = Path(__file__).parent
 
-CONFIG = Config(
-    environment="CartPole-v1",
-    environment_kwargs={"sutton_barto_reward": False},
-    max_return=500.0,
-    seed=7,
-    lead=1,
-    batch_size=256,
-    horizon_scale=0.02,
-    last_few=50,
-    learning_rate=0.001,
-    n_episodes_per_iter=15,
-    n_updates_per_iter=100,
-    n_warm_up_episodes=30,
-    warm_up_hold=5,
-    replay_size=300,
-    max_age=50,
-    recent_size=100,
-    return_scale=0.02,
-    hidden=(32, 64, 64),
-    eval_every=20_000,
+CONFIG = build(
+    Config,
+    {
+        "environment": "CartPole-v1",
+        "environment_kwargs": {"sutton_barto_reward": False},
+        "max_return": 500.0,
+        "seed": 7,
+        "lead": 1,
+        "batch_size": 256,
+        "horizon_scale": 0.02,
+        "last_few": 50,
+        "learning_rate": 0.001,
+        "n_episodes_per_iter": 15,
+        "n_updates_per_iter": 100,
+        "n_warm_up_episodes": 30,
+        "warm_up_hold": 5,
+        "replay_size": 300,
+        "max_age": 50,
+        "recent_size": 100,
+        "return_scale": 0.02,
+        "hidden": [32, 64, 64],
+        "eval_every": 20_000,
+    },
 )
 ENVIRONMENT = EnvironmentSpec(
     observation_space=Vector(size=4),
@@ -100,7 +103,7 @@ ENVIRONMENT = EnvironmentSpec(
     max_episode_steps=500,
     max_return=500.0,
 )
-GRAPH = acting_graph(CONFIG, ENVIRONMENT)
+GRAPH = acting_graph(CONFIG.network, ENVIRONMENT)
 EPISODE = Episode(
     command_id=5_000_003,
     observations=np.array(
@@ -178,7 +181,7 @@ EXAMPLES: tuple[Message, ...] = (
         protocol=PROTOCOL,
         software="0.1.0",
         run_id="cartpole-v1-seed7-20260102-030405-678901",
-        config=CONFIG,
+        settings=flat(CONFIG),
         environment=ENVIRONMENT,
         graph=GRAPH,
         acting_class="0123456789abcdef",

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from udrl.commands import Command
-from udrl.config import Config
+from udrl.config import Configured, FlatSettings
 from udrl.environments import EnvironmentSpec
 
 Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9._-]+\Z")]
@@ -68,14 +68,14 @@ class HelloRequest(Message, frozen=True, kw_only=True):
     """What run is this? Asked with a wildcard, it finds every run on a router."""
 
 
-class Hello(Message, frozen=True, kw_only=True):
+class Hello(Configured, Message, frozen=True, kw_only=True):
     """The run specification: all that a joining service needs to know.
 
     Attributes:
         protocol: version of this contract.
         software: version of the package that the replay service runs.
         run_id: the run's name in key expressions.
-        config: what the run is.
+        settings: what the run is, flat.
         environment: what its environment looks like.
         graph: the acting graph, an ONNX model whose weights have no values (:mod:`udrl.graph`).
         acting_class: numerics class of the actors, set by the first (``docs/protocol.md``).
@@ -87,7 +87,7 @@ class Hello(Message, frozen=True, kw_only=True):
     protocol: Number
     software: Text
     run_id: Name
-    config: Config
+    settings: FlatSettings = msgspec.field(name="config")
     environment: EnvironmentSpec
     graph: Annotated[bytes, Meta(max_length=2**19)]
     acting_class: Text = ""

@@ -8,7 +8,7 @@ import pytest
 from tests.proto.scripted import Scripted
 from udrl.actions import Categorical
 from udrl.commands import Command
-from udrl.config import Config
+from udrl.config import Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.errors import Refused
 from udrl.graph import acting_graph
@@ -32,13 +32,13 @@ from udrl_proto.messages import (
 )
 from whole_run import wait_for
 
-CONFIG = Config(environment="Synthetic-v0", hidden=(4, 4))
+CONFIG = build(Config, {"environment": "Synthetic-v0", "hidden": [4, 4]})
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
 )
-GRAPH = acting_graph(CONFIG, SPEC)
+GRAPH = acting_graph(CONFIG.network, SPEC)
 HELLO = Hello(
-    protocol=PROTOCOL, software="0", run_id="scripted", config=CONFIG, environment=SPEC,
+    protocol=PROTOCOL, software="0", run_id="scripted", settings=flat(CONFIG), environment=SPEC,
     graph=GRAPH,
 )  # fmt: skip
 JOIN = JoinRequest(

@@ -59,7 +59,7 @@ def order(number: int, **values: Any) -> Command:
 
 
 def behavior_of(config: Config, spec: EnvironmentSpec) -> ActingFunction:
-    return ActingFunction(acting_graph(config, spec), weights_of(initialise(config, spec)))
+    return ActingFunction(acting_graph(config.network, spec), weights_of(initialise(config, spec)))
 
 
 def algorithm2(
@@ -160,7 +160,7 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     env = make_environment(config)
     spec = specify(env, config)
     one, other = (behavior_of(settings(environment, seed=seed), spec) for seed in (1, 2))
-    buffer = ReplayBuffer(config, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
+    buffer = ReplayBuffer(config.buffer, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
     sample = CommandSampler(config, spec)
     evaluation = sample.evaluate(2, buffer)
     orders: list[Order] = []

@@ -94,7 +94,9 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
 
     def held(seen: list[Episode]) -> list[Episode]:
         """The best of all episodes ever seen, of which equals rank by age, and the newest."""
-        best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[-config.replay_size :]
+        best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[
+            -config.buffer.replay_size :
+        ]
         newest = seen[len(seen) - min(recent_size, len(seen)) :]
         return sorted({*best, *newest}, key=lambda e: (e.episode_return, e.command_id))
 
@@ -104,17 +106,17 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
     seen = generate_episodes(generator, sample.warm_up(), None)
     env_steps, evaluations = sum(e.length for e in seen), {}
     state = untrained(config, generator.spec)
-    iteration, crossed = 0, env_steps // config.eval_every > 0
+    iteration, crossed = 0, env_steps // config.evaluation.eval_every > 0
     while env_steps < BUDGET.max_env_steps:  # 3
         iteration += 1
         known = held(seen)
         entries = [Entry(e.episode_return, e.command_id, e.length) for e in known]
-        buffer = ReplayBuffer(config, entries)
+        buffer = ReplayBuffer(config.buffer, entries)
         experience = Experience(config, generator.spec)
         for episode in known:
             experience.add(episode)
         train(state, experience.by_rank([e.command_id for e in known]), config)  # 4
-        act = ActingFunction(acting_graph(config, generator.spec), state.weights)
+        act = ActingFunction(acting_graph(config.network, generator.spec), state.weights)
         exploratory = sample.explore(iteration, buffer)  # 5
         new = generate_episodes(generator, exploratory, act)  # 6
         seen += new
@@ -122,7 +124,7 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
             evaluated = generate_episodes(generator, sample.evaluate(iteration, buffer), act)
             evaluations[iteration] = summarise([e.episode_return for e in evaluated])
         before, env_steps = env_steps, env_steps + sum(e.length for e in new)
-        crossed = env_steps // config.eval_every > before // config.eval_every
+        crossed = env_steps // config.evaluation.eval_every > before // config.evaluation.eval_every
 
     run = algorithm1(config, BUDGET, 4)
     known = held(seen)

@@ -36,7 +36,7 @@ CONFIG = build(
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=3), action_space=Categorical(n=2), max_episode_steps=20
 )
-SHAPES = weight_shapes(acting_graph(CONFIG, SPEC))
+SHAPES = weight_shapes(acting_graph(CONFIG.network, SPEC))
 
 
 def experience() -> RankedExperience:

@@ -40,7 +40,7 @@ def buffer_of(returns: Sequence[float], lengths: Sequence[int] = ()) -> ReplayBu
     lengths = lengths or [1] * len(returns)
     entries = zip(returns, range(len(returns)), lengths, strict=True)
     config = settings(replay_size=len(returns), last_few=1)
-    return ReplayBuffer(config, [Entry(*entry) for entry in entries])
+    return ReplayBuffer(config.buffer, [Entry(*entry) for entry in entries])
 
 
 def desired_returns(commands: list[Command]) -> list[float]:

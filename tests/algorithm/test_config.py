@@ -5,18 +5,24 @@ from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given
 
+from tests.proto.strategies import configs
 from udrl.config import (
     Budget,
     Config,
     build,
+    change,
+    flat,
     parse_assignment,
     preset,
     preset_names,
     read_toml,
     refuse_unknown,
+    setting_names,
 )
 from udrl.errors import ConfigError
+from udrl.setting_groups import BufferSettings
 
 TABLE_2 = {
     "batch_size",
@@ -32,13 +38,58 @@ TABLE_2 = {
 
 
 def test_hyperparameters_keep_the_names_of_table_2() -> None:
-    assert set(Config.__struct_fields__) >= TABLE_2
+    assert set(setting_names(Config)) >= TABLE_2
+
+
+@given(configs())
+def test_settings_are_grouped_inside_and_flat_outside(config: Config) -> None:
+    values = flat(config)
+    assert tuple(values) == setting_names(Config)
+    assert build(Config, values) == config
+    assert build(Config, msgspec.json.decode(msgspec.json.encode(values))) == config
+
+
+def test_no_two_settings_have_one_name() -> None:
+    kinds = (Config, Budget)
+    names = [name for kind in kinds for name in setting_names(kind)]
+    assert len(names) == len(set(names))
+
+
+def test_groups_have_no_names_outside() -> None:
+    with pytest.raises(ConfigError, match="unknown setting 'training'"):
+        build(Config, {"environment": "CartPole-v1", "training": {"batch_size": 512}})
+
+
+def test_settings_are_changed_by_name_in_whatever_group_they_are() -> None:
+    config = build(Config, {"environment": "CartPole-v1", "hidden": [8], "batch_size": 2})
+    changed = change(config, batch_size=3, hidden=(4, 4), seed=5)
+    assert flat(changed) == flat(config) | {"batch_size": 3, "hidden": [4, 4], "seed": 5}
+    assert config.training.batch_size == 2
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"bach_size": 1}, r"'bach_size': did you mean 'batch_size'\?"),
+        ({"batch_size": 0}, r"^batch_size = 0: "),
+        ({"last_few": 501}, r"^last_few = 501: must be at most replay_size = 500"),
+        ({"segments": "all", "baseline": "value"}, r"^segments = 'all' with baseline = 'value'"),
+    ],
+)
+def test_an_impossible_change_is_refused(values: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        change(Config(environment="CartPole-v1"), **values)
+
+
+def test_rules_across_groups_hold_however_a_config_is_made() -> None:
+    with pytest.raises(ConfigError, match="last_few = 75: must be at most replay_size = 10"):
+        Config(environment="CartPole-v1", buffer=BufferSettings(replay_size=10))
 
 
 def test_values_are_taken_as_given() -> None:
     config = build(Config, {"environment": "CartPole-v1", "hidden": [8, 16], "learning_rate": 1})
-    assert config.hidden == (8, 16)
-    assert config.learning_rate == 1.0
+    assert config.network.hidden == (8, 16)
+    assert config.training.learning_rate == 1.0
 
 
 def test_the_environment_must_be_named() -> None:
@@ -102,7 +153,7 @@ def test_last_few_above_replay_size_is_refused_with_both_values_and_the_remedy()
 
 def test_last_few_may_be_the_whole_buffer() -> None:
     config = build(Config, {"environment": "CartPole-v1", "last_few": 10, "replay_size": 10})
-    assert config.last_few == config.replay_size
+    assert config.commands.last_few == config.buffer.replay_size
 
 
 @pytest.mark.parametrize(
@@ -129,11 +180,6 @@ def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str)
 def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
     with pytest.raises(ConfigError, match=r"'Pong': there are CartPole-v1, LunarLander-v3"):
         preset("Pong")
-
-
-def test_settings_survive_plain_data() -> None:
-    config = build(Config, {"environment": "Obedience-v0", "environment_kwargs": {"steps": 4}})
-    assert build(Config, msgspec.json.decode(msgspec.json.encode(config))) == config
 
 
 @pytest.mark.parametrize(

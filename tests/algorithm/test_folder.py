@@ -23,7 +23,7 @@ def policy() -> Policy:
     config = build(Config, {"environment": "CartPole-v1", "hidden": [16, 16], "frame_stack": 2})
     env = make_environment(config)
     spec = specify(env, config)
-    behavior = ActingFunction(acting_graph(config, spec), untrained(config, spec).weights)
+    behavior = ActingFunction(acting_graph(config.network, spec), untrained(config, spec).weights)
     return Policy(behavior, config, spec, desired_return=120.5, desired_horizon=130)
 
 

@@ -97,7 +97,7 @@ class _Noting:
 
 def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], Watching]:
     generator = EpisodeGenerator(config, n_environments)
-    behavior = Watching(acting_graph(config, generator.spec))
+    behavior = Watching(acting_graph(config.network, generator.spec))
     commands = [
         Command(
             id=i,
@@ -115,7 +115,7 @@ def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], W
 
 
 def test_before_an_episode_its_first_observation_is_repeated() -> None:
-    memory = FrameStack(Vector(size=2), settings())
+    memory = FrameStack(Vector(size=2), 4)
     times = memory.times(np.array([0, 2, 9]))
     assert times.tolist() == [[0, 0, 0, 0], [0, 0, 1, 2], [6, 7, 8, 9]]
 
@@ -131,7 +131,7 @@ def test_before_an_episode_its_first_observation_is_repeated() -> None:
 def test_observations_are_joined_along_the_first_dimension(
     space: ObservationSpace, shape: tuple[int, ...]
 ) -> None:
-    memory = FrameStack(space, settings())
+    memory = FrameStack(space, 4)
     assert memory.shape == shape
     n = math.prod(space.shape)
     each = np.arange(2 * 4 * n).astype(space.dtype).reshape(2, 4, *space.shape)
@@ -158,7 +158,10 @@ def test_acting_sees_what_training_sees(
     for rank, episode in enumerate(episodes):
         t = np.arange(episode.length)
         examples = ranked.examples(Segments(np.full_like(t, rank), t, np.full_like(t, len(t))))
-        assert examples.observation.shape[1:] == FrameStack(spec.observation_space, config).shape
+        assert (
+            examples.observation.shape[1:]
+            == FrameStack(spec.observation_space, config.network.frame_stack).shape
+        )
         for i, stack in enumerate(examples.observation):
             frames = [episode.observations[max(0, i - k)] for k in range(STACK)[::-1]]
             assert np.array_equal(stack, np.concatenate(frames)), f"step {i}"

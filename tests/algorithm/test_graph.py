@@ -54,21 +54,21 @@ def settings(**values: Any) -> Config:
 
 
 def acting(config: Config, behavior: BehaviorFunction, spec: EnvironmentSpec) -> ActingFunction:
-    return ActingFunction(acting_graph(config, spec), weights_of(behavior))
+    return ActingFunction(acting_graph(config.network, spec), weights_of(behavior))
 
 
 def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """What the network reads of a command (2.3.2, 3.1), one number at a time."""
     rows = []
     for desired_return, desired_horizon in command.tolist():
-        if config.desired_horizon == "return":
+        if config.network.desired_horizon == "return":
             horizon, least = float(np.floor(desired_return)), 1.0
         else:
             horizon, least = desired_horizon, -np.inf
         rows.append(
             [
-                max(desired_return, least) * config.return_scale,
-                max(horizon, 1.0) * config.horizon_scale,
+                max(desired_return, least) * config.network.return_scale,
+                max(horizon, 1.0) * config.network.horizon_scale,
             ]
         )
     return np.array(rows, np.float32)
@@ -104,7 +104,7 @@ def test_its_weights_are_those_of_the_network(
 ) -> None:
     config = settings(**values)
     expected = {n: t.shape for n, t in weights_of(initialise(config, spec)).items()}
-    assert weight_shapes(acting_graph(config, spec)) == expected
+    assert weight_shapes(acting_graph(config.network, spec)) == expected
 
 
 @each_kind
@@ -142,7 +142,7 @@ def test_a_row_has_the_same_bits_in_any_company(
 
 def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings()
-    graph = acting_graph(config, VECTOR)
+    graph = acting_graph(config.network, VECTOR)
     asked = []
 
     def never(graph: bytes, n: int) -> bool:
@@ -163,7 +163,7 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
 
 def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings(seed=3, hidden=[48])
-    graph = acting_graph(config, VECTOR)
+    graph = acting_graph(config.network, VECTOR)
     run = module._Together.run
 
     def last_differs(self: module._Together) -> None:
@@ -180,12 +180,14 @@ def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_graph_is_a_function_of_settings_and_spaces() -> None:
-    assert acting_graph(settings(), VECTOR) == acting_graph(settings(), VECTOR)
-    assert acting_graph(settings(), VECTOR) != acting_graph(settings(hidden=[8]), VECTOR)
+    assert acting_graph(settings().network, VECTOR) == acting_graph(settings().network, VECTOR)
+    assert acting_graph(settings().network, VECTOR) != acting_graph(
+        settings(hidden=[8]).network, VECTOR
+    )
 
 
 def test_probe_weights_are_bounded_by_the_inputs_of_a_unit() -> None:
-    weights = probe_weights(acting_graph(settings(), VECTOR))
+    weights = probe_weights(acting_graph(settings().network, VECTOR))
     assert np.abs(weights["layers.0.weight"]).max() <= 0.25
     assert np.abs(weights["layers.0.weight"]).max() > 0.2
     assert {w.dtype for w in weights.values()} == {np.dtype(np.float32)}
@@ -198,7 +200,7 @@ def test_garbage_is_no_graph(garbage: bytes) -> None:
 
 
 def test_a_graph_without_all_weights_is_refused() -> None:
-    graph = acting_graph(settings(), VECTOR)
+    graph = acting_graph(settings().network, VECTOR)
     weights = dict(probe_weights(graph))
     del weights["action.bias"]
     with pytest.raises(InvalidWeights, match=r"action\.bias"):

@@ -198,8 +198,8 @@ def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(numerics, "_is_fast_in_bfloat16", lambda fast=fast: fast)
         monkeypatch.setattr(numerics, "_has_cuda", lambda cuda=cuda: cuda)
         settled = settle(automatic)
-        assert settled.precision == ("bfloat16" if fast else "float32")
-        assert settled.device == ("cuda" if cuda else "cpu")
+        assert settled.arithmetic.precision == ("bfloat16" if fast else "float32")
+        assert settled.arithmetic.device == ("cuda" if cuda else "cpu")
         assert settle(settled) == settled
 
 
@@ -207,7 +207,7 @@ def test_resumed_run_keeps_what_was_settled() -> None:
     held = settings(precision="bfloat16", device="cpu", seed=3)
     assert settle_as(held, settings(precision="auto", device="auto", seed=3)) == held
     asked = settings(precision="float32", device="auto", seed=3)
-    assert settle_as(held, asked).precision == "float32"
+    assert settle_as(held, asked).arithmetic.precision == "float32"
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_where_nobody_tells_it_is_float32(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_horizon_is_the_return_as_an_integer() -> None:
     config = settings(desired_horizon="return", replay_size=10, last_few=4)
-    buffer = ReplayBuffer(config)
+    buffer = ReplayBuffer(config.buffer)
     buffer.admit([Entry(float(r), i, r) for i, r in enumerate((200, 301, 350, 412))])
     sampler = CommandSampler(config, TAKE_COVER)
     explored = sampler.explore(1, buffer)

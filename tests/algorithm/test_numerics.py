@@ -75,7 +75,7 @@ def test_an_environment_that_fails_the_probe_is_at_fault() -> None:
 
 
 def class_of(config: Config, generator: EpisodeGenerator) -> str:
-    return acting_class(config, generator, acting_graph(config, generator.spec))
+    return acting_class(config, generator, acting_graph(config.network, generator.spec))
 
 
 def test_the_acting_class_does_not_depend_on_the_number_of_environments() -> None:

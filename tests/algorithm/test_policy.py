@@ -18,7 +18,7 @@ def policy(environment: str = "CartPole-v1", seed: int = 1, **values: Any) -> Po
     env = make_environment(config)
     spec = specify(env, config)
     env.close()
-    graph = acting_graph(config, spec)
+    graph = acting_graph(config.network, spec)
     behavior = ActingFunction(graph, probe_weights(graph))
     return Policy(behavior, config, spec, np.random.default_rng(seed))
 

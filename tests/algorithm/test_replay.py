@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.config import COMMANDS_PER_ITERATION, Config, build
+from udrl.config import COMMANDS_PER_ITERATION, build
 from udrl.replay import Entry, ReplayBuffer
+from udrl.setting_groups import BufferSettings
 
 # Few different returns, so that there are many ties; batches of episodes, as iterations bring them.
 batches = st.lists(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), max_size=6), max_size=8)
@@ -14,9 +15,9 @@ recents = st.integers(0, 10)
 ages = st.none() | st.integers(1, 4)
 
 
-def settings(replay_size: int, recent_size: int = 0, max_age: int | None = None) -> Config:
+def settings(replay_size: int, recent_size: int = 0, max_age: int | None = None) -> BufferSettings:
     values = {"replay_size": replay_size, "recent_size": recent_size, "max_age": max_age}
-    return build(Config, {"environment": "CartPole-v1", "last_few": 1, **values})
+    return build(BufferSettings, values)
 
 
 def numbered(batches: list[list[float]]) -> list[list[Entry]]:

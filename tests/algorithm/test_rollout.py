@@ -38,7 +38,9 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
     env = make_environment(config)
     spec = specify(env, config)
     return Policy(
-        ActingFunction(acting_graph(config, spec), untrained(config, spec).weights), config, spec
+        ActingFunction(acting_graph(config.network, spec), untrained(config, spec).weights),
+        config,
+        spec,
     ), env
 
 

@@ -101,7 +101,7 @@ SPEC = EnvironmentSpec(
 
 
 def buffer() -> ReplayBuffer:
-    return ReplayBuffer(config(), [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
+    return ReplayBuffer(config().buffer, [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
 
 
 def test_your_own_is_named_by_module_and_class(own: str) -> None:

@@ -3,12 +3,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from udrl.config import Config, build
+from udrl.config import build
+from udrl.setting_groups import NetworkSettings
 from udrl.targets import ReturnInTime
 
 
 def target(**values: Any) -> ReturnInTime:
-    return ReturnInTime(build(Config, {"environment": "CartPole-v1", **values}))
+    return ReturnInTime(build(NetworkSettings, values))
 
 
 def test_counting_down_is_lines_8_9_and_11_of_algorithm_2() -> None:

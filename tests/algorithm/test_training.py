@@ -67,16 +67,16 @@ def digest(state: TrainingState) -> bytes:
 
 def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Config) -> float:
     """Section 2.3.3 as a loop over updates, and over the examples of each."""
-    n = config.n_updates_per_iter * config.batch_size
+    n = config.training.n_updates_per_iter * config.training.batch_size
     numbers = Stream(stream_key(config.seed, Purpose.TRAINING, state.version + 1)).uniforms(3 * n)
     losses = []
-    for update in range(config.n_updates_per_iter):
+    for update in range(config.training.n_updates_per_iter):
         states, commands, actions = [], [], []
-        for row in range(config.batch_size):
-            i = update * config.batch_size + row
+        for row in range(config.training.batch_size):
+            i = update * config.training.batch_size + row
             episode = episodes[int(numbers[i] * len(episodes))]
             earned = episode.cumulative_rewards
-            if config.segments == "trailing":
+            if config.training.segments == "trailing":
                 t1, t2 = int(numbers[n + i] * episode.length), episode.length
             else:
                 times = list(range(episode.length + 1))
@@ -86,7 +86,10 @@ def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Conf
             desired_return, desired_horizon = earned[t2] - earned[t1], t2 - t1
             states.append(episode.observations[t1].tolist())
             commands.append(
-                [desired_return * config.return_scale, desired_horizon * config.horizon_scale]
+                [
+                    desired_return * config.network.return_scale,
+                    desired_horizon * config.network.horizon_scale,
+                ]
             )
             actions.append(int(episode.actions[t1]))
         logits = state.behavior(torch.tensor(states), torch.tensor(commands, dtype=torch.float32))
@@ -248,7 +251,7 @@ def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: 
         )
         for i in range(180)
     ]
-    act = ActingFunction(acting_graph(config, generator.spec), state.weights)
+    act = ActingFunction(acting_graph(config.network, generator.spec), state.weights)
     did = generate_episodes(generator, told, act)
     disobeyed = [
         command

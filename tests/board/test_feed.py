@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from udrl.actions import Categorical
-from udrl.config import Config
+from udrl.config import Config, flat
 from udrl.environments import EnvironmentSpec
 from udrl.errors import InvalidData, Unreachable
 from udrl.spaces import Vector
@@ -18,7 +18,7 @@ from udrl_proto.messages import Hello, Weights
 from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 
 HELLO = Hello(
-    protocol=1, software="1", run_id="run", config=Config(environment="CartPole-v1"),
+    protocol=1, software="1", run_id="run", settings=flat(Config(environment="CartPole-v1")),
     environment=EnvironmentSpec(
         observation_space=Vector(size=4), action_space=Categorical(n=2), max_episode_steps=500
     ),

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config, KeywordValue, read_toml
+from udrl.config import Config, KeywordValue, build, read_toml
 from udrl.environments.making import make_environment, specify
 from udrl.errors import ConfigError, InvalidData
 from udrl.memory import FrameStack
@@ -80,7 +80,7 @@ def _environments() -> Iterator[None]:
 
 def baseline(algorithm: str, **changes: Any) -> Baseline:
     settings = {"environment": "Balance-v0", "hidden": [16, 8], "eval_every": 200} | changes
-    config = msgspec.convert({"eval_episodes": 4} | settings, Config)
+    config = build(Config, {"eval_episodes": 4} | settings)
     return msgspec.convert(
         {"algorithm": algorithm, "config": config, "hyperparameters": FAST[algorithm]}, Baseline
     )
@@ -154,7 +154,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     model, config = made(wanted), wanted.config
     spec = specify(make_environment(config), config)
     behavior = BehaviorFunction(spec, config)
-    seen = FrameStack(spec.observation_space, config).shape
+    seen = FrameStack(spec.observation_space, config.network.frame_stack).shape
     if isinstance(model, DQN):
         parts: list[nn.Module] = [model.q_net]
     else:
@@ -211,7 +211,7 @@ def test_reset_seeds(algorithm: str, tmp_path: Path) -> None:
     assert len(set(in_training)) == len(in_training) > 5
 
     sampler = CommandSampler(config, specify(make_environment(config), config))
-    buffer = ReplayBuffer(config, [Entry(30.0, 7, 30)])
+    buffer = ReplayBuffer(config.buffer, [Entry(30.0, 7, 30)])
     udrl = [c.environment_seed for i in (1, 2) for c in sampler.evaluate(i, buffer)]
     assert in_evaluation == udrl
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from udrl.config import Config
+from udrl.config import Config, build, change, flat
 from udrl.errors import Interrupted, InvalidData, RunFailed, RunInUse
 from udrl_experiments import jobs
 from udrl_experiments.job import carry_out as do
@@ -16,12 +16,12 @@ from udrl_experiments.jobs import Job, carry_out, furthest, read_job
 from udrl_experiments.records import Evaluated
 from udrl_inspect.tables import write
 
-CONFIG = Config(environment="CartPole-v1", eval_every=100)
+CONFIG = build(Config, {"environment": "CartPole-v1", "eval_every": 100})
 
 
 def job(max_env_steps: int = 1000, variant: str = "", **changes: Any) -> Job:
-    config = msgspec.structs.replace(CONFIG, **changes)
-    return Job(algorithm="UDRL", config=config, max_env_steps=max_env_steps, variant=variant)
+    settings = flat(change(CONFIG, **changes))
+    return Job(algorithm="UDRL", settings=settings, max_env_steps=max_env_steps, variant=variant)
 
 
 TABLE = (
@@ -49,7 +49,7 @@ def test_other_settings_are_another_run(change: dict[str, Any]) -> None:
 
 
 def test_other_hyperparameters_are_another_run() -> None:
-    dqn = Job(algorithm="DQN", config=CONFIG, max_env_steps=1)
+    dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=1)
     other = msgspec.structs.replace(dqn, hyperparameters={"gamma": 0.9})
     assert len({job().name, dqn.name, other.name}) == 3
 
@@ -190,7 +190,7 @@ def test_a_run_without_evaluations_is_told(tmp_path: Path, program: Callable[[st
 
 
 def test_nobody_else_works_on_a_run(tmp_path: Path) -> None:
-    dqn = Job(algorithm="DQN", config=CONFIG, max_env_steps=10)
+    dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=10)
     with (tmp_path / "lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(RunInUse, match="another study works on the run"):

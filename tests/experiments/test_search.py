@@ -64,16 +64,17 @@ def test_the_papers_scale_is_the_papers() -> None:
     study = search(Plan("paper"), list(TASKS.values()), ["UDRL"])
     runs = [job.config.environment for job in study.jobs]
     assert [runs.count(name) for name in ENVIRONMENTS] == [256 * 3, 256, 72]
-    assert {job.config.eval_seeds for job in study.jobs} == {"search"}
+    assert {job.config.evaluation.eval_seeds for job in study.jobs} == {"search"}
     assert {job.max_env_steps for job in study.jobs} == {10_000_000}
 
 
 def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
     (job,) = search(Plan(), [TASKS["lander"]], ["UDRL"], 1).jobs
-    assert (job.config.max_age, job.config.recent_size, job.config.lead) == (None, 0, 0)
+    buffer = job.config.buffer
+    assert (buffer.max_age, buffer.recent_size, job.config.lead) == (None, 0, 0)
     drawn = draw("LunarLander-v3", "UDRL", 0)
-    assert job.config.batch_size == drawn["batch_size"]
-    assert list(job.config.hidden) == drawn["hidden"]
+    assert job.config.training.batch_size == drawn["batch_size"]
+    assert list(job.config.network.hidden) == drawn["hidden"]
 
 
 def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from udrl.config import Config
+from udrl.config import Config, flat
 from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
@@ -18,7 +18,7 @@ from udrl_experiments.study import Place, Study, conduct
 
 
 def job(seed: int, max_env_steps: int = 100) -> Job:
-    return Job(algorithm="UDRL", config=Config(environment="CartPole-v1", seed=seed),
+    return Job(algorithm="UDRL", settings=flat(Config(environment="CartPole-v1", seed=seed)),
                max_env_steps=max_env_steps)  # fmt: skip
 
 
@@ -77,8 +77,8 @@ def test_what_is_missing_is_told_before_the_first_run(
     world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    config = Config(environment="LunarLander-v3")
-    needy = msgspec.structs.replace(job(1), algorithm=algorithm, config=config)
+    settings = flat(Config(environment="LunarLander-v3"))
+    needy = msgspec.structs.replace(job(1), algorithm=algorithm, settings=settings)
     with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[box2d,doom,studies\]"'):
         world.conduct(needy)
     assert not world.done
@@ -124,9 +124,9 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
 
 
 def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World) -> None:
-    config = Config(environment="CartPole-v1", command_strategy="not.there:Missing")
+    settings = flat(job(1).config) | {"command_strategy": "not.there:Missing"}
     with pytest.raises(ConfigError, match=r"not\.there:Missing"):
-        world.conduct(job(1), msgspec.structs.replace(job(1), config=config))
+        world.conduct(job(1), msgspec.structs.replace(job(1), settings=settings))
     assert not world.done
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.checkpoint import encode_optimizer
 from udrl.commands import Command
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, build
 from udrl.errors import InvalidData
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
@@ -46,10 +46,13 @@ from udrl_proto.transport import Answer
 from udrl_replay.creation import create
 from udrl_replay.service import ReplayService
 
-CONFIG = Config(
-    environment="Figure2-v0", lead=2, batch_size=4, hidden=(2, 2), n_warm_up_episodes=3,
-    n_episodes_per_iter=3, n_updates_per_iter=2, replay_size=6, last_few=2, eval_every=20,
-    eval_episodes=2, segments="all",
+CONFIG = build(
+    Config,
+    {
+        "environment": "Figure2-v0", "lead": 2, "batch_size": 4, "hidden": [2, 2],
+        "n_warm_up_episodes": 3, "n_episodes_per_iter": 3, "n_updates_per_iter": 2,
+        "replay_size": 6, "last_few": 2, "eval_every": 20, "eval_episodes": 2, "segments": "all",
+    },
 )  # fmt: skip
 
 NAMES = list(verbs.BY_NAME)
@@ -149,7 +152,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
     world, asked = World(), []
     generator = EpisodeGenerator(CONFIG, 4)
     states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
-    graph = acting_graph(CONFIG, generator.spec)
+    graph = acting_graph(CONFIG.network, generator.spec)
 
     def ask(verb: str, request: Message | bytes) -> Message:
         data = request if isinstance(request, bytes) else encode(request)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-import udrl_actor.courier
+import udrl_actor.outbox
 from udrl.config import Budget
 from udrl.episode import Episode
 from udrl.errors import Deceived, UdrlError
@@ -45,7 +45,7 @@ def test_liar_ends_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
             episode = replace(episode, rewards=episode.rewards + 1)
         return encode_episode(episode, actor)
 
-    monkeypatch.setattr(udrl_actor.courier, "encode_episode", lie)
+    monkeypatch.setattr(udrl_actor.outbox, "encode_episode", lie)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
     def go(*, go_on: bool) -> None:

@@ -70,7 +70,8 @@ def test_budget_spent_in_the_warm_up_trains_nothing(
 ) -> None:
     code, out, error = cli(*arguments(TOY, 1, tmp_path / "run"), "--in-process").finish()
     assert code == 0, error
-    assert "none; the budget was spent in the warm-up" in out
+    assert "none; the budget was spent in the warm-up" in error
+    assert json.loads(out)["weights_version"] == 0, "with --json there is nothing else"
 
 
 def test_resuming_an_ended_run_returns_at_once(cli: Callable[..., Cli], tmp_path: Path) -> None:

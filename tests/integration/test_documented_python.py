@@ -30,7 +30,7 @@ def agent(tmp_path: Path) -> Path:
     env = make_environment(config)
     spec = specify(env, config)
     env.close()
-    behavior = ActingFunction(acting_graph(config, spec), untrained(config, spec).weights)
+    behavior = ActingFunction(acting_graph(config.network, spec), untrained(config, spec).weights)
     policy = Policy(behavior, config, spec, desired_return=200.0, desired_horizon=300)
     folder.save(tmp_path / "my-agent", policy, "")
     return tmp_path

@@ -11,8 +11,9 @@ import msgspec
 import pytest
 from click.testing import CliRunner
 
-from udrl.config import Budget, Config, build
+from udrl.config import Budget, Config, build, change
 from udrl.errors import ConfigError, UdrlError
+from udrl.replay import ReplayBuffer
 from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
 from udrl_inspect.obedience import Obedience, keep, kept, measure, plan_commands
 from udrl_inspect.obedience_text import answer, markdown
@@ -133,7 +134,7 @@ def test_commands_lie_among_what_the_buffer_did(ended_run: Path) -> None:
 
 
 def with_horizons_that_follow(agent: Agent) -> Agent:
-    config = msgspec.structs.replace(agent.config, desired_horizon="return")
+    config = change(agent.config, desired_horizon="return")
     return agent._replace(config=config)
 
 
@@ -147,7 +148,7 @@ def test_where_horizons_follow_from_returns_they_are_not_varied(ended_run: Path)
 
 def test_a_buffer_of_equal_returns_leaves_nothing_to_compare(ended_run: Path) -> None:
     agent = load_agent(ended_run)
-    best = type(agent.buffer)(agent.config, [e._replace(episode_return=9.0) for e in agent.buffer])
+    best = ReplayBuffer(agent.config.buffer, [e._replace(episode_return=9.0) for e in agent.buffer])
     agent = agent._replace(buffer=best)
     with pytest.raises(ConfigError, match=r"are 9, .*--desired-returns LOW:HIGH"):
         plan_commands(agent, points=5, episodes=2)

@@ -89,8 +89,8 @@ def learner(hosted: Hosted) -> None:
 
 
 def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
-    other = msgspec.structs.replace(hosted.hello.config, max_episode_steps=1)
-    hello = msgspec.structs.replace(hosted.hello, config=other)
+    other = hosted.hello.settings | {"max_episode_steps": 1}
+    hello = msgspec.structs.replace(hosted.hello, settings=other)
     with pytest.raises(Refused, match=r"max_episode_steps=2.*yours is.*max_episode_steps=1") as no:
         ActorService(hosted.transport, hello, "other", 1, hosted.stop).run()
     assert no.value.code == "other_environment"

@@ -11,14 +11,14 @@ from udrl_launch.settings import gather
 
 def test_preset_named_like_the_environment_is_taken() -> None:
     settings = gather("CartPole-v1", options={})
-    assert settings.config.batch_size == preset("CartPole-v1")["batch_size"]
+    assert settings.config.training.batch_size == preset("CartPole-v1")["batch_size"]
     assert settings.budget.max_env_steps == preset("CartPole-v1")["max_env_steps"]
 
 
 def test_another_preset_can_be_named() -> None:
     settings = gather("LunarLander-v3", preset_name="CartPole-v1", options={})
     assert settings.config.environment == "LunarLander-v3"
-    assert settings.config.replay_size == preset("CartPole-v1")["replay_size"]
+    assert settings.config.buffer.replay_size == preset("CartPole-v1")["replay_size"]
 
 
 def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
@@ -29,15 +29,15 @@ def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
         assignments=["seed=4"],
     )  # fmt: skip
     config = settings.config
-    assert (config.batch_size, config.lead, config.seed) == (2, 3, 4)
-    assert config.eval_every == preset("CartPole-v1")["eval_every"]
+    assert (config.training.batch_size, config.lead, config.seed) == (2, 3, 4)
+    assert config.evaluation.eval_every == preset("CartPole-v1")["eval_every"]
     assert settings.fleet.actors == 3
 
 
 def test_stored_settings_replace_the_preset() -> None:
     settings = gather("CartPole-v1", stored={"batch_size": 5}, options={})
-    assert settings.config.batch_size == 5
-    assert settings.config.hidden != tuple(preset("CartPole-v1")["hidden"])
+    assert settings.config.training.batch_size == 5
+    assert settings.config.network.hidden != tuple(preset("CartPole-v1")["hidden"])
 
 
 def test_file_of_another_environment_is_refused(tmp_path: Path) -> None:
@@ -75,4 +75,4 @@ def test_setting_that_has_no_effect_is_refused(idle: str, needed: str) -> None:
 def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:
     file = tmp_path / "config.toml"
     file.write_text("hold_steps = 9\n")
-    assert gather("Figure2-v0", file=file, options={}).config.hold_steps == 9
+    assert gather("Figure2-v0", file=file, options={}).config.commands.hold_steps == 9

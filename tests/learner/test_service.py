@@ -9,7 +9,7 @@ import pytest
 
 from tests.proto.scripted import Scripted
 from udrl.actions import Categorical
-from udrl.config import Config
+from udrl.config import Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import Refused
@@ -36,16 +36,19 @@ from udrl_proto.messages import (
     Wait,
 )
 
-CONFIG = Config(
-    environment="Synthetic-v0", batch_size=4, hidden=(4, 4), n_updates_per_iter=2, replay_size=4,
-    last_few=1,
+CONFIG = build(
+    Config,
+    {
+        "environment": "Synthetic-v0", "batch_size": 4, "hidden": [4, 4], "n_updates_per_iter": 2,
+        "replay_size": 4, "last_few": 1,
+    },
 )  # fmt: skip
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
 )
 HELLO = Hello(
-    protocol=PROTOCOL, software="0", run_id="scripted", config=CONFIG, environment=SPEC,
-    graph=acting_graph(CONFIG, SPEC),
+    protocol=PROTOCOL, software="0", run_id="scripted", settings=flat(CONFIG), environment=SPEC,
+    graph=acting_graph(CONFIG.network, SPEC),
 )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Any message, drawn from the types themselves: a new field is covered as soon as it exists."""
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
@@ -7,7 +8,8 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 import udrl_proto.reports  # noqa: F401 - its messages are found too
-from udrl.config import Config
+from udrl.config import Config, FlatSettings, build, flat
+from udrl.setting_groups import SettingsGroup
 from udrl_proto.messages import Message
 
 MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
@@ -18,14 +20,37 @@ def messages(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
     return _any(inspect.type_info(kind))
 
 
+def setting_fields(kind: type[msgspec.Struct]) -> Iterator[inspect.Field]:
+    """Yield the fields of all settings of a kind, those in groups among them."""
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    for field in info.fields:
+        match field.type:
+            case inspect.StructType(cls=cls, fields=fields) if issubclass(cls, SettingsGroup):
+                yield from fields
+            case _:
+                yield field
+
+
+def configs() -> st.SearchStrategy[Config]:
+    """Return a strategy for all settings of a run."""
+    return _fields(setting_fields(Config)).map(lambda given: build(Config, _possible(given)))
+
+
+def _fields(fields: Iterable[inspect.Field]) -> st.SearchStrategy[dict[str, Any]]:
+    fields = list(fields)
+    return st.fixed_dictionaries(
+        {f.name: _any(f.type) for f in fields if f.required},
+        optional={f.name: _any(f.type) for f in fields if not f.required},
+    )
+
+
 def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
     match node:
         case inspect.StructType(cls=cls, fields=fields):
-            values = st.fixed_dictionaries(
-                {f.name: _any(f.type) for f in fields if f.required},
-                optional={f.name: _any(f.type) for f in fields if not f.required},
-            )
-            return values.map(lambda given: _build(cls, given))
+            return _fields(fields).map(lambda given: cls(**given))
+        case inspect.DictType() if node == inspect.type_info(FlatSettings):
+            return configs().map(flat)
         case inspect.UnionType(types=types):
             return st.one_of(*map(_any, types))
         case inspect.LiteralType(values=literals):
@@ -57,12 +82,10 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
     raise NotImplementedError(node)
 
 
-def _build(cls: type[msgspec.Struct], values: dict[str, Any]) -> msgspec.Struct:
-    if cls is Config:
-        values["replay_size"] = max(
-            values.get("replay_size", 500), min(values.get("last_few", 75), 1_000_000)
-        )
-        values["last_few"] = min(values.get("last_few", 75), values["replay_size"])
-        if values.get("segments") == "all":
-            values["baseline"] = "none"
-    return cls(**values)
+def _possible(values: dict[str, Any]) -> dict[str, Any]:
+    """Return settings of a run that can be had together."""
+    last_few = min(values.get("last_few", 75), 1_000_000)
+    values |= {"last_few": last_few, "replay_size": max(values.get("replay_size", 500), last_few)}
+    if values.get("segments") == "all":
+        values["baseline"] = "none"
+    return values

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from tests.proto.strategies import MESSAGES, messages
+from udrl.config import Config
 from udrl.digests import episode_digest
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage
@@ -158,14 +159,31 @@ def test_refusal_says_what_is_wrong(data: bytes, kind: type[Message], complaint:
 
 @pytest.mark.parametrize(
     ("setting", "complaint"),
-    [({"last_few": 501}, "at most replay_size"), ({"max_return": float("nan")}, "finite")],
+    [
+        ({}, None),
+        ({"last_few": 501}, "at most replay_size"),
+        ({"max_return": float("nan")}, "finite"),
+        ({"batch_size": 0}, "batch_size = 0: Expected `int` >= 1"),
+        ({"bach_size": 512}, "did you mean 'batch_size'"),
+        ({"training": {"batch_size": 512}}, "unknown setting 'training'"),
+        ({"hidden": [[8]]}, "Expected `int`, got `array`"),
+    ],
 )
 def test_specification_with_an_impossible_configuration_is_refused(
-    setting: dict[str, Any], complaint: str
+    setting: dict[str, Any], complaint: str | None
 ) -> None:
-    environment = {"observation_shape": [1], "n_actions": 2, "max_episode_steps": 3}
+    environment = {
+        "observation_space": {"kind": "vector", "size": 1},
+        "action_space": {"kind": "categorical", "n": 2},
+        "max_episode_steps": 3,
+    }
     config = {"environment": "x", **setting}
-    data = packed(protocol=1, software="", run_id="r", config=config, environment=environment)
+    data = packed(
+        protocol=1, software="", run_id="r", config=config, environment=environment, graph=b""
+    )
+    if complaint is None:
+        assert decode(data, Hello).config == Config(environment="x")
+        return
     with pytest.raises(InvalidMessage, match=complaint):
         decode(data, Hello)
 

@@ -10,9 +10,9 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from tests.proto.strategies import MESSAGES
+from tests.proto.strategies import MESSAGES, setting_fields
 from udrl.commands import Command
-from udrl.config import Config
+from udrl.config import Config, FlatSettings
 from udrl.environments import EnvironmentSpec
 from udrl_proto import PROTOCOL, keys, verbs
 
@@ -74,6 +74,8 @@ def described(kind: inspect.Type) -> str:
         case inspect.VarTupleType(item_type=item, min_length=fewest, max_length=count):
             limit = "" if count is None else f", {number(fewest or 0)} to {number(count)} of them"
             return f"array of {described(item)}{limit}"
+        case inspect.DictType() if kind == inspect.type_info(FlatSettings):
+            return "[Config](#config)"
         case inspect.DictType(key_type=key, value_type=value):
             return f"map of {described(key)} to {described(value)}"
         case inspect.StructType(cls=cls):
@@ -94,9 +96,7 @@ def default_of(field: inspect.Field) -> str:
 
 def rows_of(kind: type[msgspec.Struct]) -> list[list[str]]:
     """Return the first cells of a type's table as it should be: field, type, default."""
-    info = inspect.type_info(kind)
-    assert isinstance(info, inspect.StructType)
-    return [[f"`{f.encode_name}`", described(f.type), default_of(f)] for f in info.fields]
+    return [[f"`{f.encode_name}`", described(f.type), default_of(f)] for f in setting_fields(kind)]
 
 
 def table_in(page: str, heading: str) -> list[list[str]]:

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from udrl.actions import Categorical
-from udrl.config import Config
+from udrl.config import Config, flat
 from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError, Interrupted, InvalidMessage, Unreachable
 from udrl.spaces import Vector
@@ -128,7 +128,7 @@ def hello(run_id: str) -> Hello:
         protocol=PROTOCOL,
         software="0",
         run_id=run_id,
-        config=Config(environment="Figure2-v0"),
+        settings=flat(Config(environment="Figure2-v0")),
         environment=EnvironmentSpec(
             observation_space=Vector(size=4), action_space=Categorical(n=3), max_episode_steps=2
         ),

@@ -19,7 +19,7 @@ from tests.proto import stranger
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
 from udrl.commands import Command
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, build, change, flat
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.graph import acting_graph
@@ -33,21 +33,24 @@ from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import create
 from udrl_replay.service import ReplayService
 
-CONFIG = Config(
-    environment="CartPole-v1",
-    max_return=20.0,
-    seed=3,
-    lead=0,
-    batch_size=32,
-    hidden=(16, 8),
-    last_few=4,
-    n_episodes_per_iter=3,
-    n_updates_per_iter=2,
-    n_warm_up_episodes=4,
-    warm_up_hold=3,
-    replay_size=8,
-    eval_every=100,
-    eval_episodes=2,
+CONFIG = build(
+    Config,
+    {
+        "environment": "CartPole-v1",
+        "max_return": 20.0,
+        "seed": 3,
+        "lead": 0,
+        "batch_size": 32,
+        "hidden": [16, 8],
+        "last_few": 4,
+        "n_episodes_per_iter": 3,
+        "n_updates_per_iter": 2,
+        "n_warm_up_episodes": 4,
+        "warm_up_hold": 3,
+        "replay_size": 8,
+        "eval_every": 100,
+        "eval_episodes": 2,
+    },
 )
 
 
@@ -98,9 +101,10 @@ def test_it_knows_nothing_but_the_page() -> None:
 
 
 def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
-    plain = {"config": config, "environment": spec}
-    return {name: msgspec.to_builtins(value) for name, value in plain.items()} | {
-        "graph": acting_graph(config, spec)
+    return {
+        "config": flat(config),
+        "environment": msgspec.to_builtins(spec),
+        "graph": acting_graph(config.network, spec),
     }
 
 
@@ -119,7 +123,7 @@ def test_probe_has_the_same_digest(
     activation: Any, baseline: Any, desired_horizon: Any, frame_stack: int
 ) -> None:
     assert_same_class(
-        msgspec.structs.replace(
+        change(
             CONFIG, activation=activation, baseline=baseline, desired_horizon=desired_horizon,
             frame_stack=frame_stack,
         )
@@ -129,9 +133,7 @@ def test_probe_has_the_same_digest(
 @pytest.mark.parametrize("baseline", ["none", "value"])
 def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None:
     assert_same_class(
-        msgspec.structs.replace(
-            CONFIG, environment=pixels, baseline=baseline, convolutions=(4, 6), frame_stack=2
-        )
+        change(CONFIG, environment=pixels, baseline=baseline, convolutions=(4, 6), frame_stack=2)
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from udrl.actions import Categorical
 from udrl.commands import Command, CommandSampler
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, build, flat
 from udrl.digests import episode_digest, replay_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
@@ -43,17 +43,20 @@ SPEC = EnvironmentSpec(
 
 def config(lead: int = 0) -> Config:
     """Return a run of a dozen steps an iteration, with evaluations and many ties in return."""
-    return Config(
-        environment="Synthetic-v0",
-        lead=lead,
-        n_warm_up_episodes=4,
-        n_episodes_per_iter=3,
-        replay_size=5,
-        max_age=MAX_AGE,
-        recent_size=4,
-        last_few=2,
-        eval_every=9,
-        eval_episodes=2,
+    return build(
+        Config,
+        {
+            "environment": "Synthetic-v0",
+            "lead": lead,
+            "n_warm_up_episodes": 4,
+            "n_episodes_per_iter": 3,
+            "replay_size": 5,
+            "max_age": MAX_AGE,
+            "recent_size": 4,
+            "last_few": 2,
+            "eval_every": 9,
+            "eval_episodes": 2,
+        },
     )
 
 
@@ -62,9 +65,9 @@ def hello(lead: int = 0) -> Hello:
         protocol=PROTOCOL,
         software="0",
         run_id="synthetic",
-        config=config(lead),
+        settings=flat(config(lead)),
         environment=SPEC,
-        graph=acting_graph(config(lead), SPEC),
+        graph=acting_graph(config(lead).network, SPEC),
     )
 
 
@@ -140,8 +143,8 @@ def reference(lead: int, max_env_steps: int) -> Result:
         held: list[Episode] = []
         for i in range(iteration + 1):
             held = [e for e in held + explored[i] if i - entry(e).iteration < MAX_AGE]
-            best = sorted(held, key=entry)[-settings.replay_size :]
-            newest = held[-settings.recent_size :]
+            best = sorted(held, key=entry)[-settings.buffer.replay_size :]
+            newest = held[-settings.buffer.recent_size :]
             held = [e for e in held if e in best or e in newest]
         return sorted(held, key=entry)
 
@@ -155,10 +158,10 @@ def reference(lead: int, max_env_steps: int) -> Result:
         else:
             weights.append(trained(i, weights[-1], map(episode_digest, buffer(i - 1))).weights)
             source = weights_version(i, lead) - 1
-            drawn_from = ReplayBuffer(settings, map(entry, buffer(source)))
+            drawn_from = ReplayBuffer(settings.buffer, map(entry, buffer(source)))
             explored.append(carry_out(sample.explore(i, drawn_from)))
             before = steps[source - 1] if source else 0
-            due = evaluation_due(source, before, steps[source], settings.eval_every)
+            due = evaluation_due(source, before, steps[source], settings.evaluation.eval_every)
             if due and i == opened_by(source, lead)[0]:
                 returns = [e.episode_return for e in carry_out(sample.evaluate(i, drawn_from))]
                 evaluation = summarise(returns)
@@ -166,7 +169,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
     digest = replay_digest(map(episode_digest, buffer(i)))
     closing = None
     if i > 0:
-        last = ReplayBuffer(settings, map(entry, buffer(i)))
+        last = ReplayBuffer(settings.buffer, map(entry, buffer(i)))
         closing = summarise([e.episode_return for e in carry_out(sample.close(i, last))])
     return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udrl.actions import Categorical
-from udrl.config import Budget, Config, build, read_toml
+from udrl.config import Budget, Config, build, flat, read_toml
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
@@ -37,14 +37,14 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
         protocol=PROTOCOL,
         software=__version__,
         run_id=hello.run_id,
-        config=TOY,
+        settings=flat(TOY),
         environment=EnvironmentSpec(
             observation_space=Category(n=4),
             action_space=Categorical(n=3),
             max_episode_steps=2,
             max_return=2.0,
         ),
-        graph=acting_graph(TOY, hello.environment),
+        graph=acting_graph(TOY.network, hello.environment),
     )
     assert created.fact("progress", Progress) == Progress()
 
@@ -83,8 +83,10 @@ def test_run_is_resumed_with_its_configuration(created: Store, tmp_path: Path) -
 
 def test_other_configuration_is_refused_with_both_values(created: Store, tmp_path: Path) -> None:
     created.close()
-    other = Config(environment="Figure2-v0", max_return=2.0, seed=7, hidden=(8,))
-    expected = r"seed = 1, not 7; hidden = \(32, 128, 128, 128\), not \(8,\); use its configuration"
+    other = build(
+        Config, {"environment": "Figure2-v0", "max_return": 2.0, "seed": 7, "hidden": [8]}
+    )
+    expected = r"seed = 1, not 7; hidden = \[32, 128, 128, 128\], not \[8\]; use its configuration"
     with pytest.raises(OtherConfiguration, match=expected):
         creation.resume(tmp_path, other)
     # The refusal has let go of the lock.
@@ -152,12 +154,15 @@ def test_written_configuration_can_be_read_again(
     stop_return: float | None,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    config = Config(
-        environment='odd "name"\\-v0',
-        environment_kwargs=environment_kwargs,
-        learning_rate=learning_rate,
-        hidden=hidden,
-        max_return=max_return,
+    config = build(
+        Config,
+        {
+            "environment": 'odd "name"\\-v0',
+            "environment_kwargs": environment_kwargs,
+            "learning_rate": learning_rate,
+            "hidden": hidden,
+            "max_return": max_return,
+        },
     )
     budget = Budget(max_env_steps=5, stop_return=stop_return)
     run_dir = tmp_path_factory.getbasetemp()

@@ -42,20 +42,20 @@ def test_status_of_a_new_run_is_empty_but_complete(make_run: MakeRun) -> None:
     assert (seen.buffer.episodes, seen.buffer.return_mean) == (0, None)
     assert (seen.weights_version, seen.weights_sha256, seen.loss) == (0, "", None)
     assert (seen.evaluation, seen.closing_evaluation, seen.time_left_s) == (None, None, None)
-    assert seen.commands.outstanding == seen.commands.issued == config().n_warm_up_episodes
-    assert seen.useful_concurrency == config().n_episodes_per_iter
+    assert seen.commands.outstanding == seen.commands.issued == config().commands.n_warm_up_episodes
+    assert seen.useful_concurrency == config().commands.n_episodes_per_iter
     assert decode(encode(seen), Status) == seen
 
 
 def test_useful_concurrency_grows_with_the_lead(make_run: MakeRun) -> None:
-    assert shown(make_run(lead=3)).useful_concurrency == 4 * config().n_episodes_per_iter
+    assert shown(make_run(lead=3)).useful_concurrency == 4 * config().commands.n_episodes_per_iter
 
 
 def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
     run = make_run(lead=1, max_env_steps=40)
     finish(run)
     seen = shown(run)
-    returns = [e.episode_return for e in run.buffer.best(run.config.replay_size)]
+    returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
     version = run.store.version(run.progress.iteration)
     closing = run.store.last_evaluation(closing=True)
     assert version is not None
@@ -281,7 +281,7 @@ def test_contents_are_the_buffer_and_what_is_drawn_from_it(make_run: MakeRun) ->
     assert found.iteration == run.progress.iteration
     shown = list(zip(found.returns, found.lengths, found.iterations, strict=True))
     assert shown == [(e.episode_return, e.length, e.iteration) for e in run.buffer]
-    best = run.buffer.best(run.config.last_few)
+    best = run.buffer.best(run.config.commands.last_few)
     mean = math.fsum(e.episode_return for e in best) / len(best)
     assert found.desired_return == pytest.approx(mean)
     asked = [

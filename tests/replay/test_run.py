@@ -286,10 +286,11 @@ class RunMachine(RuleBasedStateMachine):
     def best(self, iteration: int) -> list[Entry]:
         """Return the buffer after an iteration, from all that was ever accepted."""
         held: list[Entry] = []
+        settings = config().buffer
         for i in range(iteration + 1):
             held += sorted((e for e in self.explored if e.iteration == i), key=lambda e: e.id)
             held = [e for e in held if i - e.iteration < MAX_AGE]
-            best, newest = sorted(held)[-config().replay_size :], held[-config().recent_size :]
+            best, newest = sorted(held)[-settings.replay_size :], held[-settings.recent_size :]
             held = [e for e in held if e in best or e in newest]
         return sorted(held)
 
@@ -382,7 +383,7 @@ def test_reopened_run_issues_nothing_again(make_run: MakeRun, reopened: MakeRun)
     before = outstanding(run)
     run = reopened(run)
     assert outstanding(run) == before
-    assert run.progress.issued == len(before) == config().n_warm_up_episodes
+    assert run.progress.issued == len(before) == config().commands.n_warm_up_episodes
 
 
 def test_second_delivery_is_a_duplicate(make_run: MakeRun) -> None:
@@ -429,7 +430,8 @@ def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) ->
     until_closing(run)
     final = run.progress.iteration
     assert [c.id for c in outstanding(run)] == [
-        final * COMMANDS_PER_ITERATION + CLOSING + n for n in range(config().eval_episodes)
+        final * COMMANDS_PER_ITERATION + CLOSING + n
+        for n in range(config().evaluation.eval_episodes)
     ]
     assert {c.weights_version for c in outstanding(run)} == {final}
     assert seeds.isdisjoint(c.environment_seed for c in outstanding(run))

@@ -19,11 +19,11 @@ from msgspec import Meta
 from PIL import Image
 
 from udrl.commands import Command
-from udrl.config import Temperature
 from udrl.environments.making import Environment, make_environment
 from udrl.errors import UdrlError, UnsupportedEnvironment
 from udrl.policy import Policy
 from udrl.rollout import Rollout
+from udrl.setting_groups import Temperature
 from udrl.streams import Purpose, stream_key
 from udrl.weights import decode_behavior
 from udrl_board.source import Source, Wanted

@@ -11,7 +11,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator, generate_episodes, iterate_episodes
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config
+from udrl.config import Config, change
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
@@ -83,7 +83,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             environment=hello.environment,
             version=wanted,
             behavior=decode_behavior(hello.graph, found.weights),
-            buffer=ReplayBuffer(hello.config, (p.entry for p in held)),
+            buffer=ReplayBuffer(hello.config.buffer, (p.entry for p in held)),
             iteration=progress.iteration,
             weights=found.weights,
         )
@@ -144,20 +144,18 @@ def evaluation_commands(
     Raises:
         ConfigError: a horizon is given, and the run's horizons follow from the returns.
     """
-    if agent.config.desired_horizon == "return" and desired_horizon is not None:
+    if agent.config.network.desired_horizon == "return" and desired_horizon is not None:
         raise ConfigError(
             f"desired horizon {desired_horizon}: in this run it is the desired return, as an "
             f"integer, at every step; give the return only"
         )
     if temperature is None:
-        temperature = agent.config.eval_temperature
-    config = msgspec.structs.replace(
-        agent.config, eval_episodes=episodes, eval_temperature=temperature
-    )
+        temperature = agent.config.evaluation.eval_temperature
+    config = change(agent.config, eval_episodes=episodes, eval_temperature=temperature)
     sampler = CommandSampler(config, agent.environment)
     commands = sampler.close(agent.iteration, agent.buffer)
     told = commands[0]
-    desired = ReturnInTime(config).settle(
+    desired = ReturnInTime(config.network).settle(
         told.desired_return if desired_return is None else desired_return,
         told.desired_horizon if desired_horizon is None else desired_horizon,
     )

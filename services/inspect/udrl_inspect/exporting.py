@@ -163,8 +163,8 @@ def _again(agent: Agent, progress: Progress) -> str:
             f"On the same kind of hardware its version {agent.version} has the same weights, to "
             f"the bit; it goes on from there, and keeps the versions that it evaluates."
         )
-    if config.dataset is not None:
-        said += f" It begins with the dataset `{config.dataset}`, which has to be there."
+    if config.commands.dataset is not None:
+        said += f" It begins with the dataset `{config.commands.dataset}`, which has to be there."
     return said
 
 

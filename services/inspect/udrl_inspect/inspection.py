@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from udrl.config import Budget, build, read_toml
+from udrl.config import Budget, build, flat, read_toml
 from udrl.errors import UdrlError
 from udrl_inspect.address import Address, connected, served_at
 from udrl_proto import verbs
@@ -95,5 +95,4 @@ def settings_of(run_dir: Path) -> dict[str, Any]:
     """Return the settings that a run was created with, and the last budget that it was given."""
     with closing(Store(run_dir, read_only=True)) as store:
         config = store.fact("hello", Hello).config
-    values: dict[str, Any] = msgspec.to_builtins(config) | msgspec.to_builtins(budget_of(run_dir))
-    return values
+    return flat(config) | flat(budget_of(run_dir))

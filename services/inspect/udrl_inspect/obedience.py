@@ -13,7 +13,6 @@ import numpy as np
 from msgspec import Meta
 
 from udrl.commands import Command
-from udrl.config import Temperature
 from udrl.errors import ConfigError, InvalidData, StoreError
 from udrl.evaluation import summarise
 from udrl.obedience import (
@@ -25,6 +24,7 @@ from udrl.obedience import (
     obeyed,
     spread,
 )
+from udrl.setting_groups import Temperature
 from udrl.strategies import nearest
 from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
 from udrl_inspect.tables import put
@@ -176,7 +176,7 @@ def plan_commands(
         )  # fmt: skip
 
     common = spread(returns, points)
-    follows = agent.config.desired_horizon == "return"
+    follows = agent.config.network.desired_horizon == "return"
     by_return = [
         commands(value, None if follows else nearest(mean_of_nearest(value, returns, lengths)))
         for value in (evenly(*desired_returns, points) if desired_returns else common)

@@ -17,6 +17,7 @@ from udrl.config import (
     read_toml,
     refuse_idle,
     refuse_unknown,
+    setting_names,
 )
 from udrl.errors import ConfigError
 
@@ -97,10 +98,10 @@ def gather(
         values[name] = value
     values["environment"] = environment
     kinds = (Config, Budget, Fleet)
-    refuse_unknown(values, tuple(name for kind in kinds for name in kind.__struct_fields__))
+    refuse_unknown(values, tuple(name for kind in kinds for name in setting_names(kind)))
 
     def part(kind: type[Kind]) -> Kind:
-        return build(kind, {n: v for n, v in values.items() if n in kind.__struct_fields__})
+        return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)
     refuse_idle(config, asked_for)

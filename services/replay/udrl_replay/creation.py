@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from udrl.acting import EpisodeGenerator
-from udrl.config import Budget, Config
+from udrl.config import Budget, Config, flat
 from udrl.episode import Episode
 from udrl.errors import OtherConfiguration, StoreError
 from udrl.graph import acting_graph
@@ -85,9 +85,9 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
         protocol=PROTOCOL,
         software=__version__,
         run_id=_run_id(run_dir),
-        config=config,
+        settings=flat(config),
         environment=generator.spec,
-        graph=acting_graph(config, generator.spec),
+        graph=acting_graph(config.network, generator.spec),
         allow_inexact=allow_inexact,
         exact=exact,
     )
@@ -118,8 +118,7 @@ def resume(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
     store = Store(run_dir)
     with _closed_on_error(store):
         hello = store.fact("hello", Hello)
-        held = msgspec.to_builtins(hello.config)
-        asked = msgspec.to_builtins(settle_as(hello.config, config))
+        held, asked = flat(hello.config), flat(settle_as(hello.config, config))
         different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
         if different:
             raise OtherConfiguration(
@@ -159,7 +158,7 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
     """
     lines = []
     for settings in (config, budget):
-        for name, value in msgspec.to_builtins(settings).items():
+        for name, value in flat(settings).items():
             if value is not None and value != {}:
                 lines.append(f"{name} = {_toml(value)}")
     path = run_dir / "config.toml"

@@ -134,7 +134,7 @@ class Waits:
 def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
     progress, dealer, config = run.progress, run.dealer, run.config
-    returns = [e.episode_return for e in run.buffer.best(run.config.replay_size)]
+    returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
     latest = run.store.version(progress.latest_version)
     rate = throughput.per_second(now)
     left = max(0, run.budget.max_env_steps - progress.env_steps)
@@ -197,7 +197,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
         else None,
         exact=progress.exact,
         inexact_reason=progress.inexact_reason,
-        useful_concurrency=config.n_episodes_per_iter * (config.lead + 1),
+        useful_concurrency=config.commands.n_episodes_per_iter * (config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
         waiting=waits.list(now),
@@ -240,8 +240,8 @@ def contents(run: Standing) -> Contents:
     entries = list(run.buffer)
     # The best are always among those that are shown.
     shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
-    best = Best.of(run.buffer.best(config.last_few)) if entries else None
-    told = best and ReturnInTime(config).settle(best.mean, best.horizon)
+    best = Best.of(run.buffer.best(config.commands.last_few)) if entries else None
+    told = best and ReturnInTime(config.network).settle(best.mean, best.horizon)
     commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
     return Contents(
         iteration=max(run.progress.iteration, 0),

@@ -123,7 +123,7 @@ class Run(Standing):
         if index < CLOSING:
             return iteration <= self.progress.iteration and index < self.store.issued_in(iteration)
         closed = self.progress.state == "ended" and iteration == self.progress.iteration > 0
-        return closed and index < CLOSING + self.config.eval_episodes
+        return closed and index < CLOSING + self.config.evaluation.eval_episodes
 
     def deal(self, request: CommandsRequest, now: float) -> list[Command]:
         """Return commands for an actor that has joined; those to be checked come first."""
@@ -206,7 +206,7 @@ class Run(Standing):
         if evaluated:
             self._note_evaluation(commands[evaluated[0].id], evaluated, closing=False)
         version = weights_version(iteration, self.config.lead)
-        best = self.buffer.best(self.config.replay_size)
+        best = self.buffer.best(self.config.buffer.replay_size)
         returns = [e.episode_return for e in best]
         desired = [c.desired_return for c in commands.values() if c.kind == "explore"]
         self.store.add_iteration(
@@ -229,7 +229,9 @@ class Run(Standing):
         )
         self.store.remove_commands(ids)
 
-        due = evaluation_due(iteration, steps_before, progress.env_steps, self.config.eval_every)
+        due = evaluation_due(
+            iteration, steps_before, progress.env_steps, self.config.evaluation.eval_every
+        )
         for opened in opened_by(iteration, self.config.lead):
             self._issue(self.sampler.explore(opened, self.buffer))
             if due:

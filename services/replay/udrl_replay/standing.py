@@ -44,7 +44,7 @@ class Standing:
         self.auditor = Auditor(audit)
         self.quarantined = Quarantine(store)
         held = store.buffer(self.progress.iteration)
-        self.buffer = ReplayBuffer(self.config, (p.entry for p in held))
+        self.buffer = ReplayBuffer(self.config.buffer, (p.entry for p in held))
         self.digests = {p.entry.id: p.digest for p in held}
         arrived = store.pending_ids()
         self.dealer.add(c for c in self.open_commands() if c.id not in arrived)

@@ -8,7 +8,7 @@ from typing import Protocol
 import msgspec
 
 from udrl.commands import Command
-from udrl.config import Config
+from udrl.config import Config, change
 from udrl.environments.making import Environment, make_environment
 from udrl.errors import UnsupportedEnvironment
 from udrl.rollout import Rollout
@@ -57,7 +57,7 @@ def filmed(config: Config) -> Environment:
                 f"render_mode of 'rgb_array'; play without a film or window"
             )
     kwargs = config.environment_kwargs | {"render_mode": "rgb_array"}
-    return make_environment(msgspec.structs.replace(config, environment_kwargs=kwargs))
+    return make_environment(change(config, environment_kwargs=kwargs))
 
 
 def fps_of(env: Environment) -> float:

@@ -105,7 +105,7 @@ def train(
 
 def _warn_of_idle_actors(settings: Settings) -> None:
     config, _, fleet = settings
-    useful = config.n_episodes_per_iter * (config.lead + 1)
+    useful = config.commands.n_episodes_per_iter * (config.lead + 1)
     environments = fleet.actors * fleet.envs_per_actor
     if environments > 2 * useful:
         log.warning(
