@@ -148,6 +148,13 @@ class CommandSampler:
             for k, c in enumerate(commands)
         ]
 
+    def training_command(self, episode_id: int) -> Command:
+        """Return a warm-up or exploratory command again, apart from what it asked for."""
+        iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
+        kind: Kind = "explore" if iteration else "warm_up"
+        n = self._settings.n_episodes_per_iter if iteration else self._settings.n_warm_up_episodes
+        return self._commands(kind, iteration, 0, [(0.0, 0)] * n, TRAINING_SEEDS)[index]
+
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
         first = self._settings.n_episodes_per_iter

@@ -1,25 +1,24 @@
 """Whether two machines round alike, and what a run leaves to the machine that creates it.
 
-A run is exact when the environment replays exactly (:func:`environment_replays`) and when all
-machines round alike: they do when their *numerics class*, the digest of a fixed probe, is the same
+A run is exact when its environment repeats itself (:mod:`udrl.repeating`) and when all machines
+round alike: they do when their *numerics class*, the digest of a fixed probe, is the same
 (:func:`acting_class`, :func:`udrl.training_class.training_class`).
 """
 
 import ctypes
-import hashlib
 from pathlib import Path
 
-from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.commands import TRAINING_SEEDS, Command
-from udrl.config import Config, change, flat
-from udrl.digests import arrays_digest, episode_digest
-from udrl.episode import Episode
-from udrl.inference import Acting, ActingFunction, probe_rows, probe_weights
-from udrl.streams import Purpose, stream_key
+import numpy as np
 
-#: Steps of an episode of the probe, and rows of its logits.
-PROBE_STEPS = 64
+from udrl.actions import ActionSpace
+from udrl.config import Config, change, flat
+from udrl.digests import arrays_digest
+from udrl.inference import ActingFunction, probe_rows, probe_weights
+from udrl.streams import Purpose, Stream, stream_key
+
+#: Rows of the probe's logits, and choices among actions.
 PROBE_ROWS = 16
+PROBE_CHOICES = 64
 
 
 def settle(config: Config) -> Config:
@@ -65,36 +64,16 @@ def _has_cuda() -> bool:
     )
 
 
-def acting_class(config: Config, generator: EpisodeGenerator, graph: bytes) -> str:
-    """Return the numerics class of acting: digest of the probe's logits and of a short episode."""
+def acting_class(graph: bytes, space: ActionSpace) -> str:
+    """Return the numerics class of acting: digest of the probe's logits and choices.
+
+    Args:
+        graph: the acting graph.
+        space: of the actions.
+    """
     function = ActingFunction(graph, probe_weights(graph))
     logits = function.logits(*probe_rows(function, PROBE_ROWS))
-    episode = _short_episode(config, generator, function, index=0)
-    sha = hashlib.sha256(arrays_digest({"logits": logits}))
-    sha.update(episode_digest(episode))
-    return sha.hexdigest()[:16]
-
-
-def environment_replays(config: Config, generator: EpisodeGenerator) -> bool:
-    """Say whether an episode is the same again after another one ran in the same instance."""
-    first = _short_episode(config, generator, None, index=0)
-    _short_episode(config, generator, None, index=1)
-    again = _short_episode(config, generator, None, index=0)
-    return episode_digest(first) == episode_digest(again)
-
-
-def _short_episode(
-    config: Config, generator: EpisodeGenerator, behavior: Acting | None, index: int
-) -> Episode:
-    steps = min(PROBE_STEPS, generator.spec.max_episode_steps)
-    command = Command(
-        id=index,
-        kind="explore",
-        desired_return=1.0 / config.network.return_scale,
-        desired_horizon=steps,
-        environment_seed=TRAINING_SEEDS[0] + index,
-        stream_key=stream_key(0, Purpose.PROBE, 1, index),
-        weights_version=0 if behavior is None else 1,
-        max_steps=steps,
-    )
-    return generate_episodes(generator, [command], behavior)[0]
+    numbers = Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(PROBE_CHOICES)
+    rows = logits[np.arange(PROBE_CHOICES) % PROBE_ROWS].astype(np.float64)
+    actions = space.sample(rows, np.ones((PROBE_CHOICES, 1)), numbers).astype(space.dtype)
+    return arrays_digest({"actions": actions, "logits": logits}).hex()[:16]

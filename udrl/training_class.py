@@ -7,7 +7,7 @@ from udrl.config import Config, change
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.numerics import PROBE_STEPS
+from udrl.repeating import PROBE_STEPS
 from udrl.segments import Experience
 from udrl.spaces import noise
 from udrl.streams import Purpose, Stream, stream_key

@@ -8,6 +8,7 @@ arithmetic.
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -313,11 +314,12 @@ mean. All files here are written by `make.py` and checked by the tests.
 - `choices.json` holds choices of the first action of an episode: the key of its stream, the first
   number u of that, float32 logits, and the action; `half` and `mode` are the actions
   at the temperatures 0.5 and 0, `action` that at 1.
-- `probe.json` holds the first half of the [probe](../README.md#numerics-class), with the graph of
+- `probe.json` holds the [probe](../README.md#numerics-class), with the graph of
   `hello.msgpack`: the digest of its weights, the digest of its rows as the arrays `command` (`<f8`)
-  and `observation`, and the logits of each row. The decimals are exact: read as float32 they give
-  the bits. Another kind of processor or version of ONNX Runtime may differ from them in the last
-  bits, and is then of another numerics class. A difference above 0.00001 is a mistake.
+  and `observation`, the logits of each row, and the 64 actions. The decimals are exact: read as
+  float32 they give the bits. Another kind of processor or version of ONNX Runtime may differ from
+  them in the last bits, and is then of another numerics class. A difference above 0.00001 is a
+  mistake.
 
 """
 
@@ -371,7 +373,7 @@ def choices() -> list[dict[str, Any]]:
     return found
 
 
-def choose(logits: tuple[float, ...], u: float) -> int:
+def choose(logits: Sequence[float], u: float) -> int:
     """Return the action for logits and a number of the stream."""
     total = 0.0
     cumulative = [total := total + math.exp(x - max(logits)) for x in logits]
@@ -383,10 +385,15 @@ def probe() -> dict[str, Any]:
     weights = probe_weights(GRAPH)
     function = ActingFunction(GRAPH, weights)
     observation, command = probe_rows(function, PROBE_ROWS)
+    logits = function.logits(observation, command)
     return {
         "weights": arrays_digest(weights).hex(),
         "rows": arrays_digest({"command": command, "observation": observation}).hex(),
-        "logits": function.logits(observation, command).tolist(),
+        "logits": logits.tolist(),
+        "actions": [
+            choose(logits[k % PROBE_ROWS].tolist(), u)
+            for k, u in enumerate(Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(64).tolist())
+        ],
     }
 
 

@@ -77,6 +77,7 @@ class Hello(Configured, Message, frozen=True, kw_only=True):
         run_id: the run's name in key expressions.
         settings: what the run is, flat.
         environment: what its environment looks like.
+        environment_digest: of a short episode there; empty: it does not repeat itself.
         graph: the acting graph, an ONNX model whose weights have no values (:mod:`udrl.graph`).
         acting_class: numerics class of the actors, set by the first (``docs/protocol.md``).
         training_class: numerics class of the learner, likewise.
@@ -89,6 +90,7 @@ class Hello(Configured, Message, frozen=True, kw_only=True):
     run_id: Name
     settings: FlatSettings = msgspec.field(name="config")
     environment: EnvironmentSpec
+    environment_digest: Text = ""
     graph: Annotated[bytes, Meta(max_length=2**19)]
     acting_class: Text = ""
     training_class: Text = ""
@@ -104,6 +106,7 @@ class JoinRequest(Message, frozen=True, kw_only=True):
         environments: how many an actor steps at once; 0 for a learner.
         numerics_class: digest of its probe.
         environment: what its own copy of the environment looks like; None: it has none.
+        environment_digest: of a short episode there.
     """
 
     role: Role
@@ -114,6 +117,7 @@ class JoinRequest(Message, frozen=True, kw_only=True):
     environments: Annotated[int, Meta(ge=0, le=65_536)] = 0
     numerics_class: Text
     environment: EnvironmentSpec | None = None
+    environment_digest: Text = ""
 
 
 class JoinReply(Message, frozen=True, kw_only=True):

@@ -16,7 +16,8 @@ from udrl.environments.obedience import Obedience
 from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
-from udrl.numerics import acting_class, environment_replays
+from udrl.numerics import acting_class
+from udrl.repeating import environment_digest, environment_repeats
 from udrl.spaces import Vector
 from udrl.training_class import training_class
 
@@ -33,7 +34,7 @@ def settings(environment: str = "CartPole-v1", **values: Any) -> Config:
 @pytest.mark.parametrize("name", ["CartPole-v1", "Figure2-v0", "LunarLander-v3", "Obedience-v0"])
 def test_environments_of_the_paper_and_the_toys_replay(name: str) -> None:
     config = settings(name)
-    assert environment_replays(config, EpisodeGenerator(config, 1))
+    assert environment_repeats(EpisodeGenerator(config, 1))
 
 
 class Drifting(Obedience):
@@ -58,50 +59,50 @@ class Failing(Obedience):
         raise RuntimeError("out of order")
 
 
-def generator_of(env: Callable[..., Environment]) -> tuple[Config, EpisodeGenerator]:
+def generator_of(env: Callable[..., Environment]) -> EpisodeGenerator:
     spec = EnvSpec("Made-v0", entry_point=env, max_episode_steps=16)
-    config = settings()
-    return config, EpisodeGenerator(config, 2, lambda _: gym.make(spec, disable_env_checker=True))
+    return EpisodeGenerator(settings(), 2, lambda _: gym.make(spec, disable_env_checker=True))
 
 
 def test_an_environment_that_remembers_other_episodes_does_not_replay() -> None:
-    assert environment_replays(*generator_of(Obedience))
-    assert not environment_replays(*generator_of(Drifting))
+    assert environment_repeats(generator_of(Obedience))
+    assert not environment_repeats(generator_of(Drifting))
 
 
 def test_an_environment_that_fails_the_probe_is_at_fault() -> None:
     with pytest.raises(EnvironmentFault, match="out of order"):
-        environment_replays(*generator_of(Failing))
+        environment_repeats(generator_of(Failing))
 
 
-def class_of(config: Config, generator: EpisodeGenerator) -> str:
-    return acting_class(config, generator, acting_graph(config.network, generator.spec))
+def class_of(config: Config) -> str:
+    return acting_class(acting_graph(config.network, LANDER), LANDER.action_space)
 
 
-def test_the_acting_class_does_not_depend_on_the_number_of_environments() -> None:
+def test_the_environment_digest_does_not_depend_on_the_number_of_environments() -> None:
     config = settings()
-    assert len({class_of(config, EpisodeGenerator(config, n)) for n in (1, 3, 20)}) == 1
+    digests = {environment_digest(EpisodeGenerator(config, n)) for n in (1, 3, 20)}
+    assert len(digests) == 1
+    assert digests != {environment_digest(generator_of(Obedience))}
 
 
 def test_a_generator_is_as_good_as_new_after_the_probes() -> None:
-    config = settings()
-    generator = EpisodeGenerator(config, 2)
-    first = class_of(config, generator)
-    environment_replays(config, generator)
-    assert class_of(config, generator) == first
+    generator = EpisodeGenerator(settings(), 2)
+    first = environment_digest(generator)
+    assert environment_repeats(generator)
+    assert environment_digest(generator) == first
     assert generator.free == 2
 
 
 def test_the_acting_class_sees_a_change_of_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings()
-    expected = class_of(config, EpisodeGenerator(config, 1))
+    expected = class_of(config)
     logits = ActingFunction.logits
 
     def rounds_otherwise(self: ActingFunction, *rows: Any) -> Any:
         return np.nextafter(logits(self, *rows), np.float32(np.inf))
 
     monkeypatch.setattr(ActingFunction, "logits", rounds_otherwise)
-    assert class_of(config, EpisodeGenerator(config, 1)) != expected
+    assert class_of(config) != expected
 
 
 def test_the_training_class_sees_a_change_of_the_last_bit(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import zenoh
 
+import udrl_actor.service
 from udrl.config import Budget
 from udrl.errors import ConfigError, Refused
 from udrl_actor.service import ActorService
@@ -96,13 +97,23 @@ def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
     assert no.value.code == "other_environment"
 
 
+def test_actor_whose_environment_does_something_else_is_refused(
+    hosted: Hosted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udrl_actor.service, "environment_digest", lambda _: "0123456789abcdef")
+    with pytest.raises(Refused, match=r"gives other observations or rewards.*0123456789abc") as no:
+        actor(hosted)
+    assert no.value.code == "other_environment"
+
+
 @pytest.mark.parametrize(("role", "service"), [("actor", actor), ("learner", learner)])
 def test_peer_that_rounds_differently_is_refused(
     role: Literal["actor", "learner"], service: Callable[[Hosted], None], hosted: Hosted
 ) -> None:
     first = JoinRequest(
-        role=role, id="first", host="here", pid=1, software="0", numerics_class="0123456789abcdef"
-    )
+        role=role, id="first", host="here", pid=1, software="0", numerics_class="0123456789abcdef",
+        environment_digest=hosted.hello.environment_digest,
+    )  # fmt: skip
     hosted.asker.ask(verbs.JOIN, first)
     with pytest.raises(Refused, match=r"class 0123456789abcdef.*like [0-9a-f]{16}.*inexact") as no:
         service(hosted)

@@ -196,24 +196,28 @@ def probe_logits(hello: dict[str, Any]) -> npt.NDArray[Any]:
 
 
 def numerics_class(hello: dict[str, Any]) -> str:
-    spec = hello["environment"]
-    n = min(64, spec["max_episode_steps"])
+    logits = probe_logits(hello)
+    drawn = numbers(stream_key(0, "probe", 3, 0), 64)
+    actions = [choose(logits[k % 16].tolist(), u, 1.0) for k, u in enumerate(drawn)]
+    dtype = "|u1" if logits.shape[1] <= 256 else "<i4"
+    return arrays_digest({"actions": np.array(actions, dtype), "logits": logits}).hex()[:16]
+
+
+def environment_digest(hello: dict[str, Any]) -> str:
+    n = min(64, hello["environment"]["max_episode_steps"])
     command = {
-        "desired_return": 1.0 / hello["config"]["return_scale"],
-        "desired_horizon": n,
+        "desired_return": 0.0,
+        "desired_horizon": 0,
         "max_steps": n,
         "environment_seed": 1_000_000,
         "stream_key": stream_key(0, "probe", 1, 0),
         "temperature": 1.0,
         "cap": None,
         "random_from": 0,
-        "random_steps": 0,
+        "random_steps": n,
         "random_hold": 1,
     }
-    network = Network(hello["graph"], probe_weights(hello["graph"]))
-    episode = run_episode(command, hello, network)
-    digests = arrays_digest({"logits": probe_logits(hello)}) + episode_digest(0, episode)
-    return hashlib.sha256(digests).hexdigest()[:16]
+    return episode_digest(0, run_episode(command, hello, None)).hex()[:16]
 
 
 # The life of an actor.
@@ -257,6 +261,7 @@ def act(session: zenoh.Session) -> int:
         "software": "from the page",
         "environments": 3,
         "numerics_class": numerics_class(hello),
+        "environment_digest": environment_digest(hello),
         "environment": hello["environment"],
     }
     ask(session, f"{run}/join", join)

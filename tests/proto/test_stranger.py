@@ -25,6 +25,7 @@ from udrl.environments import EnvironmentSpec
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import acting_class
+from udrl.repeating import environment_digest
 from udrl.streams import Purpose, stream_key
 from udrl.training import untrained
 from udrl_learner.service import LearnerService
@@ -111,7 +112,8 @@ def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
 def assert_same_class(config: Config) -> None:
     generator = EpisodeGenerator(config, 1)
     said = hello(config, generator.spec)
-    assert stranger.numerics_class(said) == acting_class(config, generator, said["graph"])
+    assert stranger.numerics_class(said) == acting_class(said["graph"], generator.spec.action_space)
+    assert stranger.environment_digest(said) == environment_digest(generator)
     generator.close()
 
 

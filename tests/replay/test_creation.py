@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
 from udrl.config import Budget, Config, build, flat, read_toml
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
+from udrl.repeating import environment_digest
 from udrl.spaces import Category
 from udrl.version import __version__
 from udrl_proto import PROTOCOL, keys
@@ -21,6 +23,7 @@ from udrl_proto.messages import Hello
 from udrl_replay import creation
 from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
+from udrl_replay.resuming import resume
 from udrl_replay.store import Store
 
 TOY = Config(environment="Figure2-v0", max_return=2.0)
@@ -44,6 +47,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
             max_episode_steps=2,
             max_return=2.0,
         ),
+        environment_digest=environment_digest(EpisodeGenerator(TOY, 1)),
         graph=acting_graph(TOY.network, hello.environment),
     )
     assert created.fact("progress", Progress) == Progress()
@@ -52,11 +56,13 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
 def test_environment_that_does_not_replay_marks_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(creation, "environment_replays", lambda config, generator: False)
+    monkeypatch.setattr(creation, "environment_repeats", lambda generator: False)
     with closing(creation.create(tmp_path, TOY)) as store:
         progress = store.fact("progress", Progress)
         assert not progress.exact
-        assert not store.fact("hello", Hello).exact
+        hello = store.fact("hello", Hello)
+        assert not hello.exact
+        assert hello.environment_digest == "", "nothing to compare actors by"
     reason = "environment Figure2-v0 does not repeat an episode from its seed"
     assert progress.inexact_reason == reason
     assert reason in caplog.text
@@ -77,7 +83,7 @@ def test_run_exists_once_it_is_created(created: Store, tmp_path: Path) -> None:
 def test_run_is_resumed_with_its_configuration(created: Store, tmp_path: Path) -> None:
     hello = created.fact("hello", Hello)
     created.close()
-    with closing(creation.resume(tmp_path, TOY)) as store:
+    with closing(resume(tmp_path, TOY)) as store:
         assert store.fact("hello", Hello) == hello
 
 
@@ -88,14 +94,14 @@ def test_other_configuration_is_refused_with_both_values(created: Store, tmp_pat
     )
     expected = r"seed = 1, not 7; hidden = \[32, 128, 128, 128\], not \[8\]; use its configuration"
     with pytest.raises(OtherConfiguration, match=expected):
-        creation.resume(tmp_path, other)
+        resume(tmp_path, other)
     # The refusal has let go of the lock.
-    creation.resume(tmp_path, TOY).close()
+    resume(tmp_path, TOY).close()
 
 
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=rf"holds no run \({FILE} is missing\)"):
-        creation.resume(tmp_path, TOY)
+        resume(tmp_path, TOY)
 
 
 @pytest.mark.parametrize("name", ["run", "My Run.2", "-", "x" * 200, "läufe", "a" * 49 + "--b"])
@@ -126,7 +132,7 @@ def test_directory_says_what_the_run_is() -> None:
 def test_resumed_run_may_allow_what_it_did_not_before(created: Store, tmp_path: Path) -> None:
     created.close()
     for allow_inexact in (True, False):
-        with closing(creation.resume(tmp_path, TOY, allow_inexact=allow_inexact)) as store:
+        with closing(resume(tmp_path, TOY, allow_inexact=allow_inexact)) as store:
             assert store.fact("hello", Hello).allow_inexact
 
 

@@ -11,6 +11,7 @@ from udrl.acting import EpisodeGenerator, Failure
 from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
+from udrl.repeating import environment_digest
 from udrl.version import __version__
 from udrl_actor.courier import Courier
 from udrl_actor.outbox import Outbox, deliver
@@ -76,8 +77,9 @@ class ActorService:
                 pid=os.getpid(),
                 software=__version__,
                 environments=self._environments,
-                numerics_class=acting_class(config, generator, self._hello.graph),
+                numerics_class=acting_class(self._hello.graph, generator.spec.action_space),
                 environment=generator.spec,
+                environment_digest=environment_digest(generator),
             )
             asker.ask(verbs.JOIN, join)
             token = self._transport.appear(keys.alive(run_id, "actor", self._name))

@@ -23,7 +23,7 @@ from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
 from udrl_proto.reports import Status, StatusRequest
-from udrl_replay.creation import config_of, create, exists, resume, write_config
+from udrl_replay.creation import open_run
 from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run
 
@@ -114,13 +114,9 @@ def train(
     if keys is not None:
         for role in ROLES:
             load(keys, role)
-    if go_on and exists(run_dir):
-        store = resume(run_dir, config, allow_inexact=allow_inexact)
-    else:
-        store = create(run_dir, config, allow_inexact=allow_inexact)
+    store = open_run(run_dir, config, budget, go_on=go_on, allow_inexact=allow_inexact)
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
-        write_config(run_dir, config_of(store), budget)
         progress = Run(store, budget).progress
         if progress.state == "ended":
             write_weights(run_dir, store, progress.latest_version)

@@ -21,6 +21,8 @@ def admit(run: Run, request: JoinRequest) -> None:
             f"the run's environment is {hello.environment}, yours is {request.environment}; "
             f"install the same version of the package that provides {hello.config.environment}",
         )
+    if request.role == "actor":
+        _compare_environments(run, request)
     _settle_numerics(run, request)
     if request.role == "actor":
         if request.id in run.quarantined:
@@ -31,6 +33,22 @@ def admit(run: Run, request: JoinRequest) -> None:
                 f"{MOST_ACTORS} actors have joined, which is the most; give fewer actors more "
                 f"environments (--envs)",
             )
+
+
+def _compare_environments(run: Run, request: JoinRequest) -> None:
+    """Compare what the environments do, where that is more than chance."""
+    hello, found = run.hello, request.environment_digest
+    if not hello.environment_digest or found == hello.environment_digest:
+        return
+    if not hello.allow_inexact:
+        raise Refused(
+            "other_environment",
+            f"the environment {hello.config.environment} gives other observations or rewards "
+            f"on {request.host} than where the run was created (a short episode has the digest "
+            f"{found or 'of nothing'}, not {hello.environment_digest}); install the same version "
+            f"of its package and of what it computes with, or create the run with --allow-inexact",
+        )
+    run.mark_inexact(f"the environment of actor {request.id} does something else")
 
 
 def _settle_numerics(run: Run, request: JoinRequest) -> None:

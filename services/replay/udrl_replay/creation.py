@@ -3,8 +3,7 @@
 import logging
 import re
 import uuid
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -13,10 +12,11 @@ import msgspec
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config, flat
 from udrl.episode import Episode
-from udrl.errors import OtherConfiguration, StoreError
+from udrl.errors import StoreError
 from udrl.graph import acting_graph
-from udrl.numerics import environment_replays, settle, settle_as
+from udrl.numerics import settle
 from udrl.offline import settle_dataset
+from udrl.repeating import environment_digest, environment_repeats
 from udrl.strategies import make_strategy
 from udrl.version import __version__
 from udrl_proto import PROTOCOL
@@ -25,6 +25,7 @@ from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect
 from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
+from udrl_replay.resuming import closed_on_error, resume
 from udrl_replay.run import Run
 from udrl_replay.store import Store
 
@@ -74,7 +75,8 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:
         config, offline = settle_dataset(config, generator.spec)
-        exact = environment_replays(config, generator)
+        exact = environment_repeats(generator)
+        digest = environment_digest(generator) if exact else ""
     progress = Progress(exact=exact)
     if not exact:
         progress.inexact_reason = (
@@ -87,13 +89,14 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
         run_id=_run_id(run_dir),
         settings=flat(config),
         environment=generator.spec,
+        environment_digest=digest,
         graph=acting_graph(config.network, generator.spec),
         allow_inexact=allow_inexact,
         exact=exact,
     )
     store = Store.create(run_dir, hello=hello, progress=progress)
     if offline is not None:
-        with _closed_on_error(store):
+        with closed_on_error(store):
             _begin_with(store, offline)
     return store
 
@@ -109,35 +112,37 @@ def _begin_with(store: Store, episodes: list[Episode]) -> None:
         run.save()
 
 
-def resume(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:
-    """Open a run to go on with it; ``allow_inexact`` from now on, if it was not before.
+def open_run(
+    run_dir: Path,
+    config: Config,
+    budget: Budget,
+    *,
+    go_on: bool,
+    allow_inexact: bool = False,
+    check_environment: bool = True,
+) -> Store:
+    """Make a new run, or open the one that is there, and write its configuration beside it.
+
+    Args:
+        run_dir: its directory.
+        config: what it is.
+        budget: when it ends.
+        go_on: go on with the run in ``run_dir``, if there is one.
+        allow_inexact: as for :func:`create` and :func:`resume`.
+        check_environment: as for :func:`resume`.
 
     Raises:
-        StoreError: there is none, it is in use, or its configuration is another one.
+        UdrlError: as :func:`create`, :func:`resume` and :func:`write_config`.
     """
-    store = Store(run_dir)
-    with _closed_on_error(store):
-        hello = store.fact("hello", Hello)
-        held, asked = flat(hello.config), flat(settle_as(hello.config, config))
-        different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
-        if different:
-            raise OtherConfiguration(
-                f"{run_dir} belongs to a run with {'; '.join(different)}; use its "
-                f"configuration, or name another --run-dir"
-            )
-        if allow_inexact and not hello.allow_inexact:
-            with store.transaction():
-                store.set_fact("hello", msgspec.structs.replace(hello, allow_inexact=True))
+    if go_on and exists(run_dir):
+        store = resume(
+            run_dir, config, allow_inexact=allow_inexact, check_environment=check_environment
+        )
+    else:
+        store = create(run_dir, config, allow_inexact=allow_inexact)
+    with closed_on_error(store):
+        write_config(run_dir, config_of(store), budget)
     return store
-
-
-@contextmanager
-def _closed_on_error(store: Store) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        store.close()
-        raise
 
 
 def config_of(store: Store) -> Config:

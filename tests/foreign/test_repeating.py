@@ -1,0 +1,117 @@
+"""Environments that do not repeat themselves, or have changed since a run was created."""
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import udrl
+from tests.foreign.conventions import Plain, register
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.commands import Command
+from udrl.config import Config, build
+from udrl.errors import OtherConfiguration
+from udrl.repeating import difference
+from udrl.streams import Purpose, stream_key
+from udrl_inspect.inspection import read_status
+from udrl_proto.messages import Hello
+from udrl_proto.reports import Status
+from udrl_replay.resuming import resume
+from udrl_replay.store import Store
+
+SMALL: dict[str, Any] = {
+    "preset": "none", "hidden": [8], "n_warm_up_episodes": 4, "n_episodes_per_iter": 2,
+    "n_updates_per_iter": 2, "batch_size": 16, "replay_size": 10, "last_few": 2,
+    "eval_episodes": 2, "eval_every": 1000, "actors": 1, "envs_per_actor": 2,
+}  # fmt: skip
+
+
+class Unseeded(Plain):
+    def reset(self, **_: Any) -> Any:
+        return super().reset(seed=None)
+
+
+class Changing(Plain):
+    """Eighty steps, of which those from ``late`` on pay what is paid today."""
+
+    late, today = 0, 1.0
+
+    def pay(self, action: Any) -> float:
+        return float(action) * (self.today if self.t > self.late else 1.0)
+
+    def over(self) -> bool:
+        return self.t >= 80
+
+
+class ChangingLate(Changing):
+    late = 70
+
+
+def train(kind: type[Plain], run_dir: Path, **more: Any) -> Status:
+    name = register(kind, max_steps=100)
+    return udrl.train(name, run_dir=run_dir, **SMALL | {"max_env_steps": 400} | more).status
+
+
+def test_run_of_an_unseeded_environment_goes_on_with_other_actors(tmp_path: Path) -> None:
+    train(Unseeded, tmp_path / "run")
+    status = train(Unseeded, tmp_path / "run", resume=True, max_env_steps=800, actors=2)
+    assert status.state == "ended"
+    assert not status.exact
+    assert "does not repeat an episode from its seed" in status.inexact_reason
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        (Changing, "its first steps are others"),
+        (ChangingLate, r"in episode \d+ step 7\d gives the reward 10, it gave 1"),
+    ],
+)
+def test_changed_environment_is_found_when_a_run_goes_on(
+    kind: type[Changing], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(kind, tmp_path / "run")
+    monkeypatch.setattr(kind, "today", 10.0)
+    with pytest.raises(OtherConfiguration, match=rf"has changed .*{says}.*--allow-inexact"):
+        train(kind, tmp_path / "run", resume=True, max_env_steps=800)
+    assert read_status(tmp_path / "run").exact, "nothing of what it does now is in the run"
+
+    with closing(Store(tmp_path / "run", read_only=True)) as store:
+        config = store.fact("hello", Hello).config
+    resume(tmp_path / "run", config, allow_inexact=True).close()
+    status = train(kind, tmp_path / "run", resume=True, max_env_steps=800)
+    assert status.state == "ended"
+    assert not status.exact
+    assert "has changed" in status.inexact_reason
+
+
+def test_difference_is_the_first_step_that_is_another() -> None:
+    config = build(Config, {"environment": register(Changing, max_steps=100)})
+    command = Command(
+        id=0, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=7,
+        stream_key=stream_key(1, Purpose.EPISODE, 0, 0), weights_version=0, max_steps=90,
+    )  # fmt: skip
+    with closing(EpisodeGenerator(config, 1)) as generator:
+        (episode,) = generate_episodes(generator, [command], None)
+
+    def found(**changes: Any) -> str | None:
+        return difference(config, replace(episode, **changes), 7, 90)
+
+    def changed(values: Any, step: int) -> Any:
+        copy = values.copy()
+        copy[step] += 1
+        return copy
+
+    assert found() is None
+    paid = episode.rewards[41]
+    says = f"step 41 gives the reward {paid:g}, it gave {paid + 1:g}"
+    assert found(rewards=changed(episode.rewards, 41)) == says
+    assert (
+        found(observations=changed(episode.observations, 3)) == "step 3 shows another observation"
+    )
+    assert found(terminated=False, truncated=True) == "step 79 ends the episode otherwise"
+    short = {name: getattr(episode, name)[:50] for name in ("observations", "actions", "rewards")}
+    assert found(**short) == "step 49 ends the episode otherwise"
+    assert difference(config, episode, 8, 90) == "step 0 shows another observation"
