@@ -25,7 +25,7 @@ def settle(config: Config) -> Config:
     """Return the settings of a new run: what says ``auto`` is chosen for this machine."""
     device, precision = config.arithmetic.device, config.arithmetic.precision
     if device == "auto":
-        device = "cuda" if _has_cuda() else "cpu"
+        device = "cuda" if has_cuda() else "cpu"
     if precision == "auto":
         precision = "bfloat16" if _is_fast_in_bfloat16() else "float32"
     return change(config, device=device, precision=precision)
@@ -50,7 +50,7 @@ def _is_fast_in_bfloat16() -> bool:
     return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 
-def _has_cuda() -> bool:
+def has_cuda() -> bool:
     """Ask the driver for GPUs; whoever creates a run may have no torch."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")

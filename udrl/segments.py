@@ -15,14 +15,18 @@ from udrl.actions import Actions
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.errors import ConfigError
 from udrl.memory import FrameStack
 from udrl.spaces import Observations
 from udrl.targets import Desired, ReturnInTime
 
 _PAGE = 64
+#: Pages that there are at least, once there are any.
+_FIRST_PAGES = 256
 
 Indices = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.float64]
+Array = npt.NDArray[Any]
 
 
 class Segments(NamedTuple):
@@ -81,27 +85,26 @@ class Experience:
     """The steps of the buffer's episodes in flat arrays, from which examples are gathered.
 
     Steps lie in pages of 64, handed out and taken back as episodes come and go, so that neither
-    copies what stays. The arrays are allocated for the worst case; the operating system provides
-    memory for pages when they are first written.
+    copies what stays. There are as many pages as were needed so far, at most twice; step limits
+    are often far beyond what episodes last.
+
+    Raises:
+        ConfigError: there is not enough memory for what is needed.
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
-        longest = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
-        pages_per_episode = -(-longest // _PAGE)
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
-        n_pages = n_episodes * pages_per_episode
-        steps = n_pages * _PAGE
         seen, acted = spec.observation_space, spec.action_space
         self._memory = FrameStack(seen, config.network.frame_stack)
-        self._observations = np.empty((steps, *seen.shape), seen.dtype)
-        self._actions = np.empty((steps, *acted.shape), acted.dtype)
-        self._earned = np.empty(steps)  # P[t]: rewards earned before step t
-        self._page_table = np.zeros((n_episodes, pages_per_episode), np.int64)
+        self._observations = np.empty((0, *seen.shape), seen.dtype)
+        self._actions = np.empty((0, *acted.shape), acted.dtype)
+        self._earned = np.empty(0)  # P[t]: rewards earned before step t
+        self._page_table = np.zeros((n_episodes, 1), np.int64)
         self._lengths = np.zeros(n_episodes, np.int64)
         self._returns = np.zeros(n_episodes)
         self._truncated = np.zeros(n_episodes, np.bool_)
         self._free_slots = list(range(n_episodes))[::-1]
-        self._free_pages = list(range(n_pages))[::-1]
+        self._free_pages: list[int] = []
         self._places: dict[int, _Place] = {}
 
     def __contains__(self, episode_id: int) -> bool:
@@ -115,6 +118,7 @@ class Experience:
         """Take in an episode; there must be room (remove the evicted first)."""
         slot = self._free_slots.pop()
         count = -(-episode.length // _PAGE)
+        self._make_room(count)
         pages = np.array([self._free_pages.pop() for _ in range(count)], np.int64)
         rows = (pages[:, None] * _PAGE + np.arange(_PAGE)).reshape(-1)[: episode.length]
         self._observations[rows] = episode.observations
@@ -126,6 +130,26 @@ class Experience:
         self._truncated[slot] = episode.truncated
         self._places[episode.command_id] = _Place(slot, pages)
 
+    def _make_room(self, count: int) -> None:
+        """See to it that an episode of ``count`` pages can be taken in."""
+        width = self._page_table.shape[1]
+        if count > width:
+            wider = max(count, 2 * width) - width
+            self._page_table = np.pad(self._page_table, ((0, 0), (0, wider)))
+        there = len(self._earned) // _PAGE
+        if count > len(self._free_pages):
+            more = max(count - len(self._free_pages), there, _FIRST_PAGES)
+            try:
+                self._observations = _longer(self._observations, more * _PAGE)
+                self._actions = _longer(self._actions, more * _PAGE)
+                self._earned = _longer(self._earned, more * _PAGE)
+            except MemoryError as error:
+                raise ConfigError(
+                    f"the learner needs memory for {(there + more) * _PAGE:,} steps and has not "
+                    f"got it; lower replay_size, recent_size or max_train_steps"
+                ) from error
+            self._free_pages[:0] = range(there, there + more)[::-1]
+
     def remove(self, episode_id: int) -> None:
         """Forget an episode."""
         place = self._places.pop(episode_id)
@@ -136,6 +160,13 @@ class Experience:
         """Return a view in which episodes go by their rank in the buffer, given as ids."""
         slots = np.array([self._places[i].slot for i in ids], np.int64)
         return RankedExperience(self, slots)
+
+
+def _longer(array: Array, more: int) -> Array:
+    """Return an array with room for ``more`` rows behind its own."""
+    longer = np.empty((len(array) + more, *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer
 
 
 class RankedExperience:

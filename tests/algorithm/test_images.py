@@ -183,6 +183,17 @@ def test_buffer_keeps_single_frames() -> None:
     """500 episodes of 800 steps take at most 0.6 GB, in pages that are taken as they fill."""
     config = settings(replay_size=500)
     experience = Experience(config, TAKE_COVER)
+    seen, done = TAKE_COVER.observation_space, TAKE_COVER.action_space
+    experience.add(
+        Episode(
+            command_id=0,
+            observations=np.zeros((800, *seen.shape), seen.dtype),
+            actions=np.zeros(800, done.dtype),
+            rewards=np.zeros(800, np.float32),
+            terminated=True,
+            truncated=False,
+        )
+    )
     kept = [a for a in vars(experience).values() if isinstance(a, np.ndarray)]
     per_step = sum(a.nbytes for a in kept) / len(experience._observations)
     in_pages = -(-800 // 64) * 64
@@ -196,7 +207,7 @@ def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch
     automatic = settings(precision="auto", device="auto")
     for fast, cuda in ((True, False), (False, True)):
         monkeypatch.setattr(numerics, "_is_fast_in_bfloat16", lambda fast=fast: fast)
-        monkeypatch.setattr(numerics, "_has_cuda", lambda cuda=cuda: cuda)
+        monkeypatch.setattr(numerics, "has_cuda", lambda cuda=cuda: cuda)
         settled = settle(automatic)
         assert settled.arithmetic.precision == ("bfloat16" if fast else "float32")
         assert settled.arithmetic.device == ("cuda" if cuda else "cpu")

@@ -1,6 +1,7 @@
 from fractions import Fraction
 from itertools import combinations
 from typing import Any, Literal
+from unittest import mock
 
 import numpy as np
 import numpy.typing as npt
@@ -9,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from udrl import segments
 from udrl.actions import Categorical
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.errors import ConfigError
 from udrl.segments import Experience, Segments, draw_segments
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
@@ -174,8 +177,12 @@ def test_segments_keep_the_shape_of_the_numbers_they_are_made_of(kind: Kind) -> 
         np.testing.assert_array_equal(one.reshape(2, 3), other)
 
 
+@pytest.mark.parametrize("first_pages", [1, 256])
 @pytest.mark.parametrize("length", [1, 63, 64, 65, 128, 200])
-def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(length: int) -> None:
+def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(
+    length: int, first_pages: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segments, "_FIRST_PAGES", first_pages)
     held = experience(replay_size=3, max_steps=200)
     episodes = {i: random_episode(i, n) for i, n in enumerate([200, length, 200])}
     for episode in episodes.values():
@@ -190,6 +197,23 @@ def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(length: int
     assert gathered(held, [0, 1, 2], wanted) == expected
 
 
+def test_memory_is_taken_by_need_whatever_the_step_limit() -> None:
+    held = experience(replay_size=500, max_steps=2**31)
+    for i in range(20):
+        held.add(random_episode(i, 100))
+    assert sum(a.nbytes for a in vars(held).values() if isinstance(a, np.ndarray)) < 1e6
+
+
+def test_too_little_memory_is_refused_with_what_to_lower(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(array: Any, more: int) -> Any:
+        raise MemoryError
+
+    held = experience(replay_size=3, max_steps=200)
+    monkeypatch.setattr(segments, "_longer", none_left)
+    with pytest.raises(ConfigError, match=r"memory for 16,384 steps.*lower replay_size"):
+        held.add(random_episode(1, 100))
+
+
 class ExperienceAsADictionary(RuleBasedStateMachine):
     """Episodes come and go at random; what is held must be what a dictionary would hold."""
 
@@ -197,9 +221,14 @@ class ExperienceAsADictionary(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
+        self.few = mock.patch.object(segments, "_FIRST_PAGES", 1)
+        self.few.start()
         self.held = experience(self.replay_size, self.max_steps)
         self.model: dict[int, Episode] = {}
         self.next_id = 0
+
+    def teardown(self) -> None:
+        self.few.stop()
 
     @precondition(lambda self: len(self.model) < self.replay_size)
     @rule(length=st.integers(1, max_steps))

@@ -8,6 +8,8 @@ import threading
 import time
 
 from udrl.acting import EpisodeGenerator, Failure
+from udrl.config import Config
+from udrl.environments.making import Environment, make_environment
 from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
@@ -25,6 +27,8 @@ log = logging.getLogger("udrl")
 #: How often the watchdog is told that all is well, as a part of its patience: it starts a thread
 #: each time, which at four times a second took 2 % of an actor's time.
 _REARM_PART = 0.05
+#: Seconds that making an environment may take at least.
+_MAKING_S = 300.0
 
 
 class ActorService:
@@ -37,7 +41,7 @@ class ActorService:
         environments: how many to step at once.
         stop: ends everything.
         hang_s: end the whole process, from outside Python, when a round of environment steps takes
-            so many seconds; None: do not.
+            so many seconds (five minutes at least for making an environment); None: do not.
     """
 
     def __init__(
@@ -65,8 +69,8 @@ class ActorService:
             Unreachable: the replay service has not answered for long.
         """
         config, run_id = self._hello.config, self._hello.run_id
+        generator = EpisodeGenerator(config, self._environments, self._make)
         self._arm()
-        generator = EpisodeGenerator(config, self._environments)
         asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
@@ -128,6 +132,14 @@ class ActorService:
                 self._arm()
                 armed = now
         courier.join(timeout=5.0)
+
+    def _make(self, config: Config) -> Environment:
+        """Make an environment, which may take longer than a step: simulators have to start."""
+        if self._hang_s is not None:
+            faulthandler.dump_traceback_later(max(self._hang_s, _MAKING_S), exit=True)
+        env = make_environment(config)
+        self._arm()
+        return env
 
     def _arm(self) -> None:
         if self._hang_s is not None:

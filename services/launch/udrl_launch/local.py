@@ -75,6 +75,7 @@ class Processes:
             start(
                 f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
                 "--nice", "10", "--patience", _PATIENCE_S,
+                "--hang-timeout", f"{fleet.hang_timeout:g}",
             )  # fmt: skip
 
     @property

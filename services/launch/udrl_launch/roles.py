@@ -6,8 +6,9 @@ from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
-from udrl.config import Budget
+from udrl.config import Budget, Config
 from udrl.errors import ConfigError, Deceived, RunFailed
+from udrl.numerics import has_cuda
 from udrl_actor.service import ActorService
 from udrl_inspect.address import Address, announced, connected, unique_name
 from udrl_proto import session as sessions
@@ -66,12 +67,30 @@ def require_torch() -> None:
         raise ConfigError('training needs torch; install it with: pip install "udrl[train]"')
 
 
+def require_device(config: Config) -> None:
+    """Refuse to train on a device that is not here.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if config.arithmetic.device == "cuda" and not has_cuda():
+        raise ConfigError(
+            "device = 'cuda': there is no GPU here that its driver knows; train on a machine that "
+            "has one, or set device = 'cpu'"
+        )
+
+
 def learner(address: Address, stop: threading.Event) -> None:
-    """Train the run at an address until it has ended."""
+    """Train the run at an address until it has ended.
+
+    Raises:
+        ConfigError: torch or the run's device is not here.
+    """
     require_torch()
     from udrl_learner.service import LearnerService  # the only one that needs torch
 
     with connected("learner", address, stop) as (transport, hello):
+        require_device(hello.config)
         LearnerService(transport, hello, unique_name("learner"), stop).run()
 
 

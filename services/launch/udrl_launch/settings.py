@@ -34,10 +34,13 @@ class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     Attributes:
         actors: actor processes on this machine.
         envs_per_actor: environments that each steps at once.
+        hang_timeout: seconds of one round of steps after which an actor ends and is started again.
+            Making an environment may take five minutes, or as long as this if that is more.
     """
 
     actors: Annotated[int, Meta(ge=0, le=1024)] = 2
     envs_per_actor: Annotated[int, Meta(ge=1, le=4096)] = 16
+    hang_timeout: Annotated[float, Meta(ge=1, le=86_400)] = 60.0
 
 
 def _from_file(file: Path, environment: str) -> dict[str, Any]:

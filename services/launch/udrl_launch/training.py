@@ -15,7 +15,7 @@ from udrl_inspect.address import Address, connected
 from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.paths import shown
-from udrl_launch.roles import require_torch
+from udrl_launch.roles import require_device, require_torch
 from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto import verbs
@@ -109,6 +109,7 @@ def train(
     """
     require_torch()
     config, budget, _ = settings
+    require_device(config)
     endpoint = listen or f"{'tls' if keys else 'tcp'}/127.0.0.1:{free_port()}"
     sessions.check_endpoint(endpoint, secure=keys is not None)
     if keys is not None:

@@ -32,6 +32,9 @@ log = logging.getLogger("udrl")
 @settings_options
 @click.option("--actors", type=int, help="Actor processes on this machine.")
 @click.option("--envs-per-actor", type=int, help="Environments that each actor steps at once.")
+@click.option("--hang-timeout", type=click.FloatRange(1),
+              help="Seconds of one round of steps after which an actor is started again.  "
+              "[default: 60]")  # fmt: skip
 @click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
 @click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
 @click.option("--in-process", is_flag=True, help="All services in one process.")
