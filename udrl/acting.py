@@ -54,6 +54,7 @@ class EpisodeGenerator:
         config: the run's settings.
         n_environments: episodes that can run at the same time.
         make: makes one environment.
+        first_index: of the environments (:data:`udrl.rows.INDEX`).
 
     Attributes:
         spec: of the environments.
@@ -67,8 +68,9 @@ class EpisodeGenerator:
         config: Config,
         n_environments: int,
         make: Callable[[Config], Environment] = make_environment,
+        first_index: int = 0,
     ) -> None:
-        self._rows = Rows(config, n_environments, make)
+        self._rows = Rows(config, n_environments, make, first_index)
         self.spec = self._rows.spec
         self._memory = FrameStack(self.spec.observation_space, config.network.frame_stack)
         # What the networks see where it is no more than what is observed.

@@ -34,8 +34,13 @@ from udrl.setting_groups import (
 )
 
 KeywordValue = bool | int | float | str
+# Lists and tables of these, and so on, a few levels deep: from a peer it could be thousands.
+_Inner = KeywordValue | list[KeywordValue] | dict[str, KeywordValue]
+_Outer = KeywordValue | list[_Inner] | dict[str, _Inner]
+#: Keyword arguments for an environment.
+Keywords = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer]]
 #: Settings as they are sent and stored: by name, without their groups.
-FlatSettings = dict[str, KeywordValue | list[int] | dict[str, KeywordValue] | None]
+FlatSettings = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer] | None]
 
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
@@ -64,7 +69,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
     """
 
     environment: Annotated[str, Meta(min_length=1, max_length=200)]
-    environment_kwargs: dict[str, KeywordValue] = {}
+    environment_kwargs: Keywords = {}
     max_episode_steps: PositiveInt | None = None
     max_train_steps: PositiveInt | None = None
     max_return: float | None = None

@@ -1,5 +1,7 @@
 """Many environments side by side, stepped one after another in one thread."""
 
+import os
+import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,6 +17,12 @@ from udrl.environments.making import (
     specify,
 )
 from udrl.spaces import Observations
+
+#: The environment variable that holds an environment's index while it is made: no other that a run
+#: has on the same machine has the same.
+INDEX = "UDRL_ENVIRONMENT_INDEX"
+
+_making = threading.RLock()
 
 
 class Step(NamedTuple):
@@ -36,6 +44,7 @@ class Rows:
         config: the run's settings.
         n: how many.
         make: makes one of them.
+        first_index: what the first of them is told that its index is (:data:`INDEX`).
 
     Attributes:
         spec: of the environments.
@@ -51,10 +60,12 @@ class Rows:
         config: Config,
         n: int,
         make: Callable[[Config], Environment] = make_environment,
+        first_index: int = 0,
     ) -> None:
         self._config = config
         self._make = make
-        self._envs = [make(config) for _ in range(n)]
+        self._first_index = first_index
+        self._envs = [self._made(row) for row in range(n)]
         self.spec: EnvironmentSpec = specify(self._envs[0], config)
         self._limits = [self.spec.max_episode_steps] * n
         space = self.spec.observation_space
@@ -99,8 +110,17 @@ class Rows:
     def replace(self, row: int) -> None:
         """Make an environment anew that can no longer be trusted."""
         self._envs[row].close()
-        self._envs[row] = self._make(self._config)
+        self._envs[row] = self._made(row)
         self._limits[row] = self.spec.max_episode_steps
+
+    def _made(self, row: int) -> Environment:
+        """Make an environment that can learn its index, e.g. for a port of its own."""
+        with _making:
+            os.environ[INDEX] = str(self._first_index + row)
+            try:
+                return self._make(self._config)
+            finally:
+                del os.environ[INDEX]
 
     def close(self) -> None:
         """Close all environments."""

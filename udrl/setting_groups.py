@@ -5,7 +5,8 @@ names.
 """
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -26,9 +27,17 @@ class SettingsGroup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def __post_init__(self) -> None:
         for name, value in msgspec.structs.asdict(self).items():
-            for number in value.values() if isinstance(value, dict) else [value]:
-                if isinstance(number, float) and not math.isfinite(number):
-                    raise ConfigError(f"{name} = {value}: must be a finite number")
+            if not all(map(math.isfinite, _floats(value))):
+                raise ConfigError(f"{name} = {value}: must be a finite number")
+
+
+def _floats(value: Any) -> Iterator[float]:
+    """Yield the floats in a value, however deep."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _floats(part)
 
 
 class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):

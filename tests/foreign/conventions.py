@@ -264,7 +264,7 @@ REFUSED: dict[type[Plain], tuple[str, str]] = {
 }
 
 
-def register(kind: Callable[..., gym.Env[Any, Any]], max_steps: int = 50) -> str:
+def register(kind: Callable[..., gym.Env[Any, Any]], max_steps: int | None = 50) -> str:
     """Let Gymnasium know an environment; return its id."""
     name = f"{getattr(kind, '__name__', 'Some')}-v0"
     gym.registry.pop(name, None)

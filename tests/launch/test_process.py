@@ -1,4 +1,5 @@
 import platform
+import signal
 import subprocess
 import sys
 
@@ -44,3 +45,57 @@ def test_freed_memory_is_kept() -> None:
     assert page_faults(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
     # The control: 64 MB are 16,384 pages.
     assert page_faults(PROGRAM.replace("KEEP", "")) > 1000
+
+
+SERVICE = """
+import signal, sys, threading, time
+from udrl.errors import Interrupted, StoreError
+from udrl_launch.process import log_to_stderr, run_service
+
+log_to_stderr()
+
+def service(stop):
+    assert threading.current_thread() is threading.main_thread()
+    signal.signal(signal.SIGUSR1, lambda *_: None)  # as some environments do
+    print("up", flush=True)
+    BODY
+
+sys.exit(run_service(service))
+"""
+
+
+def ended(body: str, *signals: int) -> tuple[int, str]:
+    """Run a service and send it signals once it is up; return its exit code and its log."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVICE.replace("BODY", body)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        for number in signals:
+            process.send_signal(number)
+        _, said = process.communicate(timeout=30)
+    return process.returncode, said
+
+
+def test_service_has_the_main_thread_and_its_error_is_the_exit_code() -> None:
+    assert ended("pass") == (0, "")
+    code, said = ended("raise StoreError('the disk is gone')")
+    assert code == 8
+    assert "ERROR   the disk is gone" in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_stops_a_service(number: signal.Signals) -> None:
+    code, said = ended("assert stop.wait(20)", number)
+    assert code == 128 + number
+    assert "stopped" in said
+    code, said = ended("assert stop.wait(20); raise Interrupted('in the middle')", number, number)
+    assert code == 128 + number
+    assert "in the middle" in said
+
+
+def test_service_that_does_not_listen_is_abandoned() -> None:
+    code, said = ended("time.sleep(20)", signal.SIGTERM)
+    assert code == 128 + signal.SIGTERM
+    assert "did not end in 4 s and is abandoned" in said

@@ -12,7 +12,7 @@ from msgspec import inspect
 
 from tests.proto.strategies import MESSAGES, setting_fields
 from udrl.commands import Command
-from udrl.config import Config, FlatSettings
+from udrl.config import Config, FlatSettings, Keywords
 from udrl.environments import EnvironmentSpec
 from udrl_proto import PROTOCOL, keys, verbs
 
@@ -76,6 +76,8 @@ def described(kind: inspect.Type) -> str:
             return f"array of {described(item)}{limit}"
         case inspect.DictType() if kind == inspect.type_info(FlatSettings):
             return "[Config](#config)"
+        case inspect.DictType() if kind == inspect.type_info(Keywords):
+            return "map of text to true or false, number or text, or arrays and maps of these"
         case inspect.DictType(key_type=key, value_type=value):
             return f"map of {described(key)} to {described(value)}"
         case inspect.StructType(cls=cls):

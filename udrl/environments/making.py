@@ -117,8 +117,8 @@ def _remedy(error: Exception, config: Config) -> str:
         return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
     if threading.current_thread() is not threading.main_thread() and _is_of_threads(text):
         return (
-            "it has to be made in the main thread of a process; train with a process for each "
-            "service (in Python: in_process=False)"
+            "it has to be made in the main thread of a process: train without --in-process (in "
+            "Python: in_process=False), and watch it with udrl play instead of the board"
         )
     if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
         return (

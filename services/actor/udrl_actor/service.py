@@ -42,6 +42,7 @@ class ActorService:
         stop: ends everything.
         hang_s: end the whole process, from outside Python, when a round of environment steps takes
             so many seconds (five minutes at least for making an environment); None: do not.
+        first_index: of its environments (:data:`udrl.rows.INDEX`).
     """
 
     def __init__(
@@ -52,7 +53,9 @@ class ActorService:
         environments: int,
         stop: threading.Event,
         hang_s: float | None = None,
+        first_index: int = 0,
     ) -> None:
+        self._first_index = first_index
         self._transport = transport
         self._hello = hello
         self._name = name
@@ -69,7 +72,7 @@ class ActorService:
             Unreachable: the replay service has not answered for long.
         """
         config, run_id = self._hello.config, self._hello.run_id
-        generator = EpisodeGenerator(config, self._environments, self._make)
+        generator = EpisodeGenerator(config, self._environments, self._make, self._first_index)
         self._arm()
         asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None

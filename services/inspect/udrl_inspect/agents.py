@@ -106,7 +106,8 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
     behavior = load_agent(run_dir, version).behavior if version else None
     faulthandler.dump_traceback_later(_SHOW_S, repeat=True)  # it may hang, in native code too
     try:
-        return generate_episodes(EpisodeGenerator(config, 1), [command], behavior)[0]
+        with closing(EpisodeGenerator(config, 1)) as generator:
+            return generate_episodes(generator, [command], behavior)[0]
     finally:
         faulthandler.cancel_dump_traceback_later()
 
@@ -190,7 +191,7 @@ def evaluate_all(
     Args:
         agent: who acts.
         evaluations: for each its commands, at least one.
-        environments: episodes that run at the same time.
+        environments: most episodes that run at the same time.
         ended: called whenever an episode has ended.
 
     Raises:
@@ -203,7 +204,8 @@ def evaluate_all(
         for k, command in enumerate(chain.from_iterable(evaluations))
     ]
     outcomes = [(0.0, 0)] * len(numbered)
-    with closing(EpisodeGenerator(agent.config, environments)) as generator:
+    at_once = max(1, min(environments, len(numbered)))
+    with closing(EpisodeGenerator(agent.config, at_once)) as generator:
         for episode in iterate_episodes(generator, numbered, agent.behavior):
             outcomes[episode.command_id - first] = episode.episode_return, episode.length
             ended()

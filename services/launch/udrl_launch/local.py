@@ -76,6 +76,7 @@ class Processes:
                 f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
                 "--nice", "10", "--patience", _PATIENCE_S,
                 "--hang-timeout", f"{fleet.hang_timeout:g}",
+                "--first-index", str((number - 1) * fleet.envs_per_actor),
             )  # fmt: skip
 
     @property
@@ -139,7 +140,13 @@ class Threads:
         for number in range(1, fleet.actors + 1):
             self._start(
                 f"actor-{number}",
-                partial(roles.actor, address, fleet.envs_per_actor, self._stop),
+                partial(
+                    roles.actor,
+                    address,
+                    fleet.envs_per_actor,
+                    self._stop,
+                    first_index=(number - 1) * fleet.envs_per_actor,
+                ),
             )
 
     def _start(self, name: str, service: Callable[[], None]) -> None:

@@ -1,9 +1,11 @@
 """One service in one process: signals, the parent's death, memory, exit codes."""
 
+import contextlib
 import ctypes
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -69,49 +71,59 @@ def switch_threads_soon() -> float:
 
 
 def run_service(service: Callable[[threading.Event], None]) -> int:
-    """Run a service in a thread until it returns or a signal comes; return the exit code.
+    """Run a service until it returns or a signal comes; return the exit code.
 
-    The main thread only waits, so that a signal is answered at once whatever the service does.
+    The service has the main thread, since some environments can be made and stepped nowhere else:
+    those that handle signals, run an event loop or draw. A thread beside it hears of signals even
+    while native code keeps the main thread, and ends the process if the service does not.
     """
     stop = threading.Event()
-    outcome: list[BaseException | None] = []
-
-    def target() -> None:
-        try:
-            service(stop)
-            outcome.append(None)
-        except BaseException as error:  # noqa: BLE001 - handed to the main thread, which reports it
-            outcome.append(error)
-
+    ended = threading.Event()
     received: list[int] = []
+    ear, mouth = socket.socketpair()
+    mouth.settimeout(0.0)
+
+    def watch() -> None:
+        number = ear.recv(1)[0]
+        if number == 0:  # the service has ended
+            return
+        received.append(number)
+        stop.set()
+        if not ended.wait(GRACE_S):
+            log.warning("the service did not end in %.0f s and is abandoned", GRACE_S)
+            sys.stderr.flush()
+            os._exit(128 + number)
 
     def on_signal(number: int, frame: object) -> None:
         # Nothing that takes a lock: the next signal may come in the middle of this one.
-        received.append(number)
+        with contextlib.suppress(OSError):
+            mouth.send(bytes([number]))
 
     previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
-    thread = threading.Thread(target=target, name="service", daemon=True)
-    thread.start()
+    # The interpreter writes to it at once, and calls on_signal when the main thread is back.
+    before = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+    watcher = threading.Thread(target=watch, name="signals", daemon=True)
+    watcher.start()
+    error: UdrlError | None = None
     try:
-        while thread.is_alive() and not received and not stop.is_set():
-            thread.join(0.2)
-        if received:
-            stop.set()
-        thread.join(GRACE_S)
+        service(stop)
+    except UdrlError as raised:
+        error = raised
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    if thread.is_alive():
-        log.warning("the service did not end in %.0f s and is abandoned", GRACE_S)
-        sys.stderr.flush()
-        os._exit(128 + received[0] if received else 1)
-    error = outcome[0]
+        ended.set()
+        signal.set_wakeup_fd(before)
+        if not received:  # else the process ends, and may be told so again
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+        with contextlib.suppress(OSError):
+            mouth.send(b"\0")
+        watcher.join(1.0)
+        mouth.close()
+        ear.close()
     if received and (error is None or isinstance(error, Interrupted)):
         log.warning("%s", error or "stopped")
         return 128 + received[0]
     if error is None:
         return 0
-    if isinstance(error, UdrlError):
-        log.error("%s", error)
-        return error.exit_code
-    raise error
+    log.error("%s", error)
+    return error.exit_code

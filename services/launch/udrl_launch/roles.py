@@ -95,7 +95,11 @@ def learner(address: Address, stop: threading.Event) -> None:
 
 
 def actor(
-    address: Address, environments: int, stop: threading.Event, hang_s: float | None = None
+    address: Address,
+    environments: int,
+    stop: threading.Event,
+    hang_s: float | None = None,
+    first_index: int = 0,
 ) -> None:
     """Act for the run at an address until it has ended.
 
@@ -104,6 +108,8 @@ def actor(
         environments: how many to step at once.
         stop: ends everything.
         hang_s: end the whole process when a round of steps takes longer; None: do not.
+        first_index: of its environments.
     """
     with connected("actor", address, stop) as (transport, hello):
-        ActorService(transport, hello, unique_name("actor"), environments, stop, hang_s).run()
+        name = unique_name("actor")
+        ActorService(transport, hello, name, environments, stop, hang_s, first_index).run()

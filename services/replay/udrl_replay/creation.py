@@ -182,7 +182,9 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
 def _toml(value: object) -> str:
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_toml(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    # JSON's booleans, numbers, strings and arrays are TOML's.
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    # JSON's booleans, numbers and strings are TOML's.
     return msgspec.json.encode(value).decode()
 
 

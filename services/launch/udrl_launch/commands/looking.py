@@ -33,6 +33,8 @@ from udrl_show.display import panel
 @click.option("--desired-return", type=RETURN, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @WEIGHTS
+@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True,
+              help="Environments at once; 1 where a simulator runs only once.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def evaluate(
     run_dir: Path,
@@ -42,6 +44,7 @@ def evaluate(
     desired_return: float | None,
     desired_horizon: int | None,
     weights: str,
+    envs: int,
     as_json: bool,
 ) -> int:
     """Evaluate a trained agent, with the run's command or one of your own.
@@ -53,7 +56,7 @@ def evaluate(
         agent, episodes=episodes, temperature=chosen_temperature(temperature, greedy=greedy),
         desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
-    result = agents.evaluate(agent, commands)
+    result = agents.evaluate(agent, commands, envs)
     if as_json:
         report = {
             "run_dir": str(run_dir), "weights_version": agent.version,

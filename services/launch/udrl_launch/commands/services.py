@@ -125,6 +125,8 @@ def learner(
 @click.option("--nice", type=click.IntRange(0, 19), default=0, help="Yield to other processes.")
 @click.option("--hang-timeout", type=click.FloatRange(1), default=60.0, show_default=True,
               help="Seconds of one round of steps after which the process ends.")  # fmt: skip
+@click.option("--first-index", type=click.IntRange(0), default=0, show_default=True,
+              help="Of its first environment, for simulators that need a port.")  # fmt: skip
 @KEYS
 @PATIENCE
 @RUN
@@ -134,6 +136,7 @@ def actor(
     envs: int,
     nice: int,
     hang_timeout: float,
+    first_index: int,
     keys: Path | None,
     patience: float,
     run_id: str | None,
@@ -146,4 +149,6 @@ def actor(
     os.nice(nice)
     switch_threads_soon()
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
-    return _as_service(parent, partial(roles.actor, address, envs, hang_s=hang_timeout))
+    return _as_service(
+        parent, partial(roles.actor, address, envs, hang_s=hang_timeout, first_index=first_index)
+    )
