@@ -40,7 +40,7 @@ _Outer = KeywordValue | list[_Inner] | dict[str, _Inner]
 #: Keyword arguments for an environment.
 Keywords = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer]]
 #: Settings as they are sent and stored: by name, without their groups.
-FlatSettings = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer] | None]
+FlatSettings = dict[str, KeywordValue | list[int] | Keywords | None]
 
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 

@@ -117,7 +117,7 @@ def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
         ("batch_size", True),
         ("environment", ""),
         ("environment_kwargs", {"gravity": math.nan}),
-        ("environment_kwargs", {"wind": [1.0]}),
+        ("environment_kwargs", {"wind": None}),
         ("eval_episodes", 0),
         ("eval_every", 0),
         ("eval_temperature", "low"),

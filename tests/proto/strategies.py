@@ -79,6 +79,8 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
             return st.booleans()
         case inspect.NoneType():
             return st.none()
+        case inspect.ListType(item_type=item):
+            return st.lists(_any(item), max_size=3)
     raise NotImplementedError(node)
 
 
