@@ -100,7 +100,7 @@ def check_udrl(words: list[str]) -> None:
         options = {n: v for n, v in given.items() if n in settings}
         gather(
             given["env"],
-            preset_name=given["preset_name"],
+            preset_name=given.get("preset_name"),
             options=options,
             assignments=given["assignments"],
         )

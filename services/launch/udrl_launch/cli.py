@@ -16,6 +16,7 @@ from udrl_launch.paths import find_modules_of_the_user
 #: The commands of this package and the modules that hold them, in the order of the help.
 _COMMANDS = {
     "train": "udrl_launch.commands.training",
+    "check": "udrl_launch.commands.checking",
     "replay": "udrl_launch.commands.services",
     "learner": "udrl_launch.commands.services",
     "actor": "udrl_launch.commands.services",

@@ -1,0 +1,201 @@
+"""``udrl check``: whether an environment can be trained on, and what it is like."""
+
+import logging
+import re
+import resource
+import sys
+import time
+import warnings
+from contextlib import closing
+from typing import Any
+
+import msgspec
+import numpy as np
+from gymnasium.utils.env_checker import check_env
+
+from udrl.acting import EpisodeGenerator
+from udrl.commands import CommandSampler
+from udrl.config import Config, change
+from udrl.environments.making import make_environment
+from udrl.episode import Episode
+from udrl.repeating import environment_digest, environment_repeats
+
+#: Random episodes that are looked at, and seconds after which no other one is begun.
+_EPISODES = 20
+_PATIENCE_S = 20.0
+_MIB = 2**20
+
+
+class Check(msgspec.Struct, frozen=True, kw_only=True):
+    """What an environment is like.
+
+    Attributes:
+        environment: its id.
+        declared_observations: its observation space.
+        declared_actions: its action space.
+        observations: what the algorithm sees of them.
+        actions: likewise.
+        max_episode_steps: its step limit.
+        max_return: the greatest return that it declares; None: none.
+        repeats: whether an episode is the same again from its seed, in the same instance and in
+            another; runs are exact only then.
+        episodes: random ones that were played.
+        return_min, return_mean, return_max: of these.
+        length_mean: of these, steps.
+        make_s: seconds that making one took.
+        reset_s: seconds of a reset, mean.
+        step_s: seconds of a step, mean.
+        memory_mib: that an environment takes of this process, about; 0: less than can be told.
+        step_bytes: of one step as it is sent and stored.
+        advice: what is unusual, a sentence each.
+    """
+
+    environment: str
+    declared_observations: str
+    declared_actions: str
+    observations: str
+    actions: str
+    max_episode_steps: int
+    max_return: float | None
+    repeats: bool
+    episodes: int
+    return_min: float
+    return_mean: float
+    return_max: float
+    length_mean: float
+    make_s: float
+    reset_s: float
+    step_s: float
+    memory_mib: float
+    step_bytes: int
+    advice: tuple[str, ...]
+
+
+def check(config: Config) -> Check:
+    """Make an environment, have it checked, and play random episodes in it.
+
+    Raises:
+        UnsupportedEnvironment: it cannot be made or is not supported; the message says all.
+        EnvironmentFault: it raised, or returned what it may not.
+    """
+    before, began = _memory(), time.perf_counter()
+    env = make_environment(config)
+    make_s = time.perf_counter() - began
+    declared = env.observations.declared, env.actions.declared
+    advice = _of_gymnasium(env.unwrapped)
+    env.close()
+    with closing(EpisodeGenerator(config, 1)) as generator:
+        spec = generator.spec
+        memory = (_memory() - before) / 2  # two were made
+        repeats = environment_repeats(generator)
+        digest = environment_digest(generator)
+        episodes, reset_s, step_s = _play(generator, config)
+    with closing(EpisodeGenerator(config, 1)) as another:
+        repeats = repeats and environment_digest(another) == digest
+    returns = [e.episode_return for e in episodes]
+    advice += _unusual(config, episodes, repeats=repeats)
+    return Check(
+        environment=config.environment,
+        declared_observations=str(declared[0]),
+        declared_actions=str(declared[1]),
+        observations=str(spec.observation_space),
+        actions=str(spec.action_space),
+        max_episode_steps=spec.max_episode_steps,
+        max_return=spec.max_return,
+        repeats=repeats,
+        episodes=len(episodes),
+        return_min=min(returns),
+        return_mean=sum(returns) / len(returns),
+        return_max=max(returns),
+        length_mean=sum(e.length for e in episodes) / len(episodes),
+        make_s=make_s,
+        reset_s=reset_s,
+        step_s=step_s,
+        memory_mib=round(max(0.0, memory) / _MIB, 1),
+        step_bytes=spec.step_bytes,
+        advice=tuple(advice),
+    )
+
+
+def _play(generator: EpisodeGenerator, config: Config) -> tuple[list[Episode], float, float]:
+    """Play random episodes; return them and the seconds of a reset and of a step."""
+    sampler = CommandSampler(change(config, n_warm_up_episodes=_EPISODES), generator.spec)
+    episodes: list[Episode] = []
+    resets = steps = 0.0
+    began = time.perf_counter()
+    for command in sampler.warm_up():
+        at = time.perf_counter()
+        generator_started = generator.start(command, None)
+        resets += time.perf_counter() - at
+        if generator_started is not None:
+            raise generator_started.error
+        at = time.perf_counter()
+        while not (ended := generator.step()):
+            pass
+        steps += time.perf_counter() - at
+        for outcome in ended:
+            if not isinstance(outcome, Episode):
+                raise outcome.error
+            episodes.append(outcome)
+        if time.perf_counter() - began > _PATIENCE_S:
+            break
+    return episodes, resets / len(episodes), steps / sum(e.length for e in episodes)
+
+
+def _of_gymnasium(env: Any) -> list[str]:
+    """Return what Gymnasium's own checker finds, a sentence each."""
+    logger = logging.getLogger("gymnasium")
+    level = logger.level
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        try:
+            check_env(env, skip_render_check=True)
+        except Exception as error:  # noqa: BLE001 - it says no in many ways, and runs foreign code
+            return [f"Gymnasium's checker says: {_line(error)}"]
+        finally:
+            logger.setLevel(level)
+    said = [_line(w.message) for w in found]
+    return [f"Gymnasium's checker warns: {s}" for s in said if "infinity" not in s]  # as most are
+
+
+def _line(message: object) -> str:
+    """Return a message without colours, in one line."""
+    return " ".join(re.sub(r"\x1b\[\d*m|WARN: ", "", str(message)).split())
+
+
+def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[str]:
+    """Return what is unusual of random episodes, and what to do about it, a sentence each."""
+    advice = []
+    returns = np.array([e.episode_return for e in episodes])
+    lengths = np.array([e.length for e in episodes])
+    if not repeats:
+        advice.append(
+            "An episode is not the same again from its seed, so runs will be marked exact: false; "
+            "draw all random numbers from self.np_random, seeded in reset(seed=...)."
+        )
+    if np.ptp(returns) == 0:
+        advice.append(
+            f"All random episodes return {returns[0]:g}: nothing tells good ones from bad ones "
+            f"until chance finds a reward; expect a long beginning, or shape the reward."
+        )
+    if all(e.truncated and not e.terminated for e in episodes):
+        advice.append(
+            f"All random episodes last until the limit of {lengths[0]} steps; a lower "
+            f"max_episode_steps makes the warm-up shorter."
+        )
+    for name, scale, size in (
+        ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
+        ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
+    ):
+        if size > 0 and not 0.1 <= scale * size <= 20:
+            advice.append(
+                f"{name} = {scale:g} makes numbers of about {scale * size:.2g} for the network of "
+                f"what is about {size:.3g}; try {name} = {1 / size:.1g}."
+            )
+    return advice
+
+
+def _memory() -> int:
+    """Return the greatest memory of this process so far, bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

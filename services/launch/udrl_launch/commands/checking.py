@@ -1,0 +1,61 @@
+"""``udrl check``."""
+
+from pathlib import Path
+
+import click
+
+from udrl_inspect.checking import Check
+from udrl_inspect.checking import check as check_environment
+from udrl_launch.commands.options import FILE
+from udrl_launch.output import print_json
+from udrl_launch.settings import gather
+
+
+@click.command()
+@click.argument("env")
+@click.option("--config", "file", type=FILE, metavar="FILE", help="Settings from a TOML file.")
+@click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
+              help="Set any setting; may be repeated.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bool) -> int:
+    """Check an environment: whether it can be trained on, what it is like, and how fast.
+
+    Example: udrl check your_package.your_module:YourEnv-v0
+    """
+    settings = gather(env, file=file, assignments=assignments, options={})
+    found = check_environment(settings.config)
+    if as_json:
+        print_json(found)
+        return 0
+    for name, text in _lines(found):
+        click.echo(f"{name:<13} {text}")
+    return 0
+
+
+def _lines(found: Check) -> list[tuple[str, str]]:
+    limit = f"{found.max_episode_steps:,} steps at most"
+    if found.max_return is not None:
+        limit += f", a return of {found.max_return:g} at most"
+    return [
+        ("environment", found.environment),
+        ("observations", f"{found.declared_observations}; seen as {found.observations}"),
+        ("actions", f"{found.declared_actions}; seen as {found.actions}"),
+        ("episodes", limit),
+        (
+            "at random",
+            f"return {found.return_mean:.4g} ({found.return_min:.4g} to {found.return_max:.4g}), "
+            f"{found.length_mean:.4g} steps, in {found.episodes} episodes",
+        ),
+        ("repeats", "yes, from its seed" if found.repeats else "NO"),
+        (
+            "speed",
+            f"{1 / found.step_s:,.0f} steps/s in one process; a reset takes "
+            f"{1000 * found.reset_s:.3g} ms, making one {found.make_s:.2g} s",
+        ),
+        (
+            "size",
+            f"{found.step_bytes:,} bytes a step; about {found.memory_mib:g} MiB an environment",
+        ),
+        *(("advice", sentence) for sentence in found.advice),
+        ("verdict", f"it can be trained on: udrl train {found.environment}"),
+    ]

@@ -1,0 +1,72 @@
+"""``udrl check``."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from gymnasium import spaces
+
+from tests.foreign.conventions import Plain, ResetsToObservation, register
+from tests.foreign.test_repeating import Unseeded
+from udrl.config import Config, build
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl_inspect.checking import check
+from udrl_launch.cli import cli
+
+
+def checked(kind: type[Plain], **settings: Any) -> Any:
+    return check(build(Config, {"environment": register(kind), "return_scale": 0.3} | settings))
+
+
+def test_what_an_environment_is_like() -> None:
+    found = checked(Plain, horizon_scale=0.1)
+    assert found.repeats
+    assert (found.max_episode_steps, found.length_mean, found.episodes) == (50, 10.0, 20)
+    assert 0 <= found.return_min <= found.return_mean <= found.return_max <= 10
+    assert found.declared_observations == "Box(-inf, inf, (2,), float32)"
+    assert found.observations == "Vector(size=2)"
+    assert found.step_bytes == 2 * 4 + 1 + 4
+    assert found.step_s > 0
+    assert found.advice == ()
+
+
+def test_advice_for_what_is_unusual() -> None:
+    class Poor(Unseeded):
+        def pay(self, action: Any) -> float:
+            return 0.0
+
+        def over(self) -> bool:
+            return False
+
+    advice = " ".join(checked(Poor, horizon_scale=1e-4).advice)
+    for part in (
+        "not the same again from its seed",
+        "All random episodes return 0",
+        "last until the limit of 50 steps",
+        "horizon_scale = 0.0001 makes numbers of about 0.005",
+    ):
+        assert part in advice
+
+
+def test_what_gymnasiums_checker_finds_is_advice() -> None:
+    class Outside(Plain):
+        observation_space = spaces.Box(0, 1, (2,), np.float32)
+
+    assert any("Gymnasium's checker" in sentence for sentence in checked(Outside).advice)
+
+
+def test_what_cannot_be_trained_on_is_refused() -> None:
+    with pytest.raises(EnvironmentFault, match=r"reset\(\) returned an array"):
+        checked(ResetsToObservation)
+    with pytest.raises(UnsupportedEnvironment, match="no step limit"):
+        check(build(Config, {"environment": register(Plain, max_steps=None)}))
+
+
+def test_command_prints_lines_or_json() -> None:
+    told = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
+    assert "repeats       yes, from its seed" in told.stdout
+    assert "verdict       it can be trained on: udrl train CartPole-v1" in told.stdout
+    told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
+    assert json.loads(told.stdout)["max_episode_steps"] == 500
