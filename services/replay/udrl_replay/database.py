@@ -1,7 +1,7 @@
 """A SQLite file of sealed rows, which one process writes and others may look at.
 
 Every change is one transaction, synced before anything is acknowledged; what is on disk is
-consistent at every moment, and a row that is not what was written is noticed.
+consistent at every moment, and a row that is not what was written, or is gone, is noticed.
 """
 
 import fcntl
@@ -17,6 +17,7 @@ import msgspec
 
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal
+from udrl_replay.tallies import TALLIES, Tallies, Tally
 
 FILE = "run.sqlite"
 LOCK = "lock"
@@ -67,6 +68,8 @@ class Database:
                 self._db.execute("PRAGMA synchronous = FULL")
                 # Some builds overwrite what is deleted: thirteen times the time for a megabyte.
                 self._db.execute("PRAGMA secure_delete = OFF")
+                # What a statement may have to take back is small, and needs no file.
+                self._db.execute("PRAGMA temp_store = MEMORY")
         except sqlite3.Error as error:
             raise self._fault(error) from error
         self._db.create_function("seal", -1, seal, deterministic=True)
@@ -81,6 +84,7 @@ class Database:
                 f"use the version that wrote it"
             )
         self._check_seals()
+        self._check_tallies()
 
     def _connect(self, how: str) -> sqlite3.Connection:
         # As a URI, so that a mode can be named and the path may hold any character.
@@ -108,6 +112,19 @@ class Database:
             if broken:
                 raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
 
+    def _check_tallies(self) -> None:
+        self._tallies = Tallies(self._db)
+        written = self.fact(TALLIES, dict[str, Tally])
+        for table, tally in self._tallies.held().items():
+            expected = written.get(table)
+            if tally != expected:
+                rows = expected.rows if expected else 0
+                raise self._damaged(
+                    f"table {table} has {tally.rows} rows, not the {rows} that were written"
+                )
+        if not self.read_only:
+            self._tallies.follow(self._db)
+
     @classmethod
     def create(cls, run_dir: Path, **facts: object) -> Self:
         """Make a new run's file, which holds some facts from the beginning.
@@ -129,11 +146,7 @@ class Database:
                 unfinished = path.with_suffix(".new")
                 unfinished.unlink(missing_ok=True)
                 with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
-                    db.executescript(TABLES)
-                    for name, value in {"schema": SCHEMA, **facts}.items():
-                        encoded = msgspec.json.encode(value)
-                        row = name, encoded, seal(name, encoded)
-                        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
+                    _begin(db, {"schema": SCHEMA, **facts})
                 unfinished.rename(path)
                 _sync(run_dir)
         except (OSError, sqlite3.Error) as error:
@@ -156,9 +169,16 @@ class Database:
         """
         try:
             self._db.execute("BEGIN IMMEDIATE")
+            before = self._tallies.held()
             try:
                 yield
+                after = self._tallies.held()
+                if after != before:
+                    self.set_fact(TALLIES, after)
                 self._db.execute("COMMIT")
+            except BaseException:
+                self._tallies.put_back(before)
+                raise
             finally:
                 # After some errors SQLite has rolled back by itself.
                 if self._db.in_transaction:
@@ -167,7 +187,7 @@ class Database:
             raise self._fault(error) from error
 
     def _insert(self, table: str, *values: Value, unsealed: Sequence[bytes] = ()) -> None:
-        """Add a row: what its seal covers, the seal, and the rest."""
+        """Add a row, within a transaction: what its seal covers, the seal, and the rest."""
         insert = "INSERT OR REPLACE" if table in _REPLACED else "INSERT"
         row = *values, seal(*values), *unsealed
         self._db.execute(f"{insert} INTO {table} VALUES ({marks(row)})", row)
@@ -201,7 +221,7 @@ class Database:
         if not rows:
             if default is not None:
                 return default
-            raise self._damaged(f"fact {name!r} is missing")
+            raise self._damaged(f"fact {name!r} is missing in table facts")
         try:
             return msgspec.json.decode(rows[0][0], type=kind)
         except (msgspec.DecodeError, ConfigError) as error:
@@ -210,6 +230,21 @@ class Database:
     def set_fact(self, name: str, value: object) -> None:
         """Set a named value."""
         self._insert("facts", name, msgspec.json.encode(value))
+
+
+def _begin(db: sqlite3.Connection, facts: dict[str, object]) -> None:
+    """Make the tables of a new run, with some facts."""
+
+    def add(name: str, value: object) -> None:
+        encoded = msgspec.json.encode(value)
+        row = name, encoded, seal(name, encoded)
+        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
+
+    db.executescript(TABLES)
+    db.create_function("seal", -1, seal, deterministic=True)
+    for name, value in facts.items():
+        add(name, value)
+    add(TALLIES, Tallies(db).held())
 
 
 def _sync(folder: Path) -> None:
