@@ -358,9 +358,9 @@ class ReplayService:
         return VersionReply(result=result)
 
     def _state(self, request: StateRequest, now: float) -> StateReply:
-        version = self._store.version(self.run.progress.latest_version)
-        if version is None:
+        if self.run.progress.latest_version == 0:
             return StateReply(version=0)
+        version = self._store.state(self.run.progress.latest_version)
         return StateReply(
             version=version.version, weights=version.weights, optimizer=version.optimizer
         )
