@@ -96,6 +96,7 @@ class World:
 
     def close(self) -> None:
         """Forget the run."""
+        self.service.close()
         self._store.close()
         self._folder.cleanup()
 

@@ -16,6 +16,7 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
+from udrl_replay.remedies import remedy
 from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal
 from udrl_replay.tallies import TALLIES, Tallies, Tally
 
@@ -135,7 +136,7 @@ class Database:
         """
         path = run_dir / FILE
         try:
-            run_dir.mkdir(parents=True, exist_ok=True)
+            _make(run_dir)
             with _lock(run_dir):
                 if path.exists():
                     raise StoreError(
@@ -150,7 +151,7 @@ class Database:
                 unfinished.rename(path)
                 _sync(run_dir)
         except (OSError, sqlite3.Error) as error:
-            raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+            raise _unusable(run_dir, error) from error
         return cls(run_dir)
 
     def close(self) -> None:
@@ -201,9 +202,10 @@ class Database:
     def _fault(self, error: sqlite3.Error) -> StoreError:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
             return self._damaged(error)
+        what_to_do = remedy(error, "free some disk space or repair the disk")
         return StoreError(
-            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: free some disk "
-            f"space or repair the disk, and start again with --resume"
+            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: {what_to_do}, "
+            f"and start again with --resume"
         )
 
     def _damaged(self, what: object) -> DamagedStore:
@@ -247,6 +249,14 @@ def _begin(db: sqlite3.Connection, facts: dict[str, object]) -> None:
     add(TALLIES, Tallies(db).held())
 
 
+def _make(run_dir: Path) -> None:
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        run_dir.stat()  # tells what a link in a loop, or to nowhere, really is
+        raise
+
+
 def _sync(folder: Path) -> None:
     """Make a renamed file's new name durable."""
     descriptor = os.open(folder, os.O_RDONLY)
@@ -254,6 +264,11 @@ def _sync(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _unusable(run_dir: Path, error: OSError | sqlite3.Error) -> StoreError:
+    what_to_do = remedy(error, "name one you may write")
+    return StoreError(f"run directory {run_dir}: {error}; {what_to_do}")
 
 
 def is_locked(run_dir: Path) -> bool:
@@ -276,7 +291,7 @@ def _lock(run_dir: Path) -> Any:
     try:
         file = (run_dir / LOCK).open("a")
     except OSError as error:
-        raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+        raise _unusable(run_dir, error) from error
     deadline = time.monotonic() + _LOOK_S
     while True:
         try:

@@ -166,6 +166,10 @@ class ReplayService:
                 if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
                     return
 
+    def close(self) -> None:
+        """Close the files that it keeps open, apart from the store."""
+        self._metrics.close()
+
     def open(self) -> list[Declaration]:
         """Begin to receive questions, which are checked on the thread that receives them."""
         spec = self.run.hello.environment
