@@ -13,6 +13,7 @@ import platform
 import threading
 import time
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from udrl.checkpoint import decode_state, encode_optimizer
@@ -96,7 +97,7 @@ class LearnerService:
         run_id = self._hello.run_id
         declared: list[Any] = []
         try:
-            self._join()
+            self._asker.ask(verbs.JOIN, self._join)
             declared += [
                 self._transport.appear(keys.alive(run_id, "learner", self._name)),
                 self._transport.subscribe(
@@ -111,8 +112,10 @@ class LearnerService:
             for declaration in declared:
                 declaration.undeclare()
 
-    def _join(self) -> None:
-        request = JoinRequest(
+    @cached_property
+    def _join(self) -> JoinRequest:
+        """Who this learner is."""
+        return JoinRequest(
             role="learner",
             id=self._name,
             host=platform.node(),
@@ -120,7 +123,6 @@ class LearnerService:
             software=__version__,
             numerics_class=training_class(self._config, self._spec),
         )
-        self._asker.ask(verbs.JOIN, request)
 
     def _train_until_ended(self) -> None:
         """Train from the latest version that there is, and again whenever that is another one.
@@ -232,7 +234,7 @@ class LearnerService:
         while not useless.is_set():
             self._progress.clear()
             request = ChangesRequest(learner=self._name, version=version)
-            changes = self._asker.ask(verbs.CHANGES, request)
+            changes = self._asker.ask_joined(verbs.CHANGES, request, self._join)
             if changes.ended:
                 break
             if changes.wait is None:
@@ -251,7 +253,7 @@ class LearnerService:
         return episodes
 
     def _deliver(self, message: VersionMessage) -> None:
-        self._asker.ask(verbs.VERSION, message)
+        self._asker.ask_joined(verbs.VERSION, message, self._join)
         self._delivered = True
         # Not acknowledged: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
