@@ -41,7 +41,7 @@ from udrl_proto import PROTOCOL, keys, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
-from udrl_proto.messages import ChangesRequest, Hello, VersionMessage, Weights
+from udrl_proto.messages import ChangesRequest, Hello, JoinRequest, VersionMessage, Weights
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import write_config
@@ -83,6 +83,12 @@ def deliver_versions(
     weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
         asker = Asker(ZenohTransport(session), RUN, "learner scale", stop)
+        asker.ask(
+            verbs.JOIN,
+            JoinRequest(
+                role="learner", id="scale", host="bench", pid=1, software="0", numerics_class="c"
+            ),
+        )
         version = 1
         while not stop.is_set():
             request = ChangesRequest(learner="scale", version=version)

@@ -11,9 +11,9 @@ import time
 from udrl.errors import Interrupted, Refused, Unreachable
 from udrl_proto import keys
 from udrl_proto.codec import decode, encode
-from udrl_proto.messages import Problem
+from udrl_proto.messages import JoinRequest, Problem
 from udrl_proto.transport import Transport
-from udrl_proto.verbs import Reply, Request, Verb
+from udrl_proto.verbs import JOIN, Reply, Request, Verb
 
 log = logging.getLogger("udrl")
 
@@ -22,6 +22,8 @@ log = logging.getLogger("udrl")
 ATTEMPT_S, LONGEST_ATTEMPT_S = 3.0, 30.0
 #: Seconds that a service goes on asking a replay service that does not answer.
 PATIENCE_S = 300.0
+#: Times that a service joins again for one question; more often nobody forgets it by chance.
+_JOINS = 5
 
 
 class Asker:
@@ -92,3 +94,16 @@ class Asker:
             self._stop.wait(pause)
             pause = min(2 * pause, 1.0)
         raise Interrupted(f"{self._who} was stopped while asking for {verb.name!r}")
+
+    def ask_joined(
+        self, verb: Verb[Request, Reply], request: Request | bytes, join: JoinRequest
+    ) -> Reply:
+        """Ask as :meth:`ask` does, and join again where the replay service was started again."""
+        for _ in range(_JOINS):
+            try:
+                return self.ask(verb, request)
+            except Refused as refusal:
+                if refusal.code != "join_first":
+                    raise
+            self.ask(JOIN, join)
+        return self.ask(verb, request)

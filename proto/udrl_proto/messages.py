@@ -79,7 +79,8 @@ class Hello(Configured, Message, frozen=True, kw_only=True):
         environment: what its environment looks like.
         environment_digest: of a short episode there; empty: it does not repeat itself.
         graph: the acting graph, an ONNX model whose weights have no values (:mod:`udrl.graph`).
-        acting_class: numerics class of the actors, set by the first (``docs/protocol.md``).
+        acting_class: numerics class of the actors, set by the first that delivers
+            (``docs/protocol.md``).
         training_class: numerics class of the learner, likewise.
         allow_inexact: accept services of other numerics classes.
         exact: whether the run's result is still a function of its configuration.

@@ -6,6 +6,8 @@ import logging
 import re
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import zenoh
 
@@ -169,6 +171,21 @@ def connect(
         if stop.wait(pause):
             raise Interrupted(f"stopped while connecting to {endpoint}")
         pause = min(2 * pause, 1.0)
+
+
+@contextmanager
+def closed_at_the_end(session: zenoh.Session) -> Iterator[None]:
+    """Close a session in the end; what cannot be closed ends with the process.
+
+    That must not hide what went wrong before, such as too many open files.
+    """
+    try:
+        yield
+    finally:
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            log.info("the session with the router could not be closed: %s", error)
 
 
 def find_run(

@@ -17,10 +17,19 @@ from udrl_actor import outbox as outboxes
 from udrl_actor.outbox import Outbox, deliver
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
-from udrl_proto.messages import Acknowledged, EpisodeReply, Problem
+from udrl_proto.messages import (
+    Acknowledged,
+    EpisodeMessage,
+    EpisodeReply,
+    JoinReply,
+    JoinRequest,
+    Message,
+    Problem,
+)
 from whole_run import wait_for
 
 DEADLINE_S = 10.0
+JOIN = JoinRequest(role="actor", id="a", host="h", pid=1, software="0", numerics_class="c")
 
 
 def episode(command_id: int, n_bytes: int = 100) -> Episode:
@@ -134,9 +143,37 @@ def asker(scripted: Scripted) -> Asker:
 
 def test_episode_is_delivered(scripted: Scripted, asker: Asker) -> None:
     scripted.answers(verbs.EPISODE, lambda _: EpisodeReply(result="accepted"))
-    assert deliver(asker, "a", episode(7)) == 7
+    assert deliver(asker, JOIN, episode(7)) == 7
     (message,) = scripted.requests(verbs.EPISODE)
     assert (message.actor, message.command_id) == ("a", 7)
+
+
+def test_episode_is_delivered_again_to_a_service_that_was_started_again(
+    scripted: Scripted, asker: Asker
+) -> None:
+    known = False
+
+    def join(_: JoinRequest) -> Message:
+        nonlocal known
+        known = True
+        return JoinReply()
+
+    def accept(_: EpisodeMessage) -> Message:
+        unknown = Problem(code="join_first", message="who is that?")
+        return EpisodeReply(result="accepted") if known else unknown
+
+    scripted.answers(verbs.JOIN, join)
+    scripted.answers(verbs.EPISODE, accept)
+    assert deliver(asker, JOIN, episode(7)) == 7
+    assert [name for name, _ in scripted.asked] == ["episode", "join", "episode"]
+
+
+def test_service_that_knows_nobody_is_not_asked_for_ever(scripted: Scripted, asker: Asker) -> None:
+    scripted.answers(verbs.JOIN, lambda _: JoinReply())
+    scripted.answers(verbs.EPISODE, lambda _: Problem(code="join_first", message="who is that?"))
+    with pytest.raises(Refused, match="who is that"):
+        deliver(asker, JOIN, episode(7))
+    assert len(scripted.requests(verbs.JOIN)) == 5
 
 
 def test_failure_is_told(scripted: Scripted, asker: Asker) -> None:
@@ -145,7 +182,7 @@ def test_failure_is_told(scripted: Scripted, asker: Asker) -> None:
         id=8, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=1,
         stream_key=bytes(16), weights_version=0, max_steps=1,
     )  # fmt: skip
-    assert deliver(asker, "a", Failure(told, EnvironmentFault("it broke"))) == 8
+    assert deliver(asker, JOIN, Failure(told, EnvironmentFault("it broke"))) == 8
     (message,) = scripted.requests(verbs.FAILURE)
     assert (message.actor, message.command_id, message.error) == ("a", 8, "it broke")
 
@@ -155,11 +192,11 @@ def test_rejected_episode_is_let_go(
 ) -> None:
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))
     with caplog.at_level(logging.INFO, "udrl"):
-        assert deliver(asker, "a", episode(7)) == 7
+        assert deliver(asker, JOIN, episode(7)) == 7
     assert "the run has ended" in caplog.text
 
 
 def test_other_refusals_are_raised(scripted: Scripted, asker: Asker) -> None:
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="quarantined", message="it lied"))
     with pytest.raises(Refused, match="it lied"):
-        deliver(asker, "a", episode(7))
+        deliver(asker, JOIN, episode(7))

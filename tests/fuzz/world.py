@@ -96,6 +96,7 @@ class World:
 
     def close(self) -> None:
         """Forget the run."""
+        self.service.close()
         self._store.close()
         self._folder.cleanup()
 
@@ -185,6 +186,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
             environments=4,
             numerics_class="c",
             environment=world.spec,
+            environment_digest=world.service.run.hello.environment_digest,
         ),
     )
     ask(verbs.JOIN.name, JoinRequest(role="learner", id="learner-1", host="h", pid=1, software="0",

@@ -1,7 +1,7 @@
 """A peer that would break the run is told why, and the run goes on."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +16,10 @@ from udrl.errors import ConfigError, Refused
 from udrl_actor.service import ActorService
 from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_learner.service import LearnerService
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode, encode_array
-from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest, VersionMessage
+from udrl_proto.messages import CommandsRequest, EpisodeMessage, Hello, JoinRequest, VersionMessage
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.session import connect, find_run
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -50,6 +49,13 @@ class Hosted:
 
     def status(self) -> Status:
         return self.asker.ask(verbs.STATUS, StatusRequest())
+
+    def join(self, role: Literal["actor", "learner"], name: str, numerics_class: str = "c") -> None:
+        request = JoinRequest(
+            role=role, id=name, host="here", pid=1, software="0", numerics_class=numerics_class,
+            environment_digest=self.hello.environment_digest,
+        )  # fmt: skip
+        self.asker.ask(verbs.JOIN, request)
 
     def finish(self) -> Status:
         """Let a good actor and a good learner end the run; return its last status."""
@@ -81,12 +87,16 @@ def hosted(tmp_path: Path) -> Iterator[Hosted]:
     one.close()
 
 
-def actor(hosted: Hosted) -> None:
-    ActorService(hosted.transport, hosted.hello, "another", 1, hosted.stop).run()
-
-
-def learner(hosted: Hosted) -> None:
-    LearnerService(hosted.transport, hosted.hello, "another", hosted.stop).run()
+#: Of command 3, and as good as any other: the warm-up is random.
+EPISODE = EpisodeMessage(
+    actor="one",
+    command_id=3,
+    observations=encode_array(np.zeros(1, np.int32)),
+    actions=encode_array(np.zeros(1, np.uint8)),
+    rewards=encode_array(np.zeros(1, np.float32)),
+    terminated=True,
+    truncated=False,
+)
 
 
 def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
@@ -102,22 +112,31 @@ def test_actor_whose_environment_does_something_else_is_refused(
 ) -> None:
     monkeypatch.setattr(udrl_actor.service, "environment_digest", lambda _: "0123456789abcdef")
     with pytest.raises(Refused, match=r"gives other observations or rewards.*0123456789abc") as no:
-        actor(hosted)
+        ActorService(hosted.transport, hosted.hello, "other", 1, hosted.stop).run()
     assert no.value.code == "other_environment"
 
 
-@pytest.mark.parametrize(("role", "service"), [("actor", actor), ("learner", learner)])
-def test_peer_that_rounds_differently_is_refused(
-    role: Literal["actor", "learner"], service: Callable[[Hosted], None], hosted: Hosted
-) -> None:
-    first = JoinRequest(
-        role=role, id="first", host="here", pid=1, software="0", numerics_class="0123456789abcdef",
-        environment_digest=hosted.hello.environment_digest,
-    )  # fmt: skip
-    hosted.asker.ask(verbs.JOIN, first)
-    with pytest.raises(Refused, match=r"class 0123456789abcdef.*like [0-9a-f]{16}.*inexact") as no:
-        service(hosted)
+def test_first_that_delivers_says_how_all_must_round(hosted: Hosted) -> None:
+    hosted.join("actor", "two", "of two")
+    hosted.join("actor", "one", "of one")
+    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
+    of_two = msgspec.structs.replace(EPISODE, actor="two", command_id=4)
+    with pytest.raises(Refused, match=r"class of one, this machine like of two,") as no:
+        hosted.asker.ask(verbs.EPISODE, of_two)
     assert no.value.code == "other_numerics"
+    with pytest.raises(Refused, match="actor two has not joined"):
+        hosted.asker.ask(verbs.EPISODE, of_two)
+    with pytest.raises(Refused, match=r"class of one, this machine like [0-9a-f]{16},"):
+        ActorService(hosted.transport, hosted.hello, "three", 1, hosted.stop).run()
+    assert hosted.status().exact
+    assert_conserved(hosted.status())
+
+
+def test_peers_that_round_differently_and_deliver_nothing_keep_nobody_away(hosted: Hosted) -> None:
+    hosted.join("actor", "idle", "of its own")
+    hosted.join("learner", "idle", "of its own")
+    assert hosted.asker.ask(verbs.COMMANDS, CommandsRequest(actor="idle", wanted=1)).commands
+    assert digests(hosted.finish()) == digests(reference(hosted.hello.config, BUDGET))
 
 
 def test_run_of_another_protocol_is_named(hosted: Hosted) -> None:
@@ -132,15 +151,8 @@ def test_run_of_another_protocol_is_named(hosted: Hosted) -> None:
 
 
 def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
-    good = EpisodeMessage(
-        actor="mallory",
-        command_id=0,
-        observations=encode_array(np.zeros(1, np.int32)),
-        actions=encode_array(np.zeros(1, np.uint8)),
-        rewards=encode_array(np.zeros(1, np.float32)),
-        terminated=True,
-        truncated=False,
-    )
+    hosted.join("actor", "mallory")
+    good = msgspec.structs.replace(EPISODE, actor="mallory", command_id=0)
     nan = encode_array(np.full(1, np.nan, np.float32))
     bad = {
         "never issued|cancelled or unknown": msgspec.structs.replace(good, command_id=77),
@@ -176,18 +188,10 @@ def test_bad_weights_are_refused(hosted: Hosted) -> None:
 def test_different_episode_for_a_command_marks_the_run_inexact(hosted: Hosted) -> None:
     status = hosted.status()
     assert status.exact
-    first = EpisodeMessage(
-        actor="one",
-        command_id=3,
-        observations=encode_array(np.zeros(1, np.int32)),
-        actions=encode_array(np.zeros(1, np.uint8)),
-        rewards=encode_array(np.zeros(1, np.float32)),
-        terminated=True,
-        truncated=False,
-    )
-    assert hosted.asker.ask(verbs.EPISODE, first).result == "accepted"
-    assert hosted.asker.ask(verbs.EPISODE, first).result == "duplicate"
-    other = msgspec.structs.replace(first, actions=encode_array(np.ones(1, np.uint8)))
+    hosted.join("actor", "one")
+    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
+    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "duplicate"
+    other = msgspec.structs.replace(EPISODE, actions=encode_array(np.ones(1, np.uint8)))
     assert hosted.asker.ask(verbs.EPISODE, other).result == "duplicate"
     status = hosted.status()
     assert not status.exact

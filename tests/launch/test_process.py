@@ -32,8 +32,8 @@ thread.join()
 """
 
 
-def page_faults(program: str) -> int:
-    """Return how many pages the kernel had to find for each round."""
+def said_by(program: str) -> int:
+    """Return the number that a program prints."""
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
@@ -42,9 +42,9 @@ def page_faults(program: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is a setting of glibc")
 def test_freed_memory_is_kept() -> None:
-    assert page_faults(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
+    assert said_by(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
     # The control: 64 MB are 16,384 pages.
-    assert page_faults(PROGRAM.replace("KEEP", "")) > 1000
+    assert said_by(PROGRAM.replace("KEEP", "")) > 1000
 
 
 SERVICE = """
@@ -99,3 +99,15 @@ def test_service_that_does_not_listen_is_abandoned() -> None:
     code, said = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
     assert "did not end in 4 s and is abandoned" in said
+
+
+@pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])
+def test_as_many_files_may_be_open_as_the_system_allows(given: int, found: int) -> None:
+    program = (
+        "from resource import RLIMIT_NOFILE, getrlimit, setrlimit\n"
+        "from udrl_launch.process import allow_open_files\n"
+        f"setrlimit(RLIMIT_NOFILE, ({given}, 4096))\n"
+        "allow_open_files()\n"
+        "print(getrlimit(RLIMIT_NOFILE)[0])"
+    )
+    assert said_by(program) == found

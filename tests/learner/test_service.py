@@ -9,6 +9,7 @@ import pytest
 
 from tests.proto.scripted import Scripted
 from udrl.actions import Categorical
+from udrl.checkpoint import encode_optimizer
 from udrl.config import Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
@@ -175,6 +176,52 @@ def test_learner_that_is_out_of_step_starts_from_the_state(
     run()
     assert len(replay.requests(verbs.STATE)) == 2
     assert delivered(replay)[-1] == (3, weights_after(*BUFFERS.values()))
+
+
+class NoPause(threading.Event):
+    """Notes for how long somebody would have waited."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: list[float | None] = []
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.waits.append(timeout)
+        return self.is_set()
+
+
+def test_learner_that_is_sent_back_without_end_gives_up(replay: Scripted) -> None:
+    never = NoPause()
+    replay.answers(verbs.CHANGES, lambda _: Problem(code="rewind", message="version 7 is next"))
+    with pytest.raises(Refused, match=r"7 times with weights version 0 .*: version 7 is next; the"):
+        LearnerService(replay.transport, HELLO, "l", never).run()
+    assert len(replay.requests(verbs.STATE)) == 7
+    assert never.waits == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
+
+
+def test_learner_that_is_sent_back_while_another_gets_on_goes_on(replay: Scripted) -> None:
+    """It is slower each time, so that it delivers nothing."""
+    there, state = 0, untrained(CONFIG, SPEC)
+    states: list[StateReply] = [StateReply(version=0)]
+    experience = Experience(CONFIG, SPEC)
+    for number in (1, 2):
+        experience.add(episode(number))
+    for version in range(1, 21):
+        train(state, experience.by_rank([1, 2]), CONFIG)
+        weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
+        states.append(StateReply(version=version, weights=weights, optimizer=optimizer))
+
+    def changes(request: ChangesRequest) -> Message:
+        nonlocal there
+        if there == 20:
+            return ChangesReply(ended=True)
+        there += 1
+        return Problem(code="rewind", message="another was faster")
+
+    replay.answers(verbs.STATE, lambda _: states[there])
+    replay.answers(verbs.CHANGES, changes)
+    LearnerService(replay.transport, HELLO, "l", NoPause()).run()
+    assert there == 20
 
 
 def test_refusal_that_starting_over_does_not_mend_is_raised(

@@ -185,6 +185,7 @@ def test_actor_written_from_the_page_serves_a_run(
         store = create(tmp_path, CONFIG)
         stack.callback(store.close)
         service = ReplayService(ZenohTransport(router), store, budget, tmp_path)
+        stack.callback(service.close)
         serving = threading.Thread(target=service.serve, args=[stop])
         serving.start()
         stack.callback(serving.join)

@@ -7,54 +7,144 @@ from msgspec.structs import replace
 
 from tests.replay.synthetic import SPEC, join
 from udrl.errors import Refused
-from udrl_proto.messages import Hello
+from udrl_proto.messages import Hello, JoinRequest, Role
 from udrl_replay import admission
-from udrl_replay.admission import admit
+from udrl_replay.admission import Admission
 from udrl_replay.run import Run
 
-
-def test_first_actor_and_first_learner_set_the_numerics_classes(
-    make_run: Callable[..., Run],
-) -> None:
-    run = make_run()
-    admit(run, replace(join("a"), numerics_class="of actors"))
-    admit(run, replace(join("l"), role="learner", numerics_class="of learners", environment=None))
-    assert (run.hello.acting_class, run.hello.training_class) == ("of actors", "of learners")
-    assert run.store.fact("hello", Hello) == run.hello
+MakeRun = Callable[..., Run]
 
 
-def test_another_numerics_class_is_refused_unless_the_run_allows_it(
-    make_run: Callable[..., Run],
-) -> None:
-    run = make_run()
-    admit(run, join("a"))
-    with pytest.raises(Refused, match="onnxruntime") as no:
-        admit(run, replace(join("b"), numerics_class="other"))
-    assert no.value.code == "other_numerics"
-    run.hello = replace(run.hello, allow_inexact=True)
-    assert run.progress.exact
-    admit(run, replace(join("b"), numerics_class="other"))
-    assert not run.progress.exact
+def request(role: Role, name: str, numerics_class: str = "c") -> JoinRequest:
+    environment = SPEC if role == "actor" else None
+    return replace(join(name), role=role, numerics_class=numerics_class, environment=environment)
 
 
-def test_another_environment_is_refused(make_run: Callable[..., Run]) -> None:
+def refusal(ask: Callable[[], None]) -> str:
+    """Return the code with which something is refused."""
     with pytest.raises(Refused) as no:
-        admit(make_run(), replace(join("a"), environment=replace(SPEC, max_episode_steps=5)))
-    assert no.value.code == "other_environment"
+        ask()
+    return no.value.code
+
+
+@pytest.mark.parametrize("role", ["actor", "learner"])
+def test_who_is_not_known_must_join(role: Role, make_run: MakeRun) -> None:
+    one = Admission(make_run())
+    assert refusal(lambda: one.check(role, "a")) == "join_first"
+    one.join(request(role, "a"), 0.0)
+    one.check(role, "a")
+    one.leave(role, "a")
+    assert refusal(lambda: one.check(role, "a")) == "join_first"
+
+
+@pytest.mark.parametrize(
+    ("role", "field"), [("actor", "acting_class"), ("learner", "training_class")]
+)
+def test_first_that_delivers_sets_the_numerics_class(
+    role: Role, field: str, make_run: MakeRun
+) -> None:
+    run = make_run()
+    one = Admission(run)
+    for name in ("first", "second"):
+        one.join(request(role, name, f"of {name}"), 0.0)
+        one.check(role, name)
+    assert run.hello == run.store.fact("hello", Hello)
+    assert (run.hello.acting_class, run.hello.training_class) == ("", "")
+    with run.store.transaction():
+        one.note_accepted(role, "second")
+    assert getattr(run.hello, field) == "of second"
+    assert run.store.fact("hello", Hello) == run.hello
+    one.check(role, "second")
+    assert refusal(lambda: one.check(role, "first")) == "other_numerics"
+    assert refusal(lambda: one.check(role, "first")) == "join_first"
+    assert refusal(lambda: one.join(request(role, "first", "of first"), 0.0)) == "other_numerics"
+    assert run.progress.exact
+
+
+def test_actors_and_learners_are_compared_among_themselves(make_run: MakeRun) -> None:
+    run = make_run()
+    one = Admission(run)
+    one.join(request("actor", "a", "of actors"), 0.0)
+    with run.store.transaction():
+        one.note_accepted("actor", "a")
+    one.join(request("learner", "l", "of learners"), 0.0)
+    one.check("learner", "l")
+
+
+def test_what_an_actor_holds_that_may_no_longer_act_goes_to_others(make_run: MakeRun) -> None:
+    run = make_run()
+    one = Admission(run)
+    for name in ("a", "b"):
+        one.join(request("actor", name, f"of {name}"), 0.0)
+        assert run.dealer.deal(run.dealer.actors[name].request, 0, 0.0) == []
+    held = run.dealer.deal(replace(run.dealer.actors["b"].request, wanted=1), 0, 0.0)
+    with run.store.transaction():
+        one.note_accepted("actor", "a")
+    assert refusal(lambda: one.check("actor", "b")) == "other_numerics"
+    again = run.dealer.deal(replace(run.dealer.actors["a"].request, wanted=9), 0, 0.0)
+    assert held[0] in again
+
+
+def test_run_that_allows_it_is_inexact_once_it_holds_something_of_another_class(
+    make_run: MakeRun,
+) -> None:
+    run = make_run()
+    run.hello = replace(run.hello, allow_inexact=True)
+    one = Admission(run)
+    for name in ("a", "b"):
+        one.join(request("actor", name, f"of {name}"), 0.0)
+    with run.store.transaction():
+        one.note_accepted("actor", "a")
+    one.check("actor", "b")
+    assert run.progress.exact
+    with run.store.transaction():
+        one.note_accepted("actor", "b")
+    assert run.progress.inexact_reason == "actor b is of another numerics class"
+
+
+def test_another_environment_is_refused(make_run: MakeRun) -> None:
+    other = replace(join("a"), environment=replace(SPEC, max_episode_steps=5))
+    assert refusal(lambda: Admission(make_run()).join(other, 0.0)) == "other_environment"
 
 
 def test_actors_in_quarantine_and_too_many_are_refused(
-    make_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = make_run()
+    one = Admission(run)
     with run.store.transaction():
         run.quarantined.add("liar", "it lied")
     with pytest.raises(Refused, match="it lied"):
-        admit(run, join("liar"))
+        one.join(join("liar"), 0.0)
     monkeypatch.setattr(admission, "MOST_ACTORS", 1)
-    admit(run, join("a"))
-    run.dealer.join(join("a"), 0.0)
-    with pytest.raises(Refused) as no:
-        admit(run, join("b"))
-    assert no.value.code == "too_many_actors"
-    admit(run, replace(join("l"), role="learner"))
+    one.join(join("a"), 0.0)
+    assert refusal(lambda: one.join(join("b"), 0.0)) == "too_many_actors"
+    one.join(request("learner", "l"), 0.0)
+
+
+def test_learners_that_are_remembered_are_bounded(
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(admission, "_MOST_LEARNERS", 2)
+    one = Admission(make_run())
+    for name in ("a", "b", "a", "c"):
+        one.join(request("learner", name), 0.0)
+    one.check("learner", "a")
+    assert refusal(lambda: one.check("learner", "b")) == "join_first"
+
+
+def test_actor_whose_environment_does_something_else_needs_an_inexact_run(
+    make_run: MakeRun,
+) -> None:
+    run = make_run()
+    one = Admission(run)
+    actor = replace(request("actor", "a"), environment_digest="of another")
+    one.join(actor, 0.0)  # this run's environment does not repeat itself: nothing to compare
+    run.hello = replace(run.hello, environment_digest="of its own")
+    assert refusal(lambda: one.join(actor, 0.0)) == "other_environment"
+    one.join(request("learner", "l"), 0.0)
+    one.join(replace(actor, environment_digest="of its own"), 0.0)
+    assert run.progress.exact
+    run.hello = replace(run.hello, allow_inexact=True)
+    one.join(actor, 0.0)
+    assert not run.progress.exact

@@ -4,6 +4,7 @@ import os
 import random
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -20,7 +21,9 @@ from udrl_proto.codec import LARGEST
 from udrl_replay.database import FILE
 from udrl_replay.run import Run
 from udrl_replay.store import Store, Version
-from udrl_replay.tables import SEALED
+from udrl_replay.tables import SEALED, seal
+
+TABLES_THERE = [*SEALED, "bodies"]
 
 
 @pytest.fixture
@@ -31,6 +34,16 @@ def written(tmp_path: Path) -> Path:
         with store.transaction():
             store.add_version(Version(1000, b"digest", 0.5, BLOB, BLOB), 0.1)
             store.add_episode(store.buffer(1000)[0].entry._replace(id=10**9), b"digest", BLOB)
+    return tmp_path / FILE
+
+
+@pytest.fixture
+def unfinished(tmp_path: Path) -> Path:
+    """The closed file of a run that goes on, with rows in all tables."""
+    with closing(create(tmp_path, lead=1)) as store:
+        run = Run(store, Budget(max_env_steps=1000))
+        for _ in range(8):
+            work(run)
     return tmp_path / FILE
 
 
@@ -119,7 +132,10 @@ def test_changed_episode_is_noticed(written: Path) -> None:
 @pytest.mark.parametrize(
     ("statement", "complaint"),
     [
-        ("DELETE FROM facts WHERE name = 'hello'", "fact 'hello' is missing"),
+        ("DELETE FROM facts WHERE name = 'hello'", "table facts has 3 rows, not the 4 that were"),
+        ("DELETE FROM facts WHERE name = 'tallies'", "fact 'tallies' is missing in table facts"),
+        ("UPDATE versions SET weights = NULL WHERE version = 1000", "table versions has "),
+        ("UPDATE versions SET optimizer = NULL WHERE version = 1000", "table versions has "),
         ("UPDATE facts SET value = '{' WHERE name = 'progress'", "name 'progress' of facts is not"),
         ("INSERT INTO commands VALUES (7, 0, x'c1', x'')", "id 7 of commands is not what was"),
         ("UPDATE commands SET cancelled = 1 - cancelled", " of commands is not what was written"),
@@ -148,6 +164,73 @@ def test_value_that_became_another_one_is_noticed(table: str, column: str, writt
     )
     with pytest.raises(DamagedStore, match=f"{key} .* of {table} is not what was written; restore"):
         read_everything(written.parent)
+
+
+def keys_of(file: Path, table: str) -> list[tuple[object, ...]]:
+    """Return the primary keys of a table's rows."""
+    with closing(sqlite3.connect(file)) as db:
+        columns = primary_key(db, table)
+        return db.execute(f"SELECT {', '.join(columns)} FROM {table}").fetchall()
+
+
+def primary_key(db: sqlite3.Connection, table: str) -> list[str]:
+    rows = db.execute(f"PRAGMA table_info({table})").fetchall()
+    return [name for _, name, *_, part in rows if part]
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+@pytest.mark.parametrize("table", TABLES_THERE)
+def test_any_row_that_is_gone_is_noticed(table: str, read_only: bool, unfinished: Path) -> None:
+    whole = unfinished.read_bytes()
+    keys = keys_of(unfinished, table)
+    assert keys
+    with closing(sqlite3.connect(unfinished)) as db:
+        this_row = " AND ".join(f"{column} = ?" for column in primary_key(db, table))
+    for key in keys:
+        edit(unfinished, f"DELETE FROM {table} WHERE {this_row}", *key)
+        with pytest.raises(DamagedStore, match=f"{unfinished}: .*{table}.*; restore the run dir"):
+            Store(unfinished.parent, read_only=read_only).close()
+        unfinished.write_bytes(whole)
+    Store(unfinished.parent, read_only=read_only).close()
+
+
+@pytest.mark.parametrize("table", TABLES_THERE)
+def test_row_that_came_from_elsewhere_is_noticed(table: str, unfinished: Path) -> None:
+    """It has a seal, as the row of another run has."""
+    with closing(sqlite3.connect(unfinished)) as db, db:
+        db.create_function("seal", -1, seal)
+        key, *_ = primary_key(db, table)
+        columns = [name for _, name, *_ in db.execute(f"PRAGMA table_info({table})")]
+        other = "'other'" if table == "facts" else f"{key} + 7777777"
+        there = {c: other if c == key else c for c in columns}
+        if "seal" in there:
+            covered = [there[column] for column in SEALED[table].split(", ")]
+            there["seal"] = f"seal({', '.join(covered)})"
+        values = ", ".join(there.values())
+        db.execute(f"INSERT INTO {table} SELECT {values} FROM {table} LIMIT 1")
+    with pytest.raises(DamagedStore, match=f"table {table} has "):
+        Store(unfinished.parent)
+
+
+def test_table_that_is_as_it_was_before_is_noticed(tmp_path: Path) -> None:
+    """All its rows were written once, and as many."""
+
+    def work_on(store: Store) -> None:
+        run = Run(store, Budget(max_env_steps=1000))
+        work(run)
+        while len(run.open_commands()) != 3:
+            work(run)
+
+    with closing(create(tmp_path)) as store:
+        work_on(store)
+    file = tmp_path / FILE
+    edit(file, "CREATE TABLE before AS SELECT * FROM commands")
+    with closing(Store(tmp_path)) as store:
+        work_on(store)
+    edit(file, "DELETE FROM commands")
+    edit(file, "INSERT INTO commands SELECT * FROM before")
+    with pytest.raises(DamagedStore, match="table commands has 3 rows, not the 3 that were writt"):
+        Store(tmp_path)
 
 
 def test_flipped_bits_are_told_or_harmless(written: Path) -> None:

@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -173,14 +174,20 @@ def lines(run_dir: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def write_metrics(run: Run, run_dir: Path) -> None:
+    with closing(MetricsFile(run_dir, run.store)) as metrics:
+        metrics.update(run.progress.iteration)
+
+
 def test_every_iteration_has_one_line(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(lead=1, max_env_steps=60)
-    metrics = MetricsFile(tmp_path, run.store)
-    assert (tmp_path / "metrics.csv").read_text() == ",".join(COLUMNS) + "\n"
-    while run.progress.state != "ended":
-        work(run)
-        metrics.update(run.progress.iteration)
-        metrics.update(run.progress.iteration)
+    with closing(MetricsFile(tmp_path, run.store)) as metrics:
+        assert (tmp_path / "metrics.csv").read_text() == ",".join(COLUMNS) + "\n"
+        while run.progress.state != "ended":
+            work(run)
+            metrics.update(run.progress.iteration)
+            metrics.update(run.progress.iteration)
+            assert len(lines(tmp_path)) == run.progress.iteration + 1
     found = lines(tmp_path)
     assert [int(line["iteration"]) for line in found] == list(range(run.progress.iteration + 1))
     assert int(found[-1]["env_steps"]) == run.progress.env_steps
@@ -192,7 +199,7 @@ def test_line_of_an_evaluated_iteration_carries_the_evaluation(
 ) -> None:
     run = make_run(max_env_steps=60)
     finish(run)
-    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    write_metrics(run, tmp_path)
     evaluation = run.store.last_evaluation(closing=False)
     assert evaluation is not None
     found = lines(tmp_path)
@@ -209,13 +216,12 @@ def test_metrics_of_a_resumed_run_are_those_of_one_that_never_stopped(
     make_run: MakeRun, reopened: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(lead=2, max_env_steps=30)
-    first = MetricsFile(tmp_path, run.store)
     finish(run)
-    first.update(run.progress.iteration)
+    write_metrics(run, tmp_path)
     before = lines(tmp_path)
     run = reopened(run, Budget(max_env_steps=60))
     finish(run)
-    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    write_metrics(run, tmp_path)
     after = lines(tmp_path)
     assert after[: len(before)] == before
     assert len(after) == run.progress.iteration + 1
@@ -234,7 +240,7 @@ def test_waits_are_bounded() -> None:
 def test_history_is_what_the_metrics_say(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(lead=1, max_env_steps=60)
     finish(run)
-    MetricsFile(tmp_path, run.store).update(run.progress.iteration)
+    write_metrics(run, tmp_path)
     found = history(run.store, -1)
     assert decode(encode(found), History) == found
     assert not found.more

@@ -216,3 +216,16 @@ def test_forgotten_blobs_leave_digest_and_loss(store: Store) -> None:
 @pytest.mark.parametrize("ask", [lambda s: s.version(9), lambda s: s.episode_digest(9)])
 def test_what_was_never_there_is_none(ask: Callable[[Store], object], store: Store) -> None:
     assert ask(store) is None
+
+
+def test_learner_never_goes_on_from_a_part_of_the_latest_version(store: Store) -> None:
+    with pytest.raises(DamagedStore, match="weights version 3, the latest, is gone"):
+        store.state(3)
+    whole = Version(3, b"digest", 0.25, b"w", b"o")
+    with store.transaction():
+        store.add_version(whole, 0.1)
+    assert store.state(3) == whole
+    with store.transaction():
+        store.drop_optimizers(4)
+    with pytest.raises(DamagedStore, match="weights version 3"):
+        store.state(3)

@@ -164,13 +164,7 @@ class Courier(threading.Thread):
             env_steps_per_s=round(rate, 1),
             weights_version=self._behaviors.newest,
         )
-        try:
-            reply = self._asker.ask(verbs.COMMANDS, request)
-        except Refused as refusal:
-            if refusal.code != "join_first":
-                raise
-            self._asker.ask(verbs.JOIN, self._join)
-            return 0.0
+        reply = self._asker.ask_joined(verbs.COMMANDS, request, self._join)
         if reply.ended:
             self.ended = True
         with self._changed:

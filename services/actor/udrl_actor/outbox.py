@@ -16,7 +16,7 @@ from udrl.errors import Refused
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode_episode
-from udrl_proto.messages import FailureMessage
+from udrl_proto.messages import FailureMessage, JoinRequest
 
 log = logging.getLogger("udrl")
 
@@ -27,8 +27,13 @@ _BYTES_UNDER_WAY = 256 * 1024
 _LOOK_S = 0.5
 
 
-def deliver(asker: Asker, actor: str, outcome: Episode | Failure) -> int:
+def deliver(asker: Asker, join: JoinRequest, outcome: Episode | Failure) -> int:
     """Deliver what came of a command; return the command's id when that is acknowledged.
+
+    Args:
+        asker: the actor's line to the replay service.
+        join: who the actor is.
+        outcome: of the command.
 
     Raises:
         Refused: the replay service cannot read it, so it could not read the next one either.
@@ -37,11 +42,11 @@ def deliver(asker: Asker, actor: str, outcome: Episode | Failure) -> int:
     if isinstance(outcome, Failure):
         command_id = outcome.command.id
         error = str(outcome.error)[:4000]
-        failure = FailureMessage(actor=actor, command_id=command_id, error=error)
+        failure = FailureMessage(actor=join.id, command_id=command_id, error=error)
         asker.ask(verbs.FAILURE, failure)
         return command_id
     try:
-        asker.ask(verbs.EPISODE, encode_episode(outcome, actor))
+        asker.ask_joined(verbs.EPISODE, encode_episode(outcome, join.id), join)
     except Refused as refusal:
         if refusal.code != "rejected":
             raise

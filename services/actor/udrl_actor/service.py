@@ -93,7 +93,7 @@ class ActorService:
             courier = Courier(self._transport, self._hello, join, asker, self._stop)
 
             def deliver_one(outcome: Episode | Failure) -> None:
-                courier.note_acknowledged(deliver(asker, self._name, outcome))
+                courier.note_acknowledged(deliver(asker, join, outcome))
 
             outbox = Outbox(f"outbox of {self._name}", deliver_one, courier.fail)
             courier.start()

@@ -22,6 +22,7 @@ from udrl_proto.messages import Hello
 from udrl_proto.transport import Transport
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.database import is_locked
+from udrl_replay.remedies import unwritable
 
 log = logging.getLogger("udrl")
 
@@ -61,16 +62,24 @@ def connected(
     """
     endpoint, run_id, patience_s, keys = address
     credentials = load(keys, role) if keys else None
-    with sessions.connect(endpoint, patience_s, stop, credentials) as session:
+    session = sessions.connect(endpoint, patience_s, stop, credentials)
+    with sessions.closed_at_the_end(session):
         yield ZenohTransport(session), sessions.find_run(session, run_id, patience_s, stop)
 
 
 @contextmanager
 def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
-    """Say in a run's directory that this process serves it at an endpoint."""
+    """Say in a run's directory that this process serves it at an endpoint.
+
+    Raises:
+        StoreError: it cannot be written there.
+    """
     file = run_dir / ENDPOINT_FILE
     where = {"endpoint": endpoint, "host": platform.node(), "pid": os.getpid()}
-    file.write_text(json.dumps(where), encoding="utf-8")
+    try:
+        file.write_text(json.dumps(where), encoding="utf-8")
+    except OSError as error:
+        raise unwritable(file, error) from error
     try:
         yield
     finally:

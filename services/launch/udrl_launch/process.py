@@ -4,11 +4,13 @@ import contextlib
 import ctypes
 import logging
 import os
+import resource
 import signal
 import socket
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 from udrl.errors import Interrupted, UdrlError
 
@@ -18,6 +20,9 @@ log = logging.getLogger("udrl")
 GRACE_S = 4.0
 
 _PR_SET_PDEATHSIG = 1
+
+#: Six for each service that may join.
+_MOST_FILES = 65_536
 
 #: Parameters of the C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
@@ -42,6 +47,19 @@ def die_with_parent(parent: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit(0)
+
+
+def allow_open_files() -> None:
+    """Let this process have as many files open as it may; by default many systems say 1,024.
+
+    Each service that joins is a connection of the replay service. More than fleets need is not
+    asked for: some programs that environments start walk through all that could be open.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):  # another system's own limit is lower
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def keep_freed_memory() -> None:
@@ -76,7 +94,9 @@ def run_service(service: Callable[[threading.Event], None]) -> int:
     The service has the main thread, since some environments can be made and stepped nowhere else:
     those that handle signals, run an event loop or draw. A thread beside it hears of signals even
     while native code keeps the main thread, and ends the process if the service does not.
+    The process may open more files from then on.
     """
+    allow_open_files()
     stop = threading.Event()
     ended = threading.Event()
     received: list[int] = []

@@ -48,13 +48,17 @@ def replay(
             if listen
             else sessions.connect(endpoint, Address(endpoint).patience_s, stop, credentials)
         )
-        with session:
-            service = ReplayService(ZenohTransport(session), store, budget, run_dir, audit)
-            with announced(run_dir, endpoint):
-                service.serve(stop)
-            progress = service.run.progress
-            if progress.state == "failed":
-                raise (Deceived if progress.deceived else RunFailed)(progress.problem)
+        with (
+            sessions.closed_at_the_end(session),
+            closing(
+                ReplayService(ZenohTransport(session), store, budget, run_dir, audit)
+            ) as service,
+            announced(run_dir, endpoint),
+        ):
+            service.serve(stop)
+        progress = service.run.progress
+        if progress.state == "failed":
+            raise (Deceived if progress.deceived else RunFailed)(progress.problem)
 
 
 def require_torch() -> None:

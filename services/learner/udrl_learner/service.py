@@ -13,6 +13,7 @@ import platform
 import threading
 import time
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from udrl.checkpoint import decode_state, encode_optimizer
@@ -42,6 +43,9 @@ log = logging.getLogger("udrl")
 
 #: Episodes that are asked for at once; a page holds fewer, usually.
 _ASK_FOR = 10_000
+
+#: Pauses before a learner that did not get on begins again, seconds; after the last it ends.
+_PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 
 #: Seconds after which a wait for the replay service looks whether it is still of use.
 _LOOK_S = 0.5
@@ -80,28 +84,27 @@ class LearnerService:
         self._stop = stop
         self._asker = Asker(transport, hello.run_id, f"learner {name}", stop)
         self._progress = threading.Event()
+        self._delivered = False
 
     @exact_arithmetic()
     def run(self) -> None:
         """Train until the run ends or ``stop`` is set.
 
         Raises:
-            Refused: the run does not want this learner.
+            Refused: the run does not want this learner, or has it start over without end.
             Unreachable: the replay service has not answered for long.
         """
         run_id = self._hello.run_id
         declared: list[Any] = []
         try:
-            self._join()
+            self._asker.ask(verbs.JOIN, self._join)
             declared += [
                 self._transport.appear(keys.alive(run_id, "learner", self._name)),
                 self._transport.subscribe(
                     keys.key(run_id, keys.PROGRESS), lambda _: self._progress.set()
                 ),
             ]
-            ended = False
-            while not ended:
-                ended = self._train_from(self._latest())
+            self._train_until_ended()
             log.info("learner %s: the run has ended", self._name)
         except Interrupted as interruption:
             log.info("%s", interruption)
@@ -109,8 +112,10 @@ class LearnerService:
             for declaration in declared:
                 declaration.undeclare()
 
-    def _join(self) -> None:
-        request = JoinRequest(
+    @cached_property
+    def _join(self) -> JoinRequest:
+        """Who this learner is."""
+        return JoinRequest(
             role="learner",
             id=self._name,
             host=platform.node(),
@@ -118,7 +123,33 @@ class LearnerService:
             software=__version__,
             numerics_class=training_class(self._config, self._spec),
         )
-        self._asker.ask(verbs.JOIN, request)
+
+    def _train_until_ended(self) -> None:
+        """Train from the latest version that there is, and again whenever that is another one.
+
+        Raises:
+            Refused: as often as there are pauses, the run had not got on when it began again.
+        """
+        began_with, in_vain = -1, 0
+        while True:
+            state = self._latest()
+            if state.version > began_with:
+                in_vain = 0  # another learner was faster
+            began_with, self._delivered = state.version, False
+            refusal = self._train_from(state)
+            if refusal is None:
+                return
+            log.warning("learner %s starts over: %s", self._name, refusal)
+            in_vain = 0 if self._delivered else in_vain + 1
+            if in_vain > len(_PAUSES_S):
+                raise Refused(
+                    refusal.code,
+                    f"learner {self._name} began again {in_vain} times with weights version "
+                    f"{began_with} and got no further: {refusal}; the replay service contradicts "
+                    f"itself: stop it, and start it again with --resume",
+                )
+            if in_vain:
+                self._stop.wait(_PAUSES_S[in_vain - 1])
 
     def _latest(self) -> TrainingState:
         """Return the state to go on from: the replay service's latest version."""
@@ -129,10 +160,10 @@ class LearnerService:
         log.info("learner %s goes on from weights version %d", self._name, reply.version)
         return decode_state(reply.version, reply.weights, reply.optimizer, self._config, self._spec)
 
-    def _train_from(self, state: TrainingState) -> bool:
-        """Train version after version; return whether the run has ended.
+    def _train_from(self, state: TrainingState) -> Refused | None:
+        """Train version after version until the run has ended.
 
-        False means: the replay service expects another version than the next one here.
+        Returns what the replay service said if it expects another version than the next one here.
         """
         experience = Experience(self._config, self._spec)
         useless = threading.Event()
@@ -155,12 +186,11 @@ class LearnerService:
             except Refused as refusal:
                 if refusal.code not in ("rewind", "unknown_episode"):
                     raise
-                log.warning("learner %s starts over: %s", self._name, refusal)
-                return False
+                return refusal
             finally:
                 useless.set()
                 self._progress.set()
-            return True
+            return None
 
     def _result(
         self, fetched: "Future[Buffer | None]", delivered: "Future[None] | None"
@@ -204,7 +234,7 @@ class LearnerService:
         while not useless.is_set():
             self._progress.clear()
             request = ChangesRequest(learner=self._name, version=version)
-            changes = self._asker.ask(verbs.CHANGES, request)
+            changes = self._asker.ask_joined(verbs.CHANGES, request, self._join)
             if changes.ended:
                 break
             if changes.wait is None:
@@ -223,7 +253,8 @@ class LearnerService:
         return episodes
 
     def _deliver(self, message: VersionMessage) -> None:
-        self._asker.ask(verbs.VERSION, message)
+        self._asker.ask_joined(verbs.VERSION, message, self._join)
+        self._delivered = True
         # Not acknowledged: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
         announcement = encode(Weights(version=message.version, weights=message.weights))

@@ -1,30 +1,56 @@
-"""Who may take part in a run: those who have its environment and compute its numbers."""
+"""Who may take part in a run: those who have its environment and compute its numbers.
+
+The first actor whose episode is accepted sets the numerics class of the run's actors, the first
+learner whose version is accepted that of its learners. Who merely joins sets nothing, so that a
+service which never delivers keeps nobody away. Whoever delivers must have joined, since only
+then its class is known.
+"""
 
 import msgspec
 
 from udrl.errors import Refused
-from udrl_proto.messages import JoinRequest
+from udrl_proto.messages import JoinRequest, Role
 from udrl_replay.dealing import MOST_ACTORS
 from udrl_replay.run import Run
 
+#: Learners that are remembered; the one that has not joined for the longest time goes first.
+_MOST_LEARNERS = 1000
 
-def admit(run: Run, request: JoinRequest) -> None:
-    """Let a service take part; the first of a role sets the run's numerics class for it.
 
-    Raises:
-        Refused: its environment or its numbers are others, it is shut out, or there are too many.
+class Admission:
+    """Lets services take part, or not.
+
+    Args:
+        run: in what; its dealer knows the actors.
     """
-    hello = run.hello
-    if request.environment is not None and request.environment != hello.environment:
-        raise Refused(
-            "other_environment",
-            f"the run's environment is {hello.environment}, yours is {request.environment}; "
-            f"install the same version of the package that provides {hello.config.environment}",
-        )
-    if request.role == "actor":
-        _compare_environments(run, request)
-    _settle_numerics(run, request)
-    if request.role == "actor":
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._learners: dict[str, str] = {}  # numerics classes by name
+
+    def join(self, request: JoinRequest, now: float) -> None:
+        """Let a service take part.
+
+        Raises:
+            Refused: its environment or its numbers are others, it is shut out, or there are too
+                many.
+        """
+        run, hello = self._run, self._run.hello
+        if request.environment is not None and request.environment != hello.environment:
+            raise Refused(
+                "other_environment",
+                f"the run's environment is {hello.environment}, yours is {request.environment}; "
+                f"install the same version of the package that provides {hello.config.environment}",
+            )
+        if request.role == "actor":
+            self._compare_environments(request)
+        self._compare(request.role, request.numerics_class)
+        if request.role == "learner":
+            self._learners.pop(request.id, None)
+            self._learners[request.id] = request.numerics_class
+            if len(self._learners) > _MOST_LEARNERS:
+                del self._learners[next(iter(self._learners))]
+            return
         if request.id in run.quarantined:
             raise run.quarantined.refusal(request.id)
         if len(run.dealer.actors) >= MOST_ACTORS:
@@ -33,38 +59,76 @@ def admit(run: Run, request: JoinRequest) -> None:
                 f"{MOST_ACTORS} actors have joined, which is the most; give fewer actors more "
                 f"environments (--envs)",
             )
+        run.dealer.join(request, now)
 
+    def check(self, role: Role, name: str) -> None:
+        """Make sure that a service takes part, before it is given or brings something.
 
-def _compare_environments(run: Run, request: JoinRequest) -> None:
-    """Compare what the environments do, where that is more than chance."""
-    hello, found = run.hello, request.environment_digest
-    if not hello.environment_digest or found == hello.environment_digest:
-        return
-    if not hello.allow_inexact:
-        raise Refused(
-            "other_environment",
-            f"the environment {hello.config.environment} gives other observations or rewards "
-            f"on {request.host} than where the run was created (a short episode has the digest "
-            f"{found or 'of nothing'}, not {hello.environment_digest}); install the same version "
-            f"of its package and of what it computes with, or create the run with --allow-inexact",
-        )
-    run.mark_inexact(f"the environment of actor {request.id} does something else")
+        Raises:
+            Refused: it is not known, or another class than its own was set since it joined.
+        """
+        numerics_class = self._class_of(role, name)
+        if numerics_class is None:
+            raise Refused("join_first", f"{role} {name} has not joined; send join first")
+        try:
+            self._compare(role, numerics_class)
+        except Refused:
+            self.leave(role, name)
+            raise
 
+    def note_accepted(self, role: Role, name: str) -> None:
+        """Note that something was accepted from a service that was checked."""
+        run, field = self._run, _FIELDS[role]
+        known, numerics_class = getattr(run.hello, field), self._class_of(role, name)
+        if not known:
+            run.hello = msgspec.structs.replace(run.hello, **{field: numerics_class})
+            run.store.set_fact("hello", run.hello)
+        elif known != numerics_class:
+            run.mark_inexact(f"{role} {name} is of another numerics class")
 
-def _settle_numerics(run: Run, request: JoinRequest) -> None:
-    field = "acting_class" if request.role == "actor" else "training_class"
-    known = getattr(run.hello, field)
-    if not known:
-        run.hello = msgspec.structs.replace(run.hello, **{field: request.numerics_class})
-        run.store.set_fact("hello", run.hello)
-    elif known != request.numerics_class:
-        if not run.hello.allow_inexact:
-            library = "onnxruntime" if request.role == "actor" else "torch"
+    def leave(self, role: str, name: str) -> None:
+        """Forget a service, and give what an actor held to others."""
+        if role == "actor":
+            self._run.lose(name)
+        elif role == "learner":
+            self._learners.pop(name, None)
+
+    def _class_of(self, role: Role, name: str) -> str | None:
+        if role == "learner":
+            return self._learners.get(name)
+        actor = self._run.dealer.actors.get(name)
+        return actor.join.numerics_class if actor else None
+
+    def _compare_environments(self, request: JoinRequest) -> None:
+        """Compare what the environments do, where that is more than chance."""
+        hello, found = self._run.hello, request.environment_digest
+        if not hello.environment_digest or found == hello.environment_digest:
+            return
+        if not hello.allow_inexact:
             raise Refused(
-                "other_numerics",
-                f"the run's {request.role}s round like class {known}, this machine like "
-                f"{request.numerics_class}, so results would depend on who computes them; use "
-                f"a machine with the same kind of processor and the same versions of {library} "
-                f"and numpy, or create the run with --allow-inexact",
+                "other_environment",
+                f"the environment {hello.config.environment} gives other observations or rewards "
+                f"on {request.host} than where the run was created (a short episode has the "
+                f"digest {found or 'of nothing'}, not {hello.environment_digest}); install the "
+                f"same version of its package and of what it computes with, or create the run "
+                f"with --allow-inexact",
             )
-        run.mark_inexact(f"{request.role} {request.id} is of another numerics class")
+        self._run.mark_inexact(f"the environment of actor {request.id} does something else")
+
+    def _compare(self, role: Role, numerics_class: str) -> None:
+        hello = self._run.hello
+        known = getattr(hello, _FIELDS[role])
+        if known in ("", numerics_class) or hello.allow_inexact:
+            return
+        library = "onnxruntime" if role == "actor" else "torch"
+        raise Refused(
+            "other_numerics",
+            f"the run's {role}s round like class {known}, this machine like {numerics_class}, so "
+            f"results would depend on who computes them; use a machine with the same kind of "
+            f"processor and the same versions of {library} and numpy, or create the run with "
+            f"--allow-inexact",
+        )
+
+
+#: Where the run specification has the class of each role.
+_FIELDS: dict[Role, str] = {"actor": "acting_class", "learner": "training_class"}

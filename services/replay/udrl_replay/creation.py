@@ -25,6 +25,7 @@ from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect
 from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
+from udrl_replay.remedies import remedy
 from udrl_replay.resuming import closed_on_error, resume
 from udrl_replay.run import Run
 from udrl_replay.store import Store
@@ -173,10 +174,8 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
         unfinished.replace(path)
     except OSError as error:
-        raise StoreError(
-            f"{path} cannot be written: {error}; free some disk space, or name a directory that "
-            f"you may write"
-        ) from error
+        what_to_do = remedy(error, "free some disk space, or name a directory that you may write")
+        raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error
 
 
 def _toml(value: object) -> str:

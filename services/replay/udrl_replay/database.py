@@ -1,7 +1,7 @@
 """A SQLite file of sealed rows, which one process writes and others may look at.
 
 Every change is one transaction, synced before anything is acknowledged; what is on disk is
-consistent at every moment, and a row that is not what was written is noticed.
+consistent at every moment, and a row that is not what was written, or is gone, is noticed.
 """
 
 import fcntl
@@ -16,7 +16,9 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
+from udrl_replay.remedies import remedy
 from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal
+from udrl_replay.tallies import TALLIES, Tallies, Tally
 
 FILE = "run.sqlite"
 LOCK = "lock"
@@ -67,6 +69,8 @@ class Database:
                 self._db.execute("PRAGMA synchronous = FULL")
                 # Some builds overwrite what is deleted: thirteen times the time for a megabyte.
                 self._db.execute("PRAGMA secure_delete = OFF")
+                # What a statement may have to take back is small, and needs no file.
+                self._db.execute("PRAGMA temp_store = MEMORY")
         except sqlite3.Error as error:
             raise self._fault(error) from error
         self._db.create_function("seal", -1, seal, deterministic=True)
@@ -81,6 +85,7 @@ class Database:
                 f"use the version that wrote it"
             )
         self._check_seals()
+        self._check_tallies()
 
     def _connect(self, how: str) -> sqlite3.Connection:
         # As a URI, so that a mode can be named and the path may hold any character.
@@ -108,6 +113,19 @@ class Database:
             if broken:
                 raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
 
+    def _check_tallies(self) -> None:
+        self._tallies = Tallies(self._db)
+        written = self.fact(TALLIES, dict[str, Tally])
+        for table, tally in self._tallies.held().items():
+            expected = written.get(table)
+            if tally != expected:
+                rows = expected.rows if expected else 0
+                raise self._damaged(
+                    f"table {table} has {tally.rows} rows, not the {rows} that were written"
+                )
+        if not self.read_only:
+            self._tallies.follow(self._db)
+
     @classmethod
     def create(cls, run_dir: Path, **facts: object) -> Self:
         """Make a new run's file, which holds some facts from the beginning.
@@ -118,7 +136,7 @@ class Database:
         """
         path = run_dir / FILE
         try:
-            run_dir.mkdir(parents=True, exist_ok=True)
+            _make(run_dir)
             with _lock(run_dir):
                 if path.exists():
                     raise StoreError(
@@ -129,15 +147,11 @@ class Database:
                 unfinished = path.with_suffix(".new")
                 unfinished.unlink(missing_ok=True)
                 with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
-                    db.executescript(TABLES)
-                    for name, value in {"schema": SCHEMA, **facts}.items():
-                        encoded = msgspec.json.encode(value)
-                        row = name, encoded, seal(name, encoded)
-                        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
+                    _begin(db, {"schema": SCHEMA, **facts})
                 unfinished.rename(path)
                 _sync(run_dir)
         except (OSError, sqlite3.Error) as error:
-            raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+            raise _unusable(run_dir, error) from error
         return cls(run_dir)
 
     def close(self) -> None:
@@ -156,9 +170,16 @@ class Database:
         """
         try:
             self._db.execute("BEGIN IMMEDIATE")
+            before = self._tallies.held()
             try:
                 yield
+                after = self._tallies.held()
+                if after != before:
+                    self.set_fact(TALLIES, after)
                 self._db.execute("COMMIT")
+            except BaseException:
+                self._tallies.put_back(before)
+                raise
             finally:
                 # After some errors SQLite has rolled back by itself.
                 if self._db.in_transaction:
@@ -167,7 +188,7 @@ class Database:
             raise self._fault(error) from error
 
     def _insert(self, table: str, *values: Value, unsealed: Sequence[bytes] = ()) -> None:
-        """Add a row: what its seal covers, the seal, and the rest."""
+        """Add a row, within a transaction: what its seal covers, the seal, and the rest."""
         insert = "INSERT OR REPLACE" if table in _REPLACED else "INSERT"
         row = *values, seal(*values), *unsealed
         self._db.execute(f"{insert} INTO {table} VALUES ({marks(row)})", row)
@@ -181,9 +202,10 @@ class Database:
     def _fault(self, error: sqlite3.Error) -> StoreError:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
             return self._damaged(error)
+        what_to_do = remedy(error, "free some disk space or repair the disk")
         return StoreError(
-            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: free some disk "
-            f"space or repair the disk, and start again with --resume"
+            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: {what_to_do}, "
+            f"and start again with --resume"
         )
 
     def _damaged(self, what: object) -> DamagedStore:
@@ -201,7 +223,7 @@ class Database:
         if not rows:
             if default is not None:
                 return default
-            raise self._damaged(f"fact {name!r} is missing")
+            raise self._damaged(f"fact {name!r} is missing in table facts")
         try:
             return msgspec.json.decode(rows[0][0], type=kind)
         except (msgspec.DecodeError, ConfigError) as error:
@@ -212,6 +234,29 @@ class Database:
         self._insert("facts", name, msgspec.json.encode(value))
 
 
+def _begin(db: sqlite3.Connection, facts: dict[str, object]) -> None:
+    """Make the tables of a new run, with some facts."""
+
+    def add(name: str, value: object) -> None:
+        encoded = msgspec.json.encode(value)
+        row = name, encoded, seal(name, encoded)
+        db.execute("INSERT INTO facts VALUES (?, ?, ?)", row)
+
+    db.executescript(TABLES)
+    db.create_function("seal", -1, seal, deterministic=True)
+    for name, value in facts.items():
+        add(name, value)
+    add(TALLIES, Tallies(db).held())
+
+
+def _make(run_dir: Path) -> None:
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        run_dir.stat()  # tells what a link in a loop, or to nowhere, really is
+        raise
+
+
 def _sync(folder: Path) -> None:
     """Make a renamed file's new name durable."""
     descriptor = os.open(folder, os.O_RDONLY)
@@ -219,6 +264,11 @@ def _sync(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _unusable(run_dir: Path, error: OSError | sqlite3.Error) -> StoreError:
+    what_to_do = remedy(error, "name one you may write")
+    return StoreError(f"run directory {run_dir}: {error}; {what_to_do}")
 
 
 def is_locked(run_dir: Path) -> bool:
@@ -241,7 +291,7 @@ def _lock(run_dir: Path) -> Any:
     try:
         file = (run_dir / LOCK).open("a")
     except OSError as error:
-        raise StoreError(f"run directory {run_dir}: {error}; name one you may write") from error
+        raise _unusable(run_dir, error) from error
     deadline = time.monotonic() + _LOOK_S
     while True:
         try:

@@ -4,11 +4,10 @@ import csv
 import logging
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from udrl.digests import replay_digest
-from udrl.errors import StoreError
 from udrl.strategies import Best
 from udrl.targets import ReturnInTime
 from udrl_proto.reports import (
@@ -26,6 +25,7 @@ from udrl_proto.reports import (
     Status,
     Waiting,
 )
+from udrl_replay.remedies import unwritable
 from udrl_replay.standing import Standing
 from udrl_replay.store import COLUMNS, EvaluationRow, Store
 
@@ -43,24 +43,30 @@ class MetricsFile:
         self._path = run_dir / "metrics.csv"
         self._store = store
         self._written = -1
-        self._write("w", [COLUMNS])
+        try:
+            with self._path.open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerow(COLUMNS)
+            # Kept open, so that no iteration needs another file.
+            self._file = self._path.open("a", newline="", encoding="utf-8")
+        except OSError as error:
+            raise unwritable(self._path, error) from error
 
     def update(self, iteration: int) -> None:
         """Append the lines of all iterations up to one."""
         if iteration <= self._written:
             return
-        self._write("a", self._store.metrics(self._written))
+        try:
+            rows = self._store.metrics(self._written)
+            csv.writer(self._file, lineterminator="\n").writerows(rows)
+            self._file.flush()
+        except OSError as error:
+            raise unwritable(self._path, error) from error
         self._written = iteration
 
-    def _write(self, mode: str, rows: Iterable[Sequence[object]]) -> None:
-        try:
-            with self._path.open(mode, newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerows(rows)
-        except OSError as error:
-            raise StoreError(
-                f"{self._path} cannot be written: {error}; free some disk space and start again "
-                f"with --resume; nothing is lost"
-            ) from error
+    def close(self) -> None:
+        """Close the file."""
+        with suppress(OSError):  # what a full disk did not take was told by update()
+            self._file.close()
 
 
 def write_weights(run_dir: Path, store: Store, version: int) -> None:
@@ -78,10 +84,7 @@ def write_weights(run_dir: Path, store: Store, version: int) -> None:
         unfinished.write_bytes(found.weights)
         unfinished.replace(path)
     except OSError as error:
-        raise StoreError(
-            f"{path} cannot be written: {error}; free some disk space and start again with "
-            f"--resume; nothing is lost"
-        ) from error
+        raise unwritable(path, error) from error
     log.info("the weights are in %s", path)
 
 

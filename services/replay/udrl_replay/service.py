@@ -52,7 +52,7 @@ from udrl_proto.messages import (
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
 from udrl_proto.transport import Declaration, Presence, Transport
-from udrl_replay.admission import admit
+from udrl_replay.admission import Admission
 from udrl_replay.arrival import Arrival, Malformed, inspect
 from udrl_replay.reporting import (
     MetricsFile,
@@ -105,6 +105,7 @@ class ReplayService:
         audit: float = 0.0,
     ) -> None:
         self.run = Run(store, budget, audit)
+        self._admission = Admission(self.run)
         self._transport = transport
         self._store = store
         self._run_dir = run_dir
@@ -165,6 +166,10 @@ class ReplayService:
                 ended_at = ended_at or now
                 if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
                     return
+
+    def close(self) -> None:
+        """Close the files that it keeps open, apart from the store."""
+        self._metrics.close()
 
     def open(self) -> list[Declaration]:
         """Begin to receive questions, which are checked on the thread that receives them."""
@@ -257,8 +262,7 @@ class ReplayService:
         else:
             self._here.discard(peer)
             self._waits.end(f"{role} {name}")
-            if role == "actor":
-                self.run.lose(name)
+            self._admission.leave(role, name)
             log.info("%s %s left", *peer)
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
@@ -271,9 +275,7 @@ class ReplayService:
         return msgspec.structs.replace(self.run.hello, exact=self.run.progress.exact)
 
     def _join(self, request: JoinRequest, now: float) -> JoinReply:
-        admit(self.run, request)
-        if request.role == "actor":
-            self.run.dealer.join(request, now)
+        self._admission.join(request, now)
         log.info("%s %s joined from %s", request.role, request.id, request.host)
         return JoinReply()
 
@@ -283,8 +285,7 @@ class ReplayService:
             return CommandsReply(ended=True)
         if request.actor in run.quarantined:
             raise run.quarantined.refusal(request.actor)
-        if request.actor not in run.dealer.actors:
-            raise Refused("join_first", f"actor {request.actor} has not joined; send join first")
+        self._admission.check("actor", request.actor)
         commands = run.deal(request, now)
         if commands:
             self._waits.end(who)
@@ -310,8 +311,11 @@ class ReplayService:
         return "actors", f"the others' episodes of iteration {run.progress.iteration + 1}"
 
     def _episode(self, arrival: Arrival, now: float) -> EpisodeReply:
+        if arrival.actor not in self.run.quarantined:
+            self._admission.check("actor", arrival.actor)
         result = self.run.accept(arrival, now)
         if result == "accepted":
+            self._admission.note_accepted("actor", arrival.actor)
             self._throughput.add(now, arrival.entry.length)
         return EpisodeReply(result=result)
 
@@ -323,6 +327,7 @@ class ReplayService:
         run, who = self.run, f"learner {request.learner}"
         if run.progress.state in ("ended", "failed"):
             return ChangesReply(ended=True)
+        self._admission.check("learner", request.learner)
         following = run.progress.latest_version + 1
         if request.version < following:
             raise Refused(
@@ -352,15 +357,18 @@ class ReplayService:
         return EpisodesReply(episodes=tuple(bodies))
 
     def _version(self, delivery: _Delivery, now: float) -> VersionReply:
+        learner = delivery.message.learner
+        self._admission.check("learner", learner)
         result = self.run.add_version(delivery.version, delivery.message.train_s)
         if result == "accepted":
+            self._admission.note_accepted("learner", learner)
             self._version_at = now
         return VersionReply(result=result)
 
     def _state(self, request: StateRequest, now: float) -> StateReply:
-        version = self._store.version(self.run.progress.latest_version)
-        if version is None:
+        if self.run.progress.latest_version == 0:
             return StateReply(version=0)
+        version = self._store.state(self.run.progress.latest_version)
         return StateReply(
             version=version.version, weights=version.weights, optimizer=version.optimizer
         )

@@ -279,6 +279,17 @@ class Store(Database):
                 raise self._damaged(f"weights version {version} is not what was written")
         return found
 
+    def state(self, version: int) -> Version:
+        """Return the version that a learner goes on from, with its optimizer.
+
+        Raises:
+            DamagedStore: it is not there as a whole, or not what was written.
+        """
+        found = self.version(version)
+        if found is None or not (found.weights and found.optimizer):
+            raise self._damaged(f"weights version {version}, the latest, is gone")
+        return found
+
     def versions_kept(self) -> list[int]:
         """Return the versions whose weights are there."""
         rows = self._rows("SELECT version FROM versions WHERE weights IS NOT NULL ORDER BY version")
