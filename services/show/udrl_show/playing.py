@@ -32,15 +32,22 @@ class Screen(Protocol):
         ...
 
 
-def with_seed(commands: list[Command], seed: int) -> list[Command]:
-    """Return commands whose environments and actions follow from ``seed``, one more for each."""
+def with_seeds(commands: list[Command], first: int | None = None) -> list[Command]:
+    """Return commands whose episodes follow from their seeds, so that a seed says which they are.
+
+    Args:
+        commands: of an evaluation, whose actions follow from their places in it.
+        first: the first seed, one more for each that follows; None: the environments' seeds stay.
+    """
+    seeds = [
+        command.environment_seed if first is None else (first + k) % 2**31
+        for k, command in enumerate(commands)
+    ]
     return [
         msgspec.structs.replace(
-            command,
-            environment_seed=(seed + k) % 2**31,
-            stream_key=stream_key(seed + k, Purpose.EPISODE),
+            command, environment_seed=seed, stream_key=stream_key(seed, Purpose.EPISODE)
         )
-        for k, command in enumerate(commands)
+        for command, seed in zip(commands, seeds, strict=True)
     ]
 
 

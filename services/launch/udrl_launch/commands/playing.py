@@ -16,7 +16,7 @@ from udrl_launch.commands.options import (
 from udrl_launch.output import print_json
 from udrl_launch.paths import shown
 from udrl_show.playing import play as play_episodes
-from udrl_show.playing import with_seed
+from udrl_show.playing import with_seeds
 from udrl_show.window import KEYS_HELP, Window
 
 
@@ -28,8 +28,8 @@ from udrl_show.window import KEYS_HELP, Window
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
               help="Episodes to play.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1),
-              help="Of the first episode, one more for each that follows. Default: those of the "
-              "run's closing evaluation.")  # fmt: skip
+              help="Of the first episode, one more for each that follows; command, weights and seed "
+              "are an episode. Default: those of the run's closing evaluation.")  # fmt: skip
 @click.option("--temperature", type=click.FloatRange(0, 1000),
               help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip
@@ -60,15 +60,16 @@ def play(
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
     agent = load_agent(run_dir, version(weights))
-    commands = evaluation_commands(
-        agent,
-        episodes=episodes,
-        temperature=chosen_temperature(temperature, greedy=greedy),
-        desired_return=desired_return,
-        desired_horizon=desired_horizon,
+    commands = with_seeds(
+        evaluation_commands(
+            agent,
+            episodes=episodes,
+            temperature=chosen_temperature(temperature, greedy=greedy),
+            desired_return=desired_return,
+            desired_horizon=desired_horizon,
+        ),
+        seed,
     )
-    if seed is not None:
-        commands = with_seed(commands, seed)
     told = commands[0]
     if not as_json:
         click.echo(
@@ -80,6 +81,8 @@ def play(
         if as_json:
             report = {
                 "environment_seed": rollout.command.environment_seed,
+                "weights_version": agent.version,
+                "temperature": told.temperature,
                 "desired_return": told.desired_return,
                 "desired_horizon": told.desired_horizon,
                 "episode_return": rollout.episode_return,
