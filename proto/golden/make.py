@@ -270,6 +270,7 @@ EXAMPLES: tuple[Message, ...] = (
         actors=(ACTOR,),
         waiting=(WAITING,),
         problem="",
+        ended_because="",
         audit=AUDIT,
         quarantined=(QUARANTINED,),
     ),

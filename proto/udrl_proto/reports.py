@@ -130,6 +130,7 @@ class Status(Message, frozen=True, kw_only=True):
     actors: tuple[ActorStatus, ...]
     waiting: tuple[Waiting, ...]
     problem: Text
+    ended_because: Text
     audit: AuditStatus
     quarantined: tuple[Quarantined, ...]
 

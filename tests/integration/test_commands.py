@@ -39,6 +39,7 @@ def test_services_started_by_hand_equal_one_process(
     status = live_status(run_dir)
     assert status is not None
     assert status.state == "ended"
+    assert status.ended_because == f"spent its budget of {BUDGET:,} env steps"
     assert digests(status) == digests(run(small(), BUDGET))
 
 

@@ -185,9 +185,12 @@ def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
     assert summary["best_return"] >= status.closing_evaluation.mean
     table = call("runs", ended_run.parent).splitlines()
     assert table[0].split() == [
-        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "run"
+        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "because",
+        "run",
     ]  # fmt: skip
     assert f"{summary['best_return']:.1f}" in table[1]
+    assert summary["ended_because"] == "spent its budget of 3,000 env steps"
+    assert summary["ended_because"] in table[1]
     assert table[1].endswith(str(ended_run))
 
 

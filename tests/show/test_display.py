@@ -33,7 +33,8 @@ STATUS = Status(
     ),
     closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
-    problem="", audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
+    problem="", ended_because="", audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0),
+    quarantined=(),
 )  # fmt: skip
 
 
@@ -67,6 +68,16 @@ def test_panel_names_the_quarantined_and_what_is_audited() -> None:
         console.print(panel(watched))
     assert "25 % of the episodes; 31 agreed, 4 open, 1 disputed" in capture.get()
     assert "actor-9: its episode of command 7 differs" in capture.get()
+
+
+def test_why_a_run_ended_is_told() -> None:
+    ended = msgspec.structs.replace(STATUS, state="ended", ended_because="reached return 100")
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(ended))
+    assert "because     reached return 100" in capture.get()
+    assert "; reached return 100" in line(ended)
+    assert "because" not in line(STATUS)
 
 
 @pytest.mark.parametrize("width", [40, 120])

@@ -202,6 +202,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
         actors=actors,
         waiting=waits.list(now),
         problem=progress.problem,
+        ended_because=progress.why_ended(),
         audit=AuditStatus(
             rate=progress.audit,
             agreed=progress.agreed,

@@ -69,6 +69,8 @@ def line(status: Status) -> str:
     ]
     if status.time_left_s is not None:
         parts.append(f"left {duration(status.time_left_s)}")
+    if status.ended_because:
+        parts.append(status.ended_because)
     parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
     return "; ".join(parts)
 
@@ -101,6 +103,8 @@ def panel(status: Status) -> Table:
             f"{100 * audit.rate:g} % of the episodes; {audit.agreed} agreed, {audit.open} open, "
             f"{audit.disputed} disputed"
         )
+    if status.ended_because:
+        rows["because"] = status.ended_because
     for name, value in rows.items():
         table.add_row(name, Text(value))
     for actor in status.quarantined:

@@ -55,7 +55,9 @@ function showStatus(status) {
   $("title").textContent = `${status.environment}, run ${status.run_id}`;
   document.title = `${status.environment} · udrl board`;
   const exact = status.exact ? "exact" : `NOT exact: ${status.inexact_reason}`;
-  $("state").textContent = `${status.state}; ${exact}`;
+  // Why it failed stands below, with the command that helps.
+  const because = { ended: `ended: ${status.ended_because}`, stopped: status.ended_because };
+  $("state").textContent = `${because[status.state] || status.state}; ${exact}`;
   const left = status.time_left_s == null ? [] : [["time left", time(status.time_left_s)]];
   facts($("facts"), [
     ["iteration", number(status.iteration)],

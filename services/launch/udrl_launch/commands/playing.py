@@ -28,8 +28,9 @@ from udrl_show.window import KEYS_HELP, Window
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
               help="Episodes to play.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1),
-              help="Of the first episode, one more for each that follows; command, weights and seed "
-              "are an episode. Default: those of the run's closing evaluation.")  # fmt: skip
+              help="Of the first episode, one more for each that follows: command, weights and "
+              "seed decide an episode. Default: those of the run's closing "
+              "evaluation.")  # fmt: skip
 @click.option("--temperature", type=click.FloatRange(0, 1000),
               help="Of the action distribution; 0: take its mode. Default: as the run's "
               "evaluations.")  # fmt: skip

@@ -118,6 +118,8 @@ def _warn_of_idle_actors(settings: Settings) -> None:
 def _finish(run_dir: Path, status: Status) -> None:
     """Write the weights and the picture, and say where everything is."""
     closing = status.closing_evaluation
+    if not status.problem:
+        click.echo(f"ended:          {status.ended_because}")
     if closing is not None:
         click.echo(
             f"final evaluation: mean return {closing.mean:.1f} "
