@@ -80,6 +80,18 @@ def test_why_a_run_ended_is_told() -> None:
     assert "because" not in line(STATUS)
 
 
+def test_small_returns_are_told_apart() -> None:
+    assert STATUS.evaluation is not None
+    small = msgspec.structs.replace(
+        STATUS,
+        evaluation=msgspec.structs.replace(
+            STATUS.evaluation, mean=0.05, ci95_low=0.0402, ci95_high=0.0598
+        ),
+        buffer=BufferStatus(episodes=3, return_min=0.0, return_mean=0.0123, return_max=1.0),
+    )  # fmt: skip
+    assert "0.05 ± 0.0098 at 10,000; buffer 0.0 / 0.0123 / 1.0" in line(small)
+
+
 @pytest.mark.parametrize("width", [40, 120])
 def test_panel_fits_its_terminal(width: int) -> None:
     console = Console(file=io.StringIO(), width=width)

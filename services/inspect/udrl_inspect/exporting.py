@@ -6,6 +6,7 @@ from pathlib import Path
 
 from udrl import folder as folders
 from udrl.errors import ConfigError, StoreError
+from udrl.evaluation import return_text
 from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent
@@ -72,7 +73,7 @@ model-index:
         metrics:
           - type: mean_reward
             name: mean_reward
-            value: {mean:.2f} +/- {std:.2f}
+            value: {mean} +/- {std}
             verified: false
 """
 
@@ -179,11 +180,12 @@ def _card(
     results, index = "These weights were never evaluated.", ""
     if found is not None:
         mean, std, low, high, episodes = found.evaluation
-        index = _INDEX.format(environment=environment, mean=mean, std=std)
+        index = _INDEX.format(environment=environment, mean=return_text(mean), std=return_text(std))
         results = (
-            f"**Mean return {mean:.1f}** (95 % interval {low:.1f} to {high:.1f}, standard "
-            f"deviation {std:.1f}, {episodes} episodes with seeds not trained on), asked for "
-            f"{found.desired_return:.1f} within {found.desired_horizon} steps, after "
+            f"**Mean return {return_text(mean)}** (95 % interval {return_text(low)} to "
+            f"{return_text(high)}, standard deviation {return_text(std)}, {episodes} episodes with "
+            f"seeds not trained on), asked for {return_text(found.desired_return)} within "
+            f"{found.desired_horizon} steps, after "
             f"{found.env_steps:,} env steps of training."
         )
     return _CARD.format(

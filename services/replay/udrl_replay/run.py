@@ -12,7 +12,7 @@ from typing import Literal
 from udrl.commands import CLOSING, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Deceived, Refused, RunFailed
-from udrl.evaluation import summarise
+from udrl.evaluation import return_text, summarise
 from udrl.replay import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage
@@ -260,8 +260,9 @@ class Run(Standing):
             )
         )
         log.info(
-            "iteration %d, evaluation at %d env steps: mean return %.1f (95 %% from %.1f to %.1f)",
-            iteration, source, result.mean, result.ci95_low, result.ci95_high,
+            "iteration %d, evaluation at %d env steps: mean return %s (95 %% from %s to %s)",
+            iteration, source,
+            *map(return_text, (result.mean, result.ci95_low, result.ci95_high)),
         )  # fmt: skip
         if not closing:
             self._evaluated.add(version)

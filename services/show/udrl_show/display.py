@@ -9,6 +9,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from udrl.evaluation import return_text
 from udrl_proto.reports import EvaluationStatus, Status, Waiting
 
 _PLAIN_EVERY_S = 5.0
@@ -124,7 +125,7 @@ def evaluation(result: EvaluationStatus | None) -> str:
     if result is None:
         return "none yet"
     half = (result.ci95_high - result.ci95_low) / 2
-    return f"{result.mean:.1f} ± {half:.1f} at {result.env_steps:,}"
+    return f"{return_text(result.mean)} ± {return_text(half)} at {result.env_steps:,}"
 
 
 def returns(status: Status) -> str:
@@ -132,7 +133,7 @@ def returns(status: Status) -> str:
     held = status.buffer
     if held.return_min is None or held.return_mean is None or held.return_max is None:
         return "empty"
-    return f"{held.return_min:.1f} / {held.return_mean:.1f} / {held.return_max:.1f}"
+    return " / ".join(map(return_text, (held.return_min, held.return_mean, held.return_max)))
 
 
 def duration(seconds: float) -> str:

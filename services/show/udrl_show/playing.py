@@ -11,6 +11,7 @@ from udrl.commands import Command
 from udrl.config import Config, change
 from udrl.environments.making import Environment, make_environment
 from udrl.errors import UnsupportedEnvironment
+from udrl.evaluation import return_text
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
 from udrl_inspect.agents import Agent
@@ -124,6 +125,6 @@ def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
 def caption(rollout: Rollout) -> str:
     """Return what is asked for still, and what has been obtained."""
     return (
-        f"step {rollout.steps}: obtained {rollout.episode_return:.1f}; asked for "
-        f"{rollout.desired_return:.1f} more within {max(rollout.desired_horizon, 1)} steps"
+        f"step {rollout.steps}: obtained {return_text(rollout.episode_return)}; asked for "
+        f"{return_text(rollout.desired_return)} more within {max(rollout.desired_horizon, 1)} steps"
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from udrl.errors import EnvironmentFault
+from udrl.evaluation import return_text
 from udrl_inspect import agents, inspection
 from udrl_launch.commands.options import (
     CONNECT,
@@ -65,10 +66,12 @@ def evaluate(
         return 0
     found = result.evaluation
     click.echo(
-        f"commanded return {result.desired_return:.1f} within {result.desired_horizon} steps, "
+        f"commanded return {return_text(result.desired_return)} within "
+        f"{result.desired_horizon} steps, "
         f"temperature {result.temperature:g}, weights version {agent.version}: mean return "
-        f"{found.mean:.1f} (95 % interval {found.ci95_low:.1f} to {found.ci95_high:.1f}), "
-        f"standard deviation {found.std:.1f}, {found.episodes} episodes"
+        f"{return_text(found.mean)} (95 % interval {return_text(found.ci95_low)} to "
+        f"{return_text(found.ci95_high)}), standard deviation {return_text(found.std)}, "
+        f"{found.episodes} episodes"
     )
     return 0
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from udrl.evaluation import return_text
 from udrl_inspect.agents import evaluation_commands, load_agent
 from udrl_launch.commands.options import (
     FILE,
@@ -74,8 +75,9 @@ def play(
     told = commands[0]
     if not as_json:
         click.echo(
-            f"asked for a return of {told.desired_return:.1f} within {told.desired_horizon} steps "
-            f"(temperature {told.temperature:g}, weights version {agent.version})"
+            f"asked for a return of {return_text(told.desired_return)} within "
+            f"{told.desired_horizon} steps (temperature {told.temperature:g}, weights version "
+            f"{agent.version})"
         )
     screen = Window if opens_window else None
     for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
@@ -96,7 +98,7 @@ def play(
             ending = "" if rollout.terminated else ", cut by its time limit"
             click.echo(
                 f"seed {rollout.command.environment_seed}: obtained "
-                f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
+                f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
             )
     if video is not None and not as_json:
         click.echo(f"film: {shown(video)}")

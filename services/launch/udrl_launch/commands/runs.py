@@ -6,6 +6,7 @@ from typing import Literal
 
 import click
 
+from udrl.evaluation import return_text
 from udrl_inspect.runs import Summary, find
 from udrl_launch.commands.options import FILE, RUN_DIR
 from udrl_launch.output import print_json
@@ -47,7 +48,7 @@ def _cells(summary: Summary) -> tuple[str, ...]:
     ago = f"{duration(max(0.0, time.time() - summary.changed))} ago"
     if summary.state == "unreadable":
         return summary.state, "", "", "", "", ago, "", summary.run_dir
-    best = "none yet" if summary.best_return is None else f"{summary.best_return:.1f}"
+    best = "none yet" if summary.best_return is None else return_text(summary.best_return)
     steps = f"{summary.env_steps:,} of {summary.max_env_steps:,}"
     seed = str(summary.seed)
     because = summary.ended_because.partition(":")[0]  # the rest stands below

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from udrl.errors import ConfigError, UdrlError
+from udrl.evaluation import return_text
 from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, settings_options
 from udrl_launch.output import print_json
@@ -122,8 +123,8 @@ def _finish(run_dir: Path, status: Status) -> None:
         click.echo(f"ended:          {status.ended_because}")
     if closing is not None:
         click.echo(
-            f"final evaluation: mean return {closing.mean:.1f} "
-            f"(95 % interval {closing.ci95_low:.1f} to {closing.ci95_high:.1f}, "
+            f"final evaluation: mean return {return_text(closing.mean)} (95 % interval "
+            f"{return_text(closing.ci95_low)} to {return_text(closing.ci95_high)}, "
             f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
             f"{status.wall_s:.0f} s"
         )
