@@ -70,7 +70,7 @@ class Processes:
             "--listen", endpoint, *(["--insecure"] if insecure else []), "--audit", str(audit),
         )  # fmt: skip
         start("learner", "learner", "--connect", endpoint, "--patience", _PATIENCE_S)
-        envs = str(fleet.envs_per_actor)
+        envs = str(settings.envs_per_actor)
         for number in range(1, fleet.actors + 1):
             start(
                 f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
@@ -138,7 +138,7 @@ class Threads:
         for number in range(1, fleet.actors + 1):
             self._start(
                 f"actor-{number}",
-                partial(roles.actor, address, fleet.envs_per_actor, self._stop),
+                partial(roles.actor, address, settings.envs_per_actor, self._stop),
             )
 
     def _start(self, name: str, service: Callable[[], None]) -> None:

@@ -77,7 +77,7 @@ def train(
     settings = gather_settings(env, given, run_dir, go_on=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
     log_to_stderr(logging.WARNING)
-    _warn_of_idle_actors(settings)
+    warn_of_idle_environments(settings)
 
     def service(stop: threading.Event) -> None:
         with ExitStack() as stack:
@@ -104,15 +104,16 @@ def train(
     return run_service(service)
 
 
-def _warn_of_idle_actors(settings: Settings) -> None:
+def warn_of_idle_environments(settings: Settings) -> None:
+    """Warn if somebody asked for more environments than exploring can keep busy."""
     config, _, fleet = settings
     useful = config.commands.n_episodes_per_iter * (config.lead + 1)
-    environments = fleet.actors * fleet.envs_per_actor
-    if environments > 2 * useful:
+    asked_for = fleet.actors * (fleet.envs_per_actor or 1)
+    if asked_for > 2 * useful:
         log.warning(
             "%d environments, but at most %d episodes can run at once (n_episodes_per_iter x "
-            "(lead + 1)); the others will be idle",
-            environments, useful,
+            "(lead + 1)); but for warm-up and evaluations the others will be idle",
+            asked_for, useful,
         )  # fmt: skip
 
 
