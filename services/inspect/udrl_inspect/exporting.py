@@ -9,7 +9,7 @@ from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import return_text
 from udrl.offline import write_dataset
 from udrl.version import __version__
-from udrl_inspect.agents import Agent
+from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.inspection import budget_of
 from udrl_inspect.obedience import Obedience, kept_of
 from udrl_inspect.obedience_text import markdown
@@ -105,11 +105,8 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     if (folder / FILE).exists():
         raise ConfigError(f"{folder} is the directory of a run; name another folder")
     with closing(Store(run_dir, read_only=True)) as store:
-        # With a lead the same weights are evaluated in a later iteration.
         progress = store.fact("progress", Progress)
-        found = store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
-            agent.version + agent.config.lead, closing=False
-        )
+        found = stored_evaluation(store, agent)
     policy = agent.policy
     if found is not None:  # what the card's results were asked for
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon

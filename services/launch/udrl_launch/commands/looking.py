@@ -8,12 +8,15 @@ import click
 from udrl.errors import EnvironmentFault
 from udrl.evaluation import return_text
 from udrl_inspect import agents, inspection
+from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
     CONNECT,
+    GREEDY,
     KEYS,
     RETURN,
     RUN,
     RUN_DIR,
+    TEMPERATURE,
     WEIGHTS,
     chosen_temperature,
     place,
@@ -27,10 +30,8 @@ from udrl_show.display import panel
 @click.argument("run_dir", type=RUN_DIR)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=100, show_default=True,
               help="Episodes to run.")  # fmt: skip
-@click.option("--temperature", type=click.FloatRange(0, 1000),
-              help="Of the action distribution; 0: take its mode. Default: as the run's "
-              "evaluations.")  # fmt: skip
-@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@TEMPERATURE
+@GREEDY
 @click.option("--desired-return", type=RETURN, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @WEIGHTS
@@ -47,7 +48,7 @@ def evaluate(
 ) -> int:
     """Evaluate a trained agent, with the run's command or one of your own.
 
-    Example: udrl evaluate runs/mine --greedy --desired-return 200 --desired-horizon 300
+    Example: udrl evaluate runs/mine --desired-return 200 --desired-horizon 300
     """
     agent = agents.load_agent(run_dir, version(weights))
     commands = agents.evaluation_commands(
@@ -55,6 +56,8 @@ def evaluate(
         desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
     result = agents.evaluate(agent, commands)
+    if said := caution(agent, run_dir, commands[0], result.returns):
+        click.echo(said, err=True)
     if as_json:
         report = {
             "run_dir": str(run_dir), "weights_version": agent.version,

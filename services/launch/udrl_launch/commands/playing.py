@@ -6,10 +6,13 @@ import click
 
 from udrl.evaluation import return_text
 from udrl_inspect.agents import evaluation_commands, load_agent
+from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
     FILE,
+    GREEDY,
     RETURN,
     RUN_DIR,
+    TEMPERATURE,
     WEIGHTS,
     chosen_temperature,
     version,
@@ -32,10 +35,8 @@ from udrl_show.window import KEYS_HELP, Window
               help="Of the first episode, one more for each that follows: command, weights and "
               "seed decide an episode. Default: those of the run's closing "
               "evaluation.")  # fmt: skip
-@click.option("--temperature", type=click.FloatRange(0, 1000),
-              help="Of the action distribution; 0: take its mode. Default: as the run's "
-              "evaluations.")  # fmt: skip
-@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@TEMPERATURE
+@GREEDY
 @WEIGHTS
 @click.option("--video", type=FILE, metavar="FILE",
               help="Film them: FILE.mp4 or FILE.gif.")  # fmt: skip
@@ -80,7 +81,9 @@ def play(
             f"{agent.version})"
         )
     screen = Window if opens_window else None
+    obtained: list[float] = []
     for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
+        obtained.append(rollout.episode_return)
         if as_json:
             report = {
                 "environment_seed": rollout.command.environment_seed,
@@ -100,6 +103,8 @@ def play(
                 f"seed {rollout.command.environment_seed}: obtained "
                 f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
             )
+    if said := caution(agent, run_dir, told, obtained):
+        click.echo(said, err=True)
     if video is not None and not as_json:
         click.echo(f"film: {shown(video)}")
     return 0
