@@ -251,6 +251,7 @@ EXAMPLES: tuple[Message, ...] = (
         env_steps_per_s=9120.5,
         wall_s=6.125,
         max_env_steps=200_000,
+        stop_return=475.0,
         time_left_s=44.5,
         commands=COMMANDS,
         episodes=EPISODES,

@@ -21,7 +21,7 @@ from udrl_show.display import Display, duration, line, panel
 STATUS = Status(
     run_id="run", state="running", environment="CartPole-v1", iteration=7, env_steps=12345,
     eval_env_steps=100, env_steps_per_s=9876.5, wall_s=61.0, max_env_steps=100_000,
-    time_left_s=3700.0,
+    stop_return=None, time_left_s=3700.0,
     commands=CommandLedger(issued=1, accepted=1, cancelled=0, outstanding=0),
     episodes=EpisodeLedger(delivered=1, accepted=1, duplicate=0, rejected=0),
     buffer=BufferStatus(episodes=3, return_min=1.0, return_mean=2.0, return_max=3.0),
@@ -45,6 +45,15 @@ def test_line_says_all_that_a_user_watches() -> None:
         "weights 6 (lag 1)", "left 1:01:40", "learner l waits for actors: iteration 7 (2.5 s)",
     ):  # fmt: skip
         assert part in text
+
+
+def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
+    stopping = msgspec.structs.replace(STATUS, stop_return=200.0)
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(stopping))
+    for text in (line(stopping), capture.get()):
+        assert "left at most 1:01:40" in text
 
 
 def test_line_before_anything_is_known() -> None:

@@ -166,6 +166,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
             run.wall_s if progress.state in ("running", "closing") else progress.wall_s, 3
         ),
         max_env_steps=run.budget.max_env_steps,
+        stop_return=run.budget.stop_return,
         time_left_s=round(left / spent, 1) if spent and progress.state == "running" else None,
         commands=CommandLedger(
             issued=progress.issued,

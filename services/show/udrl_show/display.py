@@ -69,7 +69,7 @@ def line(status: Status) -> str:
         f"weights {status.weights_version} (lag {status.weights_lag})",
     ]
     if status.time_left_s is not None:
-        parts.append(f"left {duration(status.time_left_s)}")
+        parts.append(f"left {time_left(status)}")
     if status.ended_because:
         parts.append(status.ended_because)
     parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
@@ -96,7 +96,7 @@ def panel(status: Status) -> Table:
         f"environments, {sum(a.running for a in status.actors)} of at most "
         f"{status.useful_concurrency} episodes under way",
         "time": f"{duration(status.wall_s)}"
-        + (f", left {duration(status.time_left_s)}" if status.time_left_s is not None else ""),
+        + (f", left {time_left(status)}" if status.time_left_s is not None else ""),
     }
     if status.audit.rate:
         audit = status.audit
@@ -134,6 +134,12 @@ def returns(status: Status) -> str:
     if held.return_min is None or held.return_mean is None or held.return_max is None:
         return "empty"
     return " / ".join(map(return_text, (held.return_min, held.return_mean, held.return_max)))
+
+
+def time_left(status: Status) -> str:
+    """Return how long a run goes on; nobody knows when an evaluation will reach its stop_return."""
+    most = "" if status.stop_return is None else "at most "
+    return most + duration(status.time_left_s or 0.0)
 
 
 def duration(seconds: float) -> str:

@@ -58,7 +58,7 @@ function showStatus(status) {
   // Why it failed stands below, with the command that helps.
   const because = { ended: `ended: ${status.ended_because}`, stopped: status.ended_because };
   $("state").textContent = `${because[status.state] || status.state}; ${exact}`;
-  const left = status.time_left_s == null ? [] : [["time left", time(status.time_left_s)]];
+  const left = status.time_left_s == null ? [] : [["time left", (status.stop_return == null ? "" : "at most ") + time(status.time_left_s)]];
   facts($("facts"), [
     ["iteration", number(status.iteration)],
     ["env steps", `${number(status.env_steps)} of ${number(status.max_env_steps)}`],
