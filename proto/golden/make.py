@@ -272,6 +272,7 @@ EXAMPLES: tuple[Message, ...] = (
         waiting=(WAITING,),
         problem="",
         ended_because="",
+        advice="",
         audit=AUDIT,
         quarantined=(QUARANTINED,),
     ),

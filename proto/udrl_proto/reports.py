@@ -132,6 +132,7 @@ class Status(Message, frozen=True, kw_only=True):
     waiting: tuple[Waiting, ...]
     problem: Text
     ended_because: Text
+    advice: Text
     audit: AuditStatus
     quarantined: tuple[Quarantined, ...]
 

@@ -33,8 +33,8 @@ STATUS = Status(
     ),
     closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
-    problem="", ended_because="", audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0),
-    quarantined=(),
+    problem="", ended_because="", advice="",
+    audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
 )  # fmt: skip
 
 
@@ -87,6 +87,13 @@ def test_why_a_run_ended_is_told() -> None:
     assert "because     reached return 100" in capture.get()
     assert "; reached return 100" in line(ended)
     assert "because" not in line(STATUS)
+
+
+def test_advice_is_shown_beside_the_numbers() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(msgspec.structs.replace(STATUS, advice="return_scale = 0.025: ...")))
+    assert "advice      return_scale = 0.025: ..." in capture.get()
 
 
 def test_small_returns_are_told_apart() -> None:

@@ -26,6 +26,7 @@ from udrl_proto.reports import (
     Status,
     Waiting,
 )
+from udrl_replay.advice import advice
 from udrl_replay.standing import Standing
 from udrl_replay.store import COLUMNS, EvaluationRow, Store
 
@@ -204,6 +205,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
         waiting=waits.list(now),
         problem=progress.problem,
         ended_because=progress.why_ended(),
+        advice=advice(run),
         audit=AuditStatus(
             rate=progress.audit,
             agreed=progress.agreed,

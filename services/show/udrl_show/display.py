@@ -106,6 +106,8 @@ def panel(status: Status) -> Table:
         )
     if status.ended_because:
         rows["because"] = status.ended_because
+    if status.advice:
+        rows["advice"] = status.advice
     for name, value in rows.items():
         table.add_row(name, Text(value))
     for actor in status.quarantined:

@@ -201,7 +201,7 @@ async function ask() {
   showObeyed();
   $("about").textContent = `udrl ${news.software}`;
   const why = news.status?.problem.replace("RUN_DIR", commands().run_dir);
-  problem([news.problem, why].filter(Boolean).join(" "));
+  problem([news.problem, why, news.status?.advice].filter(Boolean).join(" "));
 }
 
 function problem(text) {

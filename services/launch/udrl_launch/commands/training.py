@@ -16,7 +16,7 @@ from udrl_launch.output import print_json
 from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.settings import Settings
-from udrl_launch.training import Watchers
+from udrl_launch.training import Adviser, Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
 from udrl_replay.creation import directory_name
@@ -89,6 +89,7 @@ def train(
             if tensorboard:
                 watchers.add(stack.enter_context(closing(EventFiles(run_dir))))
             watchers.add(stack.enter_context(Display()))
+            watchers.add(Adviser())
             status = run_training(
                 settings, run_dir, stop, go_on=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
