@@ -105,7 +105,7 @@ class DisturbedRun:
             for number in range(1, self.settings.fleet.actors + 1):
                 start(
                     f"actor-{number}", "actor", "--connect", self.link.endpoint, "--patience", "60",
-                    "--envs", str(self.settings.fleet.envs_per_actor),
+                    "--envs", str(self.settings.envs_per_actor),
                     "--hang-timeout", str(self._hang_s),
                 )  # fmt: skip
             yield self

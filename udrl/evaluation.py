@@ -24,6 +24,18 @@ class Evaluation(NamedTuple):
     episodes: int
 
 
+def return_text(value: float) -> str:
+    """Return a return as people read it: one decimal, or three digits where it is below ten.
+
+    Environments differ by orders of magnitude: returns of 0 to 1 need more decimals than others.
+    """
+    size = abs(value)
+    if not 1e-4 <= size < 10:
+        return f"{value:.3g}" if 0 < size < 1 else f"{value + 0.0:.1f}"
+    whole, _, decimals = f"{value:.{2 - math.floor(math.log10(size))}f}".partition(".")
+    return f"{whole}.{decimals.rstrip('0') or '0'}"
+
+
 def summarise(returns: Sequence[float]) -> Evaluation:
     """Return the evaluation of some episode returns, at least one."""
     mean = fmean(returns)

@@ -111,6 +111,7 @@ class Status(Message, frozen=True, kw_only=True):
     env_steps_per_s: float
     wall_s: float
     max_env_steps: Number
+    stop_return: float | None
     time_left_s: float | None
     commands: CommandLedger
     episodes: EpisodeLedger
@@ -130,6 +131,8 @@ class Status(Message, frozen=True, kw_only=True):
     actors: tuple[ActorStatus, ...]
     waiting: tuple[Waiting, ...]
     problem: Text
+    ended_because: Text
+    advice: Text
     audit: AuditStatus
     quarantined: tuple[Quarantined, ...]
 

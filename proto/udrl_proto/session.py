@@ -24,6 +24,11 @@ _ENDPOINT = re.compile(
     r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:]+\]|[^:/\s\[\]]+):(?P<port>\d+)"
 )
 
+#: Seconds of looking for a router after which that is worth a warning: it may be starting up.
+QUIET_S = 15.0
+#: Seconds between two looks, at first.
+_FIRST_PAUSE_S = 0.05
+
 #: A hung or cut-off service is noticed after this many milliseconds.
 LEASE_MS = 2000
 
@@ -153,7 +158,7 @@ def connect(
     config.insert_json5("connect/timeout_ms", "1000")
     began = time.monotonic()
     stop = stop or threading.Event()
-    pause = 0.05
+    pause, warn_at = _FIRST_PAUSE_S, QUIET_S
     while True:
         try:
             return zenoh.open(config)
@@ -166,8 +171,13 @@ def connect(
                     f"nobody answers at {endpoint!r} after {waited:.0f} s; start `udrl replay ENV "
                     f"--listen {endpoint}` there, or correct the endpoint"
                 ) from error
-        if pause > 0.4:
-            log.warning("waiting for a replay service or router at %s", endpoint)
+        if waited >= warn_at:
+            log.warning(
+                "waiting for a replay service or router at %s, for %.0f s now", endpoint, waited
+            )
+            warn_at *= 2
+        elif pause == _FIRST_PAUSE_S:
+            log.info("waiting for a replay service or router at %s", endpoint)
         if stop.wait(pause):
             raise Interrupted(f"stopped while connecting to {endpoint}")
         pause = min(2 * pause, 1.0)

@@ -1,9 +1,11 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.evaluation import summarise
+from udrl.evaluation import return_text, summarise
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=50))
@@ -23,3 +25,22 @@ def test_one_episode_has_no_spread() -> None:
 def test_the_order_of_the_episodes_does_not_matter() -> None:
     returns = [0.1, 1e9, 0.2, -1e9, 0.3]
     assert summarise(returns) == summarise(returns[::-1])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0.0"), (-0.0, "0.0"), (0.05, "0.05"), (0.0123456, "0.0123"), (-0.5, "-0.5"),
+        (0.9996, "1.0"), (1.0, "1.0"), (1.25, "1.25"), (9.999, "10.0"), (10.04, "10.0"),
+        (247.53, "247.5"), (-165.0, "-165.0"), (1e9, "1000000000.0"), (1.234e-7, "1.23e-07"),
+        (math.inf, "inf"),
+    ],
+)  # fmt: skip
+def test_returns_have_as_many_digits_as_they_need(value: float, text: str) -> None:
+    assert return_text(value) == text
+
+
+@given(st.floats(-1e6, 1e6))
+def test_a_return_as_text_is_the_return(value: float) -> None:
+    read = float(return_text(value))
+    assert abs(read - value) <= max(0.0501 if abs(value) >= 10 else 0, 0.0051 * abs(value))

@@ -90,6 +90,15 @@ def test_the_other_sentences() -> None:
     )
 
 
+def test_a_tolerance_beyond_all_returns_hides_no_digits() -> None:
+    small = msgspec.structs.replace(
+        report(lambda r: 0.0123, tolerance=5.0), reachable_low=0.0, reachable_high=0.5
+    )
+    assert "Highest mean return: 0.012 (" in best(small)
+    alike = msgspec.structs.replace(small, reachable_high=0.0, tolerance=0.0)
+    assert "Highest mean return: 0.0123 (" in best(alike)
+
+
 def test_the_table_ends_with_the_answer() -> None:
     told = report(obeyed=(30.0, 80.0))
     lines = table(told).splitlines()

@@ -44,6 +44,7 @@ def test_a_callback_stops_a_run_that_can_be_resumed(
         callbacks=[enough, lambda status: others.append(status.iteration)], **SETTINGS,
     )  # fmt: skip
     assert stopped.status.state == "stopped"
+    assert stopped.status.ended_because == "stopped on request"
     assert others
     budget = stopped.status.env_steps + 1000
     ended = udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, max_env_steps=budget)

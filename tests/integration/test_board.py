@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -14,6 +15,7 @@ import msgspec
 import pytest
 from click.testing import CliRunner
 from starlette.testclient import TestClient
+from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from udrl.errors import ConfigError, StoreError, Unreachable
@@ -200,7 +202,7 @@ def test_a_token_is_asked_for_and_becomes_a_cookie(ended_run: Path) -> None:
             assert "the address that `udrl board` printed" in answer.text
         assert client.get("/", params={"token": "wrong"}).status_code == 401
         let_in = client.get("/", params={"token": "open-sesame"}, follow_redirects=False)
-        assert (let_in.status_code, let_in.headers["location"]) == (303, "/")
+        assert (let_in.status_code, let_in.headers["location"]) == (303, "./")
         assert "HttpOnly" in let_in.headers["set-cookie"]
         assert "SameSite=strict" in let_in.headers["set-cookie"]
         assert client.get("/").status_code == 200
@@ -415,6 +417,62 @@ def test_an_environment_without_pictures_is_played_all_the_same(
         assert last["step"] in (1, 2)
 
 
+# Behind a proxy.
+
+HUB, UNDER = "https://hub.example", "/user/board"
+
+
+class Proxy:
+    """Shows a board under a path of another host, as a reverse proxy does."""
+
+    def __init__(self, board: ASGIApp, host: str) -> None:
+        self._board = board
+        self._host = host.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "lifespan":
+            assert scope["path"].startswith(UNDER), "the board led out of its path"
+            path = scope["path"].removeprefix(UNDER)
+            headers = [(k, self._host if k == b"host" else v) for k, v in scope["headers"]]
+            scope = dict(scope) | {"path": path, "raw_path": path.encode(), "headers": headers}
+        await self._board(scope, receive, send)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8765", "hub.example"])
+def test_a_proxy_may_show_the_board_under_a_path(ended_run: Path, host: str) -> None:
+    board = make_app(
+        Feed(Directory(ended_run)), hosts=("127.0.0.1", "hub.example"), token="t", origins=(HUB,)
+    )
+    own = {"origin": HUB}
+    with TestClient(Proxy(board, host), base_url=HUB) as client:
+        assert client.get(f"{UNDER}/").status_code == 401
+        main = client.get(f"{UNDER}/", params={"token": "t"})
+        assert main.url == f"{HUB}{UNDER}/"
+        assert "<title>udrl board</title>" in main.text
+        (cookie,) = client.cookies.jar
+        assert cookie.path == UNDER, "nobody else behind the proxy gets it"
+        for part in re.findall(r'(?:src|href)="([^"#]+)"', main.text):
+            assert client.get(main.url.join(part), headers=own).status_code == 200
+        assert client.get(main.url.join("news"), headers=own).status_code == 200
+        stage = str(main.url.join("stage")).replace("https", "wss")
+        with client.websocket_connect(stage, headers=own) as socket:
+            socket.send_json(begin(paused=True))
+            assert next(moments(socket))["step"] == 0
+        strange = client.get(f"{UNDER}/news", headers={"origin": "https://evil.example"})
+        assert strange.status_code == 403
+        assert "--allow-origin https://evil.example" in strange.text
+
+
+def test_a_proxy_that_nobody_allowed_is_told_how(ended_run: Path) -> None:
+    board = make_app(Feed(Directory(ended_run)))
+    with TestClient(Proxy(board, "127.0.0.1"), base_url=HUB) as client:
+        answer = client.get(f"{UNDER}/news", headers={"origin": HUB})
+    assert answer.status_code == 403
+    assert (
+        "behind a proxy, start `udrl board` with --allow-origin https://hub.example" in answer.text
+    )
+
+
 # The command.
 
 
@@ -435,6 +493,9 @@ def test_the_command_refuses_what_cannot_be(tmp_path: Path, ended_run: Path) -> 
             call(ended_run, "--host", host)
     with pytest.raises(ConfigError, match="letters, digits"):
         call(ended_run, "--token", "a+b&c")
+    for origin in ("hub.example", "https://hub.example/", "https://Hub.example", "*", "null"):
+        with pytest.raises(ConfigError, match=r"--allow-origin .*: expected scheme, host and port"):
+            call(ended_run, "--allow-origin", origin)
 
 
 def test_beyond_loopback_a_token_is_made(cli: Callable[..., Cli], ended_run: Path) -> None:

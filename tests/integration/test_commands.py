@@ -39,6 +39,7 @@ def test_services_started_by_hand_equal_one_process(
     status = live_status(run_dir)
     assert status is not None
     assert status.state == "ended"
+    assert status.ended_because == f"spent its budget of {BUDGET:,} env steps"
     assert digests(status) == digests(run(small(), BUDGET))
 
 
@@ -63,6 +64,18 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
     for name in ("run.sqlite", "metrics.csv", "config.toml", "weights.safetensors"):
         assert (run_dir / name).stat().st_size > 0
     assert (run_dir / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_usual_training_warns_of_nothing_and_says_why_it_ended(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    code, out, error = cli(
+        "train", "CartPole-v1", "--max-env-steps", "2000", "--eval-episodes", "3",
+        "--run-dir", str(tmp_path / "run"),
+    ).finish()  # fmt: skip
+    assert code == 0, error
+    assert "WARNING" not in error
+    assert "ended:          spent its budget of 2,000 env steps" in out
 
 
 def test_budget_spent_in_the_warm_up_trains_nothing(

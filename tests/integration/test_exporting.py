@@ -15,6 +15,7 @@ from huggingface_hub import ModelCard
 
 import udrl
 from udrl.errors import ConfigError, UdrlError
+from udrl.evaluation import return_text
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
 from udrl_launch.cli import cli as command_line
@@ -55,7 +56,7 @@ def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
     assert last is not None
     (result,) = card.data.eval_results
     assert result.dataset_name == "CartPole-v1"
-    assert result.metric_value == f"{last.mean:.2f} +/- {last.std:.2f}"
+    assert result.metric_value == f"{return_text(last.mean)} +/- {return_text(last.std)}"
     assert f"**Mean return {last.mean:.1f}**" in card.text
     assert card.data.library_name == "udrl"
 

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,12 +16,16 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image, ImageSequence
 
+from udrl.commands import Command
+from udrl.environments.making import make_environment
 from udrl.errors import ConfigError, StoreError, UdrlError
+from udrl.rollout import Rollout
 from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, load_agent
 from udrl_inspect.inspection import read_status
 from udrl_inspect.runs import find
 from udrl_launch.cli import cli
 from udrl_show.curve import compare
+from udrl_show.playing import with_seeds
 
 
 def call(*arguments: object) -> str:
@@ -35,20 +40,53 @@ def lines(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
+def test_greedy_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     commands = evaluation_commands(
-        agent, episodes=4, temperature=0.5, desired_return=60, desired_horizon=50
+        agent, episodes=4, temperature=0, desired_return=60, desired_horizon=50
     )
     counted = evaluate(agent, commands)
     played = lines(
-        call("play", ended_run, "--episodes", 4, "--temperature", 0.5, "--desired-return", 60,
+        call("play", ended_run, "--episodes", 4, "--greedy", "--desired-return", 60,
              "--desired-horizon", 50, "--json")
     )  # fmt: skip
     assert [p["episode_return"] for p in played] == counted.returns
-    told = {"desired_return": 60.0, "desired_horizon": 50}
+    told = {"desired_return": 60.0, "desired_horizon": 50, "temperature": 0.0}
     assert all(told.items() <= p.items() for p in played)
     assert all(p["length"] == p["episode_return"] for p in played)  # CartPole: 1 a step
+
+
+def test_a_seed_that_play_prints_gives_its_episode_again(ended_run: Path) -> None:
+    played = lines(call("play", ended_run, "--episodes", 4, "--json"))
+    for episode in played:
+        (again,) = lines(
+            call("play", ended_run, "--seed", episode["environment_seed"], "--episodes", 1,
+                 "--json")
+        )  # fmt: skip
+        assert again == episode
+    for line in call("play", ended_run, "--episodes", 4).splitlines()[1:]:
+        seed = line.removeprefix("seed ").partition(":")[0]
+        assert call("play", ended_run, "--seed", seed, "--episodes", 1).splitlines()[1:] == [line]
+
+
+def test_a_seed_decides_every_action_wherever_it_stands(ended_run: Path) -> None:
+    agent = load_agent(ended_run)
+    commands = evaluation_commands(agent, episodes=3)
+    third = with_seeds(commands)[2]
+    (alone,) = with_seeds(commands[:1], third.environment_seed)
+
+    def actions(command: Command) -> list[int | None]:
+        with closing(make_environment(agent.config)) as env:
+            rollout, taken = Rollout(agent.policy, env, command), []
+            while not rollout.over:
+                rollout.step()
+                taken.append(rollout.action)
+        return taken
+
+    assert actions(alone) == actions(third)
+    last = with_seeds(commands, 2**31 - 2)
+    assert [c.environment_seed for c in last] == [2**31 - 2, 2**31 - 1, 0]
+    assert last[2].stream_key == with_seeds(commands, 0)[0].stream_key
 
 
 def test_evaluations_in_one_go_are_those_one_by_one(ended_run: Path) -> None:
@@ -147,9 +185,12 @@ def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
     assert summary["best_return"] >= status.closing_evaluation.mean
     table = call("runs", ended_run.parent).splitlines()
     assert table[0].split() == [
-        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "run"
+        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "because",
+        "run",
     ]  # fmt: skip
     assert f"{summary['best_return']:.1f}" in table[1]
+    assert summary["ended_because"] == "spent its budget of 3,000 env steps"
+    assert summary["ended_because"] in table[1]
     assert table[1].endswith(str(ended_run))
 
 

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from udrl.config import preset
+from udrl.config import preset, preset_names
 from udrl.errors import ConfigError
+from udrl_launch.commands.training import warn_of_idle_environments
 from udrl_launch.settings import gather
 
 
@@ -76,3 +77,35 @@ def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:
     file = tmp_path / "config.toml"
     file.write_text("hold_steps = 9\n")
     assert gather("Figure2-v0", file=file, options={}).config.commands.hold_steps == 9
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, 16),
+        ({"actors": 0}, 16),
+        ({"actors": 10}, 10),  # 100 episodes of an evaluation beside 2 others
+        ({"actors": 3, "eval_episodes": 4, "n_warm_up_episodes": 5}, 2),
+        ({"actors": 500}, 1),
+        ({"actors": 500, "envs_per_actor": 30}, 30),
+    ],
+)
+def test_actors_have_environments_for_what_can_run_at_once(
+    options: dict[str, int], expected: int
+) -> None:
+    assert gather("CartPole-v1", options=options).envs_per_actor == expected
+
+
+@pytest.mark.parametrize("environment", preset_names())
+def test_shipped_settings_are_not_warned_of(
+    environment: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_idle_environments(gather("Figure2-v0", preset_name=environment, options={}))
+    assert not caplog.records
+
+
+def test_environments_that_somebody_asked_for_in_vain_are_warned_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    warn_of_idle_environments(gather("CartPole-v1", options={"envs_per_actor": 16}))
+    assert "32 environments, but at most 2 episodes can run at once" in caplog.text

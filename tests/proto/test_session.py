@@ -1,5 +1,6 @@
 """Finding each other: endpoints, routers, runs, and what is said when there is none."""
 
+import logging
 import socket
 import threading
 import time
@@ -118,6 +119,26 @@ def test_client_connects_to_a_router_that_comes_later(endpoint: str) -> None:
         client = sessions.connect(endpoint, patience_s=20.0, stop=FirstPause())
         stack.enter_context(client)
         assert list(client.info.routers_zid())
+
+
+def test_a_router_that_starts_up_is_waited_for_without_a_warning(
+    endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class AtFirst(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            return True
+
+    caplog.set_level(logging.INFO, "udrl")
+    with pytest.raises(Interrupted):
+        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+    assert [(r.levelname, r.message) for r in caplog.records] == [
+        ("INFO", f"waiting for a replay service or router at {endpoint}")
+    ]
+    monkeypatch.setattr(sessions, "QUIET_S", 0.0)
+    with pytest.raises(Interrupted):
+        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+    assert caplog.records[-1].levelname == "WARNING"
+    assert f"router at {endpoint}, for " in caplog.text
 
 
 # Finding a run.

@@ -37,10 +37,11 @@ from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Refused
 from udrl.replay import Entry
 from udrl.schedule import weights_version
+from udrl_inspect.inspection import read_status
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import Status
 from udrl_replay.arrival import Arrival
-from udrl_replay.progress import Progress
+from udrl_replay.progress import KILLED, STOPPED, Progress
 from udrl_replay.reporting import Throughput, Waits, status
 from udrl_replay.run import Run
 from udrl_replay.standing import Standing
@@ -479,6 +480,42 @@ def test_evaluation_that_reaches_the_stop_return_ends_the_run(make_run: MakeRun)
     evaluation = run.store.last_evaluation(closing=False)
     assert evaluation is not None
     assert evaluation.iteration == run.progress.iteration == 1
+
+
+def test_run_says_why_it_ended(make_run: MakeRun, reopened: MakeRun, tmp_path: Path) -> None:
+    run = make_run(stop_return=0.0)
+    assert run.progress.why_ended() == ""
+    finish(run)
+    assert run.progress.why_ended() == "reached return 0"
+    steps = run.progress.env_steps
+    run = reopened(run, Budget(max_env_steps=steps + 20))
+    assert (run.progress.state, run.progress.why_ended()) == ("running", "")
+    finish(run)
+    assert run.progress.why_ended() == f"spent its budget of {steps + 20} env steps"
+    assert read_status(tmp_path).ended_because == run.progress.why_ended()
+
+
+def test_failed_run_says_why(make_run: MakeRun, tmp_path: Path) -> None:
+    run = make_run()
+    for actors in ("ab", "a"):
+        fail(run, 2, *actors)
+    assert read_status(tmp_path).ended_because.startswith("failed: command 2 failed three times: ")
+
+
+def test_run_that_was_stopped_is_told_from_one_that_was_killed(
+    make_run: MakeRun, reopened: MakeRun, tmp_path: Path
+) -> None:
+    run = make_run(max_env_steps=20)
+    until_closing(run)
+    with run.store.transaction():
+        run.save()
+    assert read_status(tmp_path).state == "stopped"
+    assert read_status(tmp_path).ended_because == KILLED
+    with run.store.transaction():
+        run.stop()
+    assert read_status(tmp_path).ended_because == STOPPED
+    run = reopened(run)
+    assert run.progress.ended_because == "spent its budget of 20 env steps"
 
 
 def test_best_version_is_kept(make_run: MakeRun) -> None:

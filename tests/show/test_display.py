@@ -21,7 +21,7 @@ from udrl_show.display import Display, duration, line, panel
 STATUS = Status(
     run_id="run", state="running", environment="CartPole-v1", iteration=7, env_steps=12345,
     eval_env_steps=100, env_steps_per_s=9876.5, wall_s=61.0, max_env_steps=100_000,
-    time_left_s=3700.0,
+    stop_return=None, time_left_s=3700.0,
     commands=CommandLedger(issued=1, accepted=1, cancelled=0, outstanding=0),
     episodes=EpisodeLedger(delivered=1, accepted=1, duplicate=0, rejected=0),
     buffer=BufferStatus(episodes=3, return_min=1.0, return_mean=2.0, return_max=3.0),
@@ -33,7 +33,8 @@ STATUS = Status(
     ),
     closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
-    problem="", audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
+    problem="", ended_because="", advice="",
+    audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
 )  # fmt: skip
 
 
@@ -44,6 +45,15 @@ def test_line_says_all_that_a_user_watches() -> None:
         "weights 6 (lag 1)", "left 1:01:40", "learner l waits for actors: iteration 7 (2.5 s)",
     ):  # fmt: skip
         assert part in text
+
+
+def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
+    stopping = msgspec.structs.replace(STATUS, stop_return=200.0)
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(stopping))
+    for text in (line(stopping), capture.get()):
+        assert "left at most 1:01:40" in text
 
 
 def test_line_before_anything_is_known() -> None:
@@ -67,6 +77,35 @@ def test_panel_names_the_quarantined_and_what_is_audited() -> None:
         console.print(panel(watched))
     assert "25 % of the episodes; 31 agreed, 4 open, 1 disputed" in capture.get()
     assert "actor-9: its episode of command 7 differs" in capture.get()
+
+
+def test_why_a_run_ended_is_told() -> None:
+    ended = msgspec.structs.replace(STATUS, state="ended", ended_because="reached return 100")
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(ended))
+    assert "because     reached return 100" in capture.get()
+    assert "; reached return 100" in line(ended)
+    assert "because" not in line(STATUS)
+
+
+def test_advice_is_shown_beside_the_numbers() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with console.capture() as capture:
+        console.print(panel(msgspec.structs.replace(STATUS, advice="return_scale = 0.025: ...")))
+    assert "advice      return_scale = 0.025: ..." in capture.get()
+
+
+def test_small_returns_are_told_apart() -> None:
+    assert STATUS.evaluation is not None
+    small = msgspec.structs.replace(
+        STATUS,
+        evaluation=msgspec.structs.replace(
+            STATUS.evaluation, mean=0.05, ci95_low=0.0402, ci95_high=0.0598
+        ),
+        buffer=BufferStatus(episodes=3, return_min=0.0, return_mean=0.0123, return_max=1.0),
+    )  # fmt: skip
+    assert "0.05 ± 0.0098 at 10,000; buffer 0.0 / 0.0123 / 1.0" in line(small)
 
 
 @pytest.mark.parametrize("width", [40, 120])

@@ -49,7 +49,13 @@ _HEADERS = {
 }
 
 
-def make_app(feed: Feed, *, hosts: tuple[str, ...] = (), token: str = "") -> Starlette:
+def make_app(
+    feed: Feed,
+    *,
+    hosts: tuple[str, ...] = (),
+    token: str = "",
+    origins: tuple[str, ...] = (),
+) -> Starlette:
     """Return the web application.
 
     Args:
@@ -57,6 +63,8 @@ def make_app(feed: Feed, *, hosts: tuple[str, ...] = (), token: str = "") -> Sta
         hosts: names that it may be called by; empty: any. A page of elsewhere whose name leads here
             (DNS rebinding) is refused by it.
         token: what a browser must know; empty: nothing.
+        origins: of pages that are the board's own as a proxy shows them, e.g.
+            ``https://hub.example``.
     """
     static = Path(str(resources.files("udrl_board"))) / "static"
     board = _Board(feed)
@@ -72,7 +80,7 @@ def make_app(feed: Feed, *, hosts: tuple[str, ...] = (), token: str = "") -> Sta
             WebSocketRoute("/stage", board.stage),
             Mount("/", StaticFiles(directory=static, html=True)),
         ],
-        middleware=[Middleware(_Guard, hosts=hosts, token=token)],
+        middleware=[Middleware(_Guard, hosts=hosts, token=token, origins=origins)],
         lifespan=lifespan,
     )
 
@@ -80,10 +88,13 @@ def make_app(feed: Feed, *, hosts: tuple[str, ...] = (), token: str = "") -> Sta
 class _Guard:
     """Lets in who knows the token and calls the board by a name of its own, and no other page."""
 
-    def __init__(self, app: ASGIApp, *, hosts: tuple[str, ...], token: str) -> None:
+    def __init__(
+        self, app: ASGIApp, *, hosts: tuple[str, ...], token: str, origins: tuple[str, ...]
+    ) -> None:
         self._app = app
         self._hosts = hosts
         self._token = token
+        self._origins = origins
         # Of its own: browsers keep one jar for all ports of a host.
         self._cookie = f"udrl_board_{hashlib.sha256(token.encode()).hexdigest()[:16]}"
 
@@ -123,8 +134,12 @@ class _Guard:
             return PlainTextResponse("Neither Host nor Origin can be read.", 400)
         if self._hosts and name not in self._hosts:
             return PlainTextResponse(f"This board is not called {name!r}.", 421)
-        if page != host:
-            return PlainTextResponse("Another page may not use this board.", 403)
+        if page != host and origin not in self._origins:
+            return PlainTextResponse(
+                f"A page of {origin} may not use this board; if it is the board's own, behind a "
+                f"proxy, start `udrl board` with --allow-origin {origin}.",
+                403,
+            )
         if self._token and not self._knows(connection):
             return PlainTextResponse(
                 "This board asks for a token: open it by the address that `udrl board` printed.",
@@ -144,8 +159,10 @@ class _Guard:
         """Turn a token in the address into a cookie, so that it does not stay there."""
         if not self._token or not self._shown(connection):
             return None
-        response = RedirectResponse("/", 303)
-        response.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
+        # A proxy may show the board under a path that only the browser knows: so the redirect is
+        # relative, and the cookie has the path that it was set at.
+        response = RedirectResponse("./", 303)
+        response.set_cookie(self._cookie, self._token, path=None, httponly=True, samesite="strict")
         return response
 
 

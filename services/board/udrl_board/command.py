@@ -32,8 +32,15 @@ _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
               help="Where the page is served; 0: any that is free.")  # fmt: skip
 @click.option("--host", default="127.0.0.1", show_default=True,
               help="Address to serve on. Beyond loopback, browsers must know a token.")  # fmt: skip
-@click.option("--token", envvar="UDRL_BOARD_TOKEN", metavar="TOKEN",
-              help="What browsers must know. Default: a new one, beyond loopback.")  # fmt: skip
+@click.option(
+    "--token",
+    envvar="UDRL_BOARD_TOKEN",
+    metavar="TOKEN",
+    help="What browsers must know. Default: a new one, beyond loopback or a proxy.",
+)
+@click.option("--allow-origin", "origins", multiple=True, metavar="ORIGIN",
+              help="Origin of the board's pages behind a proxy, e.g. https://hub.example; may be "
+              "repeated.")  # fmt: skip
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @KEYS
 @RUN
@@ -43,6 +50,7 @@ def board(
     port: int,
     host: str,
     token: str | None,
+    origins: tuple[str, ...],
     opens: bool,
     keys: Path | None,
     run_id: str | None,
@@ -65,14 +73,18 @@ def board(
     source: Source = Directory(where, keys) if isinstance(where, Path) else Served(where)
     source.hello()  # is there a run?
     is_local = _is_loopback(host)
-    if not is_local:
+    called = tuple(map(_host_of, origins))
+    if origins or not is_local:
         token = token or secrets.token_urlsafe(18)
     if token is not None and not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
         raise ConfigError(
             "--token: expected letters, digits and . _ ~ - only, since it stands in an address"
         )
     log_to_stderr(logging.WARNING)
-    app = make_app(Feed(source), hosts=(*_LOOPBACK, host) if is_local else (), token=token or "")
+    app = make_app(
+        Feed(source), hosts=(*_LOOPBACK, host, *called) if is_local else (), token=token or "",
+        origins=origins,
+    )  # fmt: skip
     with _listening(host, port) as listener:
         shown = socket.gethostname() if host in _EVERYWHERE else host
         shown = f"[{shown}]" if ":" in shown else shown
@@ -112,6 +124,21 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def _host_of(origin: str) -> str:
+    """Return the name of an origin's host.
+
+    Raises:
+        ConfigError: it is not one, as browsers write them.
+    """
+    found = re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:[0-9]{1,5})?", origin)
+    if found is None:
+        raise ConfigError(
+            f"--allow-origin {origin}: expected scheme, host and port as a browser writes them, "
+            f"in small letters and without a path, e.g. https://hub.example"
+        )
+    return found[1].strip("[]")
 
 
 def _listening(host: str, port: int) -> socket.socket:

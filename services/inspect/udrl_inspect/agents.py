@@ -23,7 +23,7 @@ from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
 from udrl_replay.progress import Progress
-from udrl_replay.store import Store
+from udrl_replay.store import EvaluationRow, Store
 
 #: Seconds after which a command that is reproduced shows where it is, again and again.
 _SHOW_S = 60.0
@@ -87,6 +87,14 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             iteration=progress.iteration,
             weights=found.weights,
         )
+
+
+def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:
+    """Return what the run's own evaluation of an agent obtained; None: there was none."""
+    # With a lead the same weights are evaluated in a later iteration.
+    return store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
+        agent.version + agent.config.lead, closing=False
+    )
 
 
 def reproduce(run_dir: Path, command_id: int) -> Episode:

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from udrl import folder as folders
 from udrl.errors import ConfigError, StoreError
+from udrl.evaluation import return_text
 from udrl.offline import write_dataset
 from udrl.version import __version__
-from udrl_inspect.agents import Agent
+from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.inspection import budget_of
 from udrl_inspect.obedience import Obedience, kept_of
 from udrl_inspect.obedience_text import markdown
@@ -72,7 +73,7 @@ model-index:
         metrics:
           - type: mean_reward
             name: mean_reward
-            value: {mean:.2f} +/- {std:.2f}
+            value: {mean} +/- {std}
             verified: false
 """
 
@@ -104,11 +105,8 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     if (folder / FILE).exists():
         raise ConfigError(f"{folder} is the directory of a run; name another folder")
     with closing(Store(run_dir, read_only=True)) as store:
-        # With a lead the same weights are evaluated in a later iteration.
         progress = store.fact("progress", Progress)
-        found = store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
-            agent.version + agent.config.lead, closing=False
-        )
+        found = stored_evaluation(store, agent)
     policy = agent.policy
     if found is not None:  # what the card's results were asked for
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
@@ -179,11 +177,12 @@ def _card(
     results, index = "These weights were never evaluated.", ""
     if found is not None:
         mean, std, low, high, episodes = found.evaluation
-        index = _INDEX.format(environment=environment, mean=mean, std=std)
+        index = _INDEX.format(environment=environment, mean=return_text(mean), std=return_text(std))
         results = (
-            f"**Mean return {mean:.1f}** (95 % interval {low:.1f} to {high:.1f}, standard "
-            f"deviation {std:.1f}, {episodes} episodes with seeds not trained on), asked for "
-            f"{found.desired_return:.1f} within {found.desired_horizon} steps, after "
+            f"**Mean return {return_text(mean)}** (95 % interval {return_text(low)} to "
+            f"{return_text(high)}, standard deviation {return_text(std)}, {episodes} episodes with "
+            f"seeds not trained on), asked for {return_text(found.desired_return)} within "
+            f"{found.desired_horizon} steps, after "
             f"{found.env_steps:,} env steps of training."
         )
     return _CARD.format(

@@ -69,9 +69,12 @@ def read_status(run_dir: Path) -> Status:
         StoreError: there is no run, or it is damaged.
     """
     with closing(Store(run_dir, read_only=True)) as store:
-        found = status(read_run(run_dir, store), Throughput(), Waits(), 0.0, 0.0)
+        run = read_run(run_dir, store)
+        found = status(run, Throughput(), Waits(), 0.0, 0.0)
     if found.state in ("running", "closing") and served_at(run_dir) is None:
-        return msgspec.structs.replace(found, state="stopped", time_left_s=None)
+        return msgspec.structs.replace(
+            found, state="stopped", time_left_s=None, ended_because=run.progress.why_stopped()
+        )
     return found
 
 

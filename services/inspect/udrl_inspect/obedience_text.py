@@ -1,11 +1,12 @@
 """The report on what an agent can be asked for, as text: sentences, tables, rows of a CSV file."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import msgspec
 
+from udrl.evaluation import return_text
 from udrl_inspect.obedience import TOLERANCE, Obedience, Point
 
 #: Correlation from which on means follow their commands, even if they are not what is commanded.
@@ -118,11 +119,11 @@ def horizons(report: Obedience) -> str:
 
 def rule(report: Obedience) -> str:
     """Return the sentence that says when a command counts as obeyed."""
-    usual = TOLERANCE * (report.reachable_high - report.reachable_low)
+    is_usual = math.isclose(report.tolerance, _usual_tolerance(report))
     share = f" ({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns)"
     return (
         f"Obeyed: the mean lies within {_number(report)(report.tolerance)} of the command"
-        f"{share if math.isclose(report.tolerance, usual) else ''}, and increases with it."
+        f"{share if is_usual else ''}, and increases with it."
     )
 
 
@@ -179,16 +180,17 @@ def _exact(value: float) -> str:
     return f"{value:.10g}"
 
 
-class _Number:
-    """Numbers with as many digits as tell returns of a report apart: a tenth of the tolerance."""
+def _number(report: Obedience) -> Callable[[float], str]:
+    """Return what writes returns of a report, alike and with as many digits as tell them apart.
 
-    def __init__(self, report: Obedience) -> None:
-        tolerance = report.tolerance
-        self._digits = max(0, 1 - math.floor(math.log10(tolerance))) if tolerance > 0 else 1
+    These are digits to a tenth of the tolerance, which may be wider than all returns.
+    """
+    finest = min(report.tolerance, _usual_tolerance(report))
+    if finest <= 0:
+        return return_text
+    digits = max(0, 1 - math.floor(math.log10(finest)))
+    return lambda value: f"{round(value, digits) + 0.0:.{digits}f}"
 
-    def __call__(self, value: float) -> str:
-        return f"{round(value, self._digits) + 0.0:.{self._digits}f}"
 
-
-def _number(report: Obedience) -> _Number:
-    return _Number(report)
+def _usual_tolerance(report: Obedience) -> float:
+    return TOLERANCE * (report.reachable_high - report.reachable_low)

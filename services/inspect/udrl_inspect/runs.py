@@ -32,6 +32,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         best_return: the greatest mean return of an evaluation; None: none yet.
         changed: when its file was last written, seconds since 1970.
         problem: why it failed, or cannot be read.
+        ended_because: why nobody works on it; empty: somebody does, or it cannot be read.
     """
 
     run_dir: str
@@ -43,6 +44,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     best_return: float | None = None
     changed: float = 0.0
     problem: str = ""
+    ended_because: str = ""
 
 
 def find(folder: Path) -> list[Summary]:
@@ -83,10 +85,11 @@ def summarise(run_dir: Path) -> Summary:
             progress = store.fact("progress", Progress)
             best = store.best_evaluation()
         state: State = "stopped"
+        because = progress.why_stopped()
         if progress.state in ("ended", "failed"):
-            state = progress.state
+            state, because = progress.state, progress.why_ended()
         elif served_at(run_dir) is not None:
-            state = "running"
+            state, because = "running", ""
         return Summary(
             run_dir=str(run_dir),
             state=state,
@@ -97,6 +100,7 @@ def summarise(run_dir: Path) -> Summary:
             best_return=best,
             changed=changed,
             problem=progress.problem,
+            ended_because=because,
         )
     except UdrlError as error:
         return Summary(

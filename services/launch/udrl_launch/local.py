@@ -70,13 +70,13 @@ class Processes:
             "--listen", endpoint, *(["--insecure"] if insecure else []), "--audit", str(audit),
         )  # fmt: skip
         start("learner", "learner", "--connect", endpoint, "--patience", _PATIENCE_S)
-        envs = str(fleet.envs_per_actor)
+        envs = str(settings.envs_per_actor)
         for number in range(1, fleet.actors + 1):
             start(
                 f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
                 "--nice", "10", "--patience", _PATIENCE_S,
                 "--hang-timeout", f"{fleet.hang_timeout:g}",
-                "--first-index", str((number - 1) * fleet.envs_per_actor),
+                "--first-index", str((number - 1) * settings.envs_per_actor),
             )  # fmt: skip
 
     @property
@@ -143,9 +143,9 @@ class Threads:
                 partial(
                     roles.actor,
                     address,
-                    fleet.envs_per_actor,
+                    settings.envs_per_actor,
                     self._stop,
-                    first_index=(number - 1) * fleet.envs_per_actor,
+                    first_index=(number - 1) * settings.envs_per_actor,
                 ),
             )
 

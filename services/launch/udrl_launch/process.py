@@ -141,7 +141,8 @@ def run_service(service: Callable[[threading.Event], None]) -> int:
         mouth.close()
         ear.close()
     if received and (error is None or isinstance(error, Interrupted)):
-        log.warning("%s", error or "stopped")
+        by = signal.Signals(received[0]).name
+        log.warning("%s", f"{by}: {error or 'stopped'}")
         return 128 + received[0]
     if error is None:
         return 0

@@ -33,13 +33,13 @@ class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     Attributes:
         actors: actor processes on this machine.
-        envs_per_actor: environments that each steps at once.
+        envs_per_actor: environments that each steps at once; None: what suits the run.
         hang_timeout: seconds of one round of steps after which an actor ends and is started again.
             Making an environment may take five minutes, or as long as this if that is more.
     """
 
     actors: Annotated[int, Meta(ge=0, le=1024)] = 2
-    envs_per_actor: Annotated[int, Meta(ge=1, le=4096)] = 16
+    envs_per_actor: Annotated[int, Meta(ge=1, le=4096)] | None = None
     hang_timeout: Annotated[float, Meta(ge=1, le=86_400)] = 60.0
 
 
@@ -53,12 +53,26 @@ def _from_file(file: Path, environment: str) -> dict[str, Any]:
     return values
 
 
+#: Environments that one call of a network for vectors serves well.
+_MOST_ENVS = 16
+
+
 class Settings(NamedTuple):
     """All settings of a command."""
 
     config: Config
     budget: Budget
     fleet: Fleet
+
+    @property
+    def envs_per_actor(self) -> int:
+        """Environments that each actor steps at once, all of them busy now and then."""
+        if self.fleet.envs_per_actor is not None:
+            return self.fleet.envs_per_actor
+        commands, evaluation = self.config.commands, self.config.evaluation
+        exploring = commands.n_episodes_per_iter * (self.config.lead + 1)
+        most = max(commands.n_warm_up_episodes, exploring + evaluation.eval_episodes)
+        return max(1, min(_MOST_ENVS, most // max(1, self.fleet.actors)))
 
 
 def gather(

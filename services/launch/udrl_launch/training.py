@@ -66,6 +66,19 @@ class Watchers:
         return self._latest if self._clock() - self._shown_at < _STALE_S else None
 
 
+class Adviser:
+    """Warns once, as soon as a run does not learn."""
+
+    def __init__(self) -> None:
+        self._has_warned = False
+
+    def show(self, status: Status) -> None:
+        """Take note of a status."""
+        if status.advice and not self._has_warned:
+            log.warning("%s", status.advice)
+            self._has_warned = True
+
+
 #: Seconds after which a status says nothing of now.
 _STALE_S = 10.0
 #: Seconds between two looks at the services.

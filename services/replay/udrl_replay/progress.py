@@ -6,6 +6,10 @@ import msgspec
 
 State = Literal["running", "closing", "ended", "failed"]
 
+#: Why nobody works on a run: its service was told to end, or could not say that it would.
+STOPPED = "stopped on request"
+KILLED = "stopped without notice: its replay service was killed, or its machine went down"
+
 
 class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """What the store keeps as one fact, written at the end of every transaction that changed it.
@@ -23,6 +27,8 @@ class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         latest_version: the newest weights version; 0: none yet.
         best_version: the version with the best evaluation; 0: none yet.
         exact: whether the result is still a function of the configuration alone.
+        problem: why the run failed.
+        ended_because: why there is no iteration after the last one, or :data:`STOPPED`.
         deceived: the run failed because episodes of an actor that lied have entered it.
         audit: share of the episodes that a second actor makes again.
         agreed: those that it made alike.
@@ -46,6 +52,15 @@ class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     exact: bool = True
     inexact_reason: str = ""
     problem: str = ""
+    ended_because: str = ""
     deceived: bool = False
     audit: float = 0.0
     agreed: int = 0
+
+    def why_ended(self) -> str:
+        """Return why the run ended, in words; empty: it has not."""
+        return f"failed: {self.problem}"[:4000] if self.state == "failed" else self.ended_because
+
+    def why_stopped(self) -> str:
+        """Return why nobody works on the run, though it has not ended."""
+        return STOPPED if self.ended_because == STOPPED else KILLED

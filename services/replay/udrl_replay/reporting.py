@@ -25,6 +25,7 @@ from udrl_proto.reports import (
     Status,
     Waiting,
 )
+from udrl_replay.advice import advice
 from udrl_replay.remedies import unwritable
 from udrl_replay.standing import Standing
 from udrl_replay.store import COLUMNS, EvaluationRow, Store
@@ -169,6 +170,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
             run.wall_s if progress.state in ("running", "closing") else progress.wall_s, 3
         ),
         max_env_steps=run.budget.max_env_steps,
+        stop_return=run.budget.stop_return,
         time_left_s=round(left / spent, 1) if spent and progress.state == "running" else None,
         commands=CommandLedger(
             issued=progress.issued,
@@ -205,6 +207,8 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
         actors=actors,
         waiting=waits.list(now),
         problem=progress.problem,
+        ended_because=progress.why_ended(),
+        advice=advice(run),
         audit=AuditStatus(
             rate=progress.audit,
             agreed=progress.agreed,

@@ -12,13 +12,14 @@ from typing import Literal
 from udrl.commands import CLOSING, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Deceived, Refused, RunFailed
-from udrl.evaluation import summarise
+from udrl.evaluation import return_text, summarise
 from udrl.replay import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import IterationStatus
 from udrl_replay.arrival import Arrival
 from udrl_replay.dealing import SUSPICIOUS
+from udrl_replay.progress import STOPPED
 from udrl_replay.standing import Standing
 from udrl_replay.store import EvaluationRow, Store, Version
 from udrl_replay.trust import Trust
@@ -54,8 +55,10 @@ class Run(Standing):
                 self._issue(self.sampler.warm_up())
             if self.progress.state == "failed":
                 self._try_again()
-            if self.progress.state != "running" and not self._budget_spent():
+            why = self._spent()
+            if self.progress.state != "running" and not why:
                 self._reopen()
+            self.progress.ended_because = "" if self.progress.state == "running" else why
             self._advance()
             self.save()
 
@@ -64,6 +67,12 @@ class Run(Standing):
         if self.progress.state in ("running", "closing"):
             self.progress.wall_s = self.wall_s
         self.store.set_fact("progress", self.progress)
+
+    def stop(self) -> None:
+        """Note that nobody will work on the run, for whoever looks at its file."""
+        if self.progress.state in ("running", "closing"):
+            self.progress.ended_because = STOPPED
+        self.save()
 
     # Episodes.
 
@@ -237,8 +246,8 @@ class Run(Standing):
             if due:
                 self._issue(self.sampler.evaluate(opened, self.buffer))
             due = False
-        if self._budget_spent():
-            self._close()
+        if why := self._spent():
+            self._close(why)
 
     def _note_evaluation(self, command: Command, entries: list[Entry], *, closing: bool) -> None:
         """Summarise what an evaluation's episodes obtained; ``command`` is one of theirs."""
@@ -251,8 +260,9 @@ class Run(Standing):
             )
         )
         log.info(
-            "iteration %d, evaluation at %d env steps: mean return %.1f (95 %% from %.1f to %.1f)",
-            iteration, source, result.mean, result.ci95_low, result.ci95_high,
+            "iteration %d, evaluation at %d env steps: mean return %s (95 %% from %s to %s)",
+            iteration, source,
+            *map(return_text, (result.mean, result.ci95_low, result.ci95_high)),
         )  # fmt: skip
         if not closing:
             self._evaluated.add(version)
@@ -267,19 +277,24 @@ class Run(Standing):
 
     # The end, and going on after it.
 
-    def _budget_spent(self) -> bool:
+    def _spent(self) -> str:
+        """Return what of the budget is reached, in words; empty: nothing."""
+        most, wanted = self.budget.max_env_steps, self.budget.stop_return
         last = self.store.last_evaluation(closing=False)
-        lands = (
-            self.budget.stop_return is not None
+        if (
+            wanted is not None
             and last is not None
             and last.iteration == self.progress.iteration
-            and last.evaluation.mean >= self.budget.stop_return
-        )
-        return self.progress.env_steps >= self.budget.max_env_steps or lands
+            and last.evaluation.mean >= wanted
+        ):
+            return f"reached return {wanted:g}"
+        if self.progress.env_steps >= most:
+            return f"spent its budget of {most:,} env steps"
+        return ""
 
-    def _close(self) -> None:
+    def _close(self, why: str) -> None:
         """Iteration N is complete: cancel what was issued beyond and wait for version N."""
-        self.progress.state = "closing"
+        self.progress.state, self.progress.ended_because = "closing", why
         self._cancel(list(self.dealer.outstanding))
         self.store.remove_versions(self.progress.iteration)
         self.progress.latest_version = min(self.progress.latest_version, self.progress.iteration)

@@ -149,7 +149,7 @@ class ReplayService:
             self._answer_until_ended(stop)
             # Only here: after an error, what is in memory may be ahead of what is on disk.
             with self._store.transaction():
-                self.run.save()
+                self.run.stop()
             if self.run.progress.state == "ended":
                 write_weights(self._run_dir, self._store, self.run.progress.latest_version)
         finally:

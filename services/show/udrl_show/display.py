@@ -9,6 +9,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from udrl.evaluation import return_text
 from udrl_proto.reports import EvaluationStatus, Status, Waiting
 
 _PLAIN_EVERY_S = 5.0
@@ -68,7 +69,9 @@ def line(status: Status) -> str:
         f"weights {status.weights_version} (lag {status.weights_lag})",
     ]
     if status.time_left_s is not None:
-        parts.append(f"left {duration(status.time_left_s)}")
+        parts.append(f"left {time_left(status)}")
+    if status.ended_because:
+        parts.append(status.ended_because)
     parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
     return "; ".join(parts)
 
@@ -93,7 +96,7 @@ def panel(status: Status) -> Table:
         f"environments, {sum(a.running for a in status.actors)} of at most "
         f"{status.useful_concurrency} episodes under way",
         "time": f"{duration(status.wall_s)}"
-        + (f", left {duration(status.time_left_s)}" if status.time_left_s is not None else ""),
+        + (f", left {time_left(status)}" if status.time_left_s is not None else ""),
     }
     if status.audit.rate:
         audit = status.audit
@@ -101,6 +104,10 @@ def panel(status: Status) -> Table:
             f"{100 * audit.rate:g} % of the episodes; {audit.agreed} agreed, {audit.open} open, "
             f"{audit.disputed} disputed"
         )
+    if status.ended_because:
+        rows["because"] = status.ended_because
+    if status.advice:
+        rows["advice"] = status.advice
     for name, value in rows.items():
         table.add_row(name, Text(value))
     for actor in status.quarantined:
@@ -120,7 +127,7 @@ def evaluation(result: EvaluationStatus | None) -> str:
     if result is None:
         return "none yet"
     half = (result.ci95_high - result.ci95_low) / 2
-    return f"{result.mean:.1f} ± {half:.1f} at {result.env_steps:,}"
+    return f"{return_text(result.mean)} ± {return_text(half)} at {result.env_steps:,}"
 
 
 def returns(status: Status) -> str:
@@ -128,7 +135,13 @@ def returns(status: Status) -> str:
     held = status.buffer
     if held.return_min is None or held.return_mean is None or held.return_max is None:
         return "empty"
-    return f"{held.return_min:.1f} / {held.return_mean:.1f} / {held.return_max:.1f}"
+    return " / ".join(map(return_text, (held.return_min, held.return_mean, held.return_max)))
+
+
+def time_left(status: Status) -> str:
+    """Return how long a run goes on; nobody knows when an evaluation will reach its stop_return."""
+    most = "" if status.stop_return is None else "at most "
+    return most + duration(status.time_left_s or 0.0)
 
 
 def duration(seconds: float) -> str:

@@ -11,6 +11,7 @@ from udrl.commands import Command
 from udrl.config import Config, change
 from udrl.environments.making import Environment, make_environment
 from udrl.errors import UnsupportedEnvironment
+from udrl.evaluation import return_text
 from udrl.rollout import Rollout
 from udrl.streams import Purpose, stream_key
 from udrl_inspect.agents import Agent
@@ -32,15 +33,22 @@ class Screen(Protocol):
         ...
 
 
-def with_seed(commands: list[Command], seed: int) -> list[Command]:
-    """Return commands whose environments and actions follow from ``seed``, one more for each."""
+def with_seeds(commands: list[Command], first: int | None = None) -> list[Command]:
+    """Return commands whose episodes follow from their seeds, so that a seed says which they are.
+
+    Args:
+        commands: of an evaluation, whose actions follow from their places in it.
+        first: the first seed, one more for each that follows; None: the environments' seeds stay.
+    """
+    seeds = [
+        command.environment_seed if first is None else (first + k) % 2**31
+        for k, command in enumerate(commands)
+    ]
     return [
         msgspec.structs.replace(
-            command,
-            environment_seed=(seed + k) % 2**31,
-            stream_key=stream_key(seed + k, Purpose.EPISODE),
+            command, environment_seed=seed, stream_key=stream_key(seed, Purpose.EPISODE)
         )
-        for k, command in enumerate(commands)
+        for command, seed in zip(commands, seeds, strict=True)
     ]
 
 
@@ -117,6 +125,6 @@ def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
 def caption(rollout: Rollout) -> str:
     """Return what is asked for still, and what has been obtained."""
     return (
-        f"step {rollout.steps}: obtained {rollout.episode_return:.1f}; asked for "
-        f"{rollout.desired_return:.1f} more within {max(rollout.desired_horizon, 1)} steps"
+        f"step {rollout.steps}: obtained {return_text(rollout.episode_return)}; asked for "
+        f"{return_text(rollout.desired_return)} more within {max(rollout.desired_horizon, 1)} steps"
     )

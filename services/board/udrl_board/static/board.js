@@ -55,8 +55,10 @@ function showStatus(status) {
   $("title").textContent = `${status.environment}, run ${status.run_id}`;
   document.title = `${status.environment} · udrl board`;
   const exact = status.exact ? "exact" : `NOT exact: ${status.inexact_reason}`;
-  $("state").textContent = `${status.state}; ${exact}`;
-  const left = status.time_left_s == null ? [] : [["time left", time(status.time_left_s)]];
+  // Why it failed stands below, with the command that helps.
+  const because = { ended: `ended: ${status.ended_because}`, stopped: status.ended_because };
+  $("state").textContent = `${because[status.state] || status.state}; ${exact}`;
+  const left = status.time_left_s == null ? [] : [["time left", (status.stop_return == null ? "" : "at most ") + time(status.time_left_s)]];
   facts($("facts"), [
     ["iteration", number(status.iteration)],
     ["env steps", `${number(status.env_steps)} of ${number(status.max_env_steps)}`],
@@ -199,7 +201,7 @@ async function ask() {
   showObeyed();
   $("about").textContent = `udrl ${news.software}`;
   const why = news.status?.problem.replace("RUN_DIR", commands().run_dir);
-  problem([news.problem, why].filter(Boolean).join(" "));
+  problem([news.problem, why, news.status?.advice].filter(Boolean).join(" "));
 }
 
 function problem(text) {

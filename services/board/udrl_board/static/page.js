@@ -1,9 +1,11 @@
 // What every script of the page needs: its elements, numbers as people read them, lists of facts.
 export const $ = (id) => document.getElementById(id);
 
-// Small numbers with three digits after the point, others with one; or with as many as are wanted.
+// Numbers below ten with three digits, others with one after the point; or with as many there as are wanted.
 export const number = (x, digits) =>
-  x == null ? "–" : x.toLocaleString("en", { maximumFractionDigits: digits ?? (Math.abs(x) < 10 ? 3 : 1) });
+  x == null
+    ? "–"
+    : x.toLocaleString("en", digits === undefined && Math.abs(x) < 10 ? { maximumSignificantDigits: 3 } : { maximumFractionDigits: digits ?? 1 });
 
 // Numbers of an axis in the largest unit that fits, with as many digits as tell them apart.
 export function labels(values) {

@@ -3,7 +3,7 @@ import { Plane, Seen, spans } from "./map.js";
 import { $, facts, nice, number } from "./page.js";
 
 const FIELDS = ["desired-return", "desired-horizon"];
-const round = (x) => Math.round(x * 1000) / 1000;
+const round = (x) => (Math.abs(x) < 1 ? Number(Number(x).toPrecision(4)) : Math.round(x * 1000) / 1000);
 
 export class Command {
   constructor() {

@@ -6,13 +6,17 @@ from pathlib import Path
 import click
 
 from udrl.errors import EnvironmentFault
+from udrl.evaluation import return_text
 from udrl_inspect import agents, inspection
+from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
     CONNECT,
+    GREEDY,
     KEYS,
     RETURN,
     RUN,
     RUN_DIR,
+    TEMPERATURE,
     WEIGHTS,
     chosen_temperature,
     place,
@@ -26,10 +30,8 @@ from udrl_show.display import panel
 @click.argument("run_dir", type=RUN_DIR)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=100, show_default=True,
               help="Episodes to run.")  # fmt: skip
-@click.option("--temperature", type=click.FloatRange(0, 1000),
-              help="Of the action distribution; 0: take its mode. Default: as the run's "
-              "evaluations.")  # fmt: skip
-@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@TEMPERATURE
+@GREEDY
 @click.option("--desired-return", type=RETURN, help="Default: as in section 2.3.6.")
 @click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
 @WEIGHTS
@@ -49,7 +51,7 @@ def evaluate(
 ) -> int:
     """Evaluate a trained agent, with the run's command or one of your own.
 
-    Example: udrl evaluate runs/mine --greedy --desired-return 200 --desired-horizon 300
+    Example: udrl evaluate runs/mine --desired-return 200 --desired-horizon 300
     """
     agent = agents.load_agent(run_dir, version(weights))
     commands = agents.evaluation_commands(
@@ -57,6 +59,8 @@ def evaluate(
         desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
     result = agents.evaluate(agent, commands, envs)
+    if said := caution(agent, run_dir, commands[0], result.returns):
+        click.echo(said, err=True)
     if as_json:
         report = {
             "run_dir": str(run_dir), "weights_version": agent.version,
@@ -68,10 +72,12 @@ def evaluate(
         return 0
     found = result.evaluation
     click.echo(
-        f"commanded return {result.desired_return:.1f} within {result.desired_horizon} steps, "
+        f"commanded return {return_text(result.desired_return)} within "
+        f"{result.desired_horizon} steps, "
         f"temperature {result.temperature:g}, weights version {agent.version}: mean return "
-        f"{found.mean:.1f} (95 % interval {found.ci95_low:.1f} to {found.ci95_high:.1f}), "
-        f"standard deviation {found.std:.1f}, {found.episodes} episodes"
+        f"{return_text(found.mean)} (95 % interval {return_text(found.ci95_low)} to "
+        f"{return_text(found.ci95_high)}), standard deviation {return_text(found.std)}, "
+        f"{found.episodes} episodes"
     )
     return 0
 

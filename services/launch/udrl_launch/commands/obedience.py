@@ -12,8 +12,10 @@ from udrl_inspect import obedience_text, tables
 from udrl_inspect.agents import load_agent
 from udrl_launch.commands.options import (
     FILE,
+    GREEDY,
     RETURNS,
     RUN_DIR,
+    TEMPERATURE,
     WEIGHTS,
     chosen_temperature,
     version,
@@ -37,10 +39,8 @@ _NAME = Path(reports.FILE)
 @click.option("--tolerance", type=click.FloatRange(0, 1e9),
               help="How far a mean obtained return may be from its command where the agent obeys. "
               "Default: 10 % of the range of the replay buffer's returns.")  # fmt: skip
-@click.option("--temperature", type=click.FloatRange(0, 1000),
-              help="Of the action distribution; 0: take its mode. Default: as the run's "
-              "evaluations.")  # fmt: skip
-@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+@TEMPERATURE
+@GREEDY
 @WEIGHTS
 @click.option("--output", "-o", type=FILE, metavar="FILE",
               help="The picture: .png, .svg or .pdf. Default: obedience.png in RUN_DIR, where "

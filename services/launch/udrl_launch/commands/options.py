@@ -77,6 +77,16 @@ WEIGHTS = click.option(
 )  # fmt: skip
 
 
+TEMPERATURE = click.option(
+    "--temperature", type=click.FloatRange(0, 1000),
+    help="Of the action distribution; 0: take its mode. Default: as the run's evaluations.",
+)  # fmt: skip
+GREEDY = click.option(
+    "--greedy", is_flag=True,
+    help="The same as --temperature 0. Agents that learned with sampled actions may do far worse.",
+)  # fmt: skip
+
+
 class _Return(click.ParamType):  # type: ignore[type-arg]
     """A return that can be asked for."""
 

@@ -4,11 +4,15 @@ from pathlib import Path
 
 import click
 
+from udrl.evaluation import return_text
 from udrl_inspect.agents import evaluation_commands, load_agent
+from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
     FILE,
+    GREEDY,
     RETURN,
     RUN_DIR,
+    TEMPERATURE,
     WEIGHTS,
     chosen_temperature,
     version,
@@ -16,7 +20,7 @@ from udrl_launch.commands.options import (
 from udrl_launch.output import print_json
 from udrl_launch.paths import shown
 from udrl_show.playing import play as play_episodes
-from udrl_show.playing import with_seed
+from udrl_show.playing import with_seeds
 from udrl_show.window import KEYS_HELP, Window
 
 
@@ -28,12 +32,11 @@ from udrl_show.window import KEYS_HELP, Window
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
               help="Episodes to play.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1),
-              help="Of the first episode, one more for each that follows. Default: those of the "
-              "run's closing evaluation.")  # fmt: skip
-@click.option("--temperature", type=click.FloatRange(0, 1000),
-              help="Of the action distribution; 0: take its mode. Default: as the run's "
-              "evaluations.")  # fmt: skip
-@click.option("--greedy", is_flag=True, help="The same as --temperature 0.")
+              help="Of the first episode, one more for each that follows: command, weights and "
+              "seed decide an episode. Default: those of the run's closing "
+              "evaluation.")  # fmt: skip
+@TEMPERATURE
+@GREEDY
 @WEIGHTS
 @click.option("--video", type=FILE, metavar="FILE",
               help="Film them: FILE.mp4 or FILE.gif.")  # fmt: skip
@@ -60,26 +63,32 @@ def play(
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
     agent = load_agent(run_dir, version(weights))
-    commands = evaluation_commands(
-        agent,
-        episodes=episodes,
-        temperature=chosen_temperature(temperature, greedy=greedy),
-        desired_return=desired_return,
-        desired_horizon=desired_horizon,
+    commands = with_seeds(
+        evaluation_commands(
+            agent,
+            episodes=episodes,
+            temperature=chosen_temperature(temperature, greedy=greedy),
+            desired_return=desired_return,
+            desired_horizon=desired_horizon,
+        ),
+        seed,
     )
-    if seed is not None:
-        commands = with_seed(commands, seed)
     told = commands[0]
     if not as_json:
         click.echo(
-            f"asked for a return of {told.desired_return:.1f} within {told.desired_horizon} steps "
-            f"(temperature {told.temperature:g}, weights version {agent.version})"
+            f"asked for a return of {return_text(told.desired_return)} within "
+            f"{told.desired_horizon} steps (temperature {told.temperature:g}, weights version "
+            f"{agent.version})"
         )
     screen = Window if opens_window else None
+    obtained: list[float] = []
     for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
+        obtained.append(rollout.episode_return)
         if as_json:
             report = {
                 "environment_seed": rollout.command.environment_seed,
+                "weights_version": agent.version,
+                "temperature": told.temperature,
                 "desired_return": told.desired_return,
                 "desired_horizon": told.desired_horizon,
                 "episode_return": rollout.episode_return,
@@ -92,8 +101,10 @@ def play(
             ending = "" if rollout.terminated else ", cut by its time limit"
             click.echo(
                 f"seed {rollout.command.environment_seed}: obtained "
-                f"{rollout.episode_return:.1f} in {rollout.steps} steps{ending}"
+                f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
             )
+    if said := caution(agent, run_dir, told, obtained):
+        click.echo(said, err=True)
     if video is not None and not as_json:
         click.echo(f"film: {shown(video)}")
     return 0

@@ -6,13 +6,14 @@ from typing import Literal
 
 import click
 
+from udrl.evaluation import return_text
 from udrl_inspect.runs import Summary, find
 from udrl_launch.commands.options import FILE, RUN_DIR
 from udrl_launch.output import print_json
 from udrl_show import curve
 from udrl_show.display import duration
 
-_HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "run"
+_HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "because", "run"
 
 
 @click.command()
@@ -46,11 +47,12 @@ def _cells(summary: Summary) -> tuple[str, ...]:
     """Return a line of the table; the directory, which may be long, stands last."""
     ago = f"{duration(max(0.0, time.time() - summary.changed))} ago"
     if summary.state == "unreadable":
-        return summary.state, "", "", "", "", ago, summary.run_dir
-    best = "none yet" if summary.best_return is None else f"{summary.best_return:.1f}"
+        return summary.state, "", "", "", "", ago, "", summary.run_dir
+    best = "none yet" if summary.best_return is None else return_text(summary.best_return)
     steps = f"{summary.env_steps:,} of {summary.max_env_steps:,}"
     seed = str(summary.seed)
-    return summary.state, summary.environment, seed, steps, best, ago, summary.run_dir
+    because = summary.ended_because.partition(":")[0]  # the rest stands below
+    return summary.state, summary.environment, seed, steps, best, ago, because, summary.run_dir
 
 
 @click.command()

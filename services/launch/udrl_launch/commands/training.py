@@ -9,13 +9,14 @@ from typing import Any
 import click
 
 from udrl.errors import ConfigError, UdrlError
+from udrl.evaluation import return_text
 from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, settings_options
 from udrl_launch.output import print_json
 from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.settings import Settings
-from udrl_launch.training import Watchers
+from udrl_launch.training import Adviser, Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
 from udrl_replay.creation import directory_name
@@ -79,7 +80,7 @@ def train(
     settings = gather_settings(env, given, run_dir, go_on=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
     log_to_stderr(logging.WARNING)
-    _warn_of_idle_actors(settings)
+    warn_of_idle_environments(settings)
 
     def service(stop: threading.Event) -> None:
         with ExitStack() as stack:
@@ -91,6 +92,7 @@ def train(
             if tensorboard:
                 watchers.add(stack.enter_context(closing(EventFiles(run_dir))))
             watchers.add(stack.enter_context(Display()))
+            watchers.add(Adviser())
             status = run_training(
                 settings, run_dir, stop, go_on=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
@@ -106,25 +108,28 @@ def train(
     return run_service(service)
 
 
-def _warn_of_idle_actors(settings: Settings) -> None:
+def warn_of_idle_environments(settings: Settings) -> None:
+    """Warn if somebody asked for more environments than exploring can keep busy."""
     config, _, fleet = settings
     useful = config.commands.n_episodes_per_iter * (config.lead + 1)
-    environments = fleet.actors * fleet.envs_per_actor
-    if environments > 2 * useful:
+    asked_for = fleet.actors * (fleet.envs_per_actor or 1)
+    if asked_for > 2 * useful:
         log.warning(
             "%d environments, but at most %d episodes can run at once (n_episodes_per_iter x "
-            "(lead + 1)); the others will be idle",
-            environments, useful,
+            "(lead + 1)); but for warm-up and evaluations the others will be idle",
+            asked_for, useful,
         )  # fmt: skip
 
 
 def _finish(run_dir: Path, status: Status) -> None:
     """Write the weights and the picture, and say where everything is."""
     closing = status.closing_evaluation
+    if not status.problem:
+        click.echo(f"ended:          {status.ended_because}")
     if closing is not None:
         click.echo(
-            f"final evaluation: mean return {closing.mean:.1f} "
-            f"(95 % interval {closing.ci95_low:.1f} to {closing.ci95_high:.1f}, "
+            f"final evaluation: mean return {return_text(closing.mean)} (95 % interval "
+            f"{return_text(closing.ci95_low)} to {return_text(closing.ci95_high)}, "
             f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
             f"{status.wall_s:.0f} s"
         )

@@ -1,0 +1,55 @@
+"""Whether an agent acts worse greedily than sampled: often, if it learned from sampled actions."""
+
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from udrl.commands import Command
+from udrl.evaluation import return_text, summarise
+from udrl_inspect.agents import Agent, evaluation_commands, stored_evaluation
+from udrl_replay.store import Store
+
+
+def caution(agent: Agent, run_dir: Path, told: Command, returns: Sequence[float]) -> str:
+    """Return a sentence if greedy episodes obtained far less than the run's sampled evaluations.
+
+    Far less: more than a standard deviation of the sampled returns, and more than chance explains,
+    however few the greedy episodes are.
+
+    Args:
+        agent: who acted.
+        run_dir: the run's directory.
+        told: the command that it was given; any but the run's own cannot be compared.
+        returns: what it obtained.
+
+    Returns:
+        What was found and what to do; empty: nothing, or there is nothing to compare with.
+
+    Raises:
+        StoreError: the run cannot be read.
+    """
+    usual = evaluation_commands(agent, episodes=1)[0]
+    is_asked_the_same = (told.desired_return, told.desired_horizon) == (
+        usual.desired_return,
+        usual.desired_horizon,
+    )
+    if not (returns and is_asked_the_same and told.temperature == 0 < usual.temperature):
+        return ""
+    with closing(Store(run_dir, read_only=True)) as store:
+        found = (
+            stored_evaluation(store, agent)
+            or store.last_evaluation(closing=True)
+            or store.last_evaluation(closing=False)
+        )
+    if found is None:
+        return ""
+    greedy, sampled = summarise(returns), found.evaluation
+    spread = max(greedy.std, sampled.std)
+    surely_below = greedy.mean + 1.96 * spread / math.sqrt(greedy.episodes)
+    if surely_below >= sampled.ci95_low or sampled.mean - greedy.mean <= sampled.std:
+        return ""
+    return (
+        f"greedy: mean return {return_text(greedy.mean)}; sampled evaluations of this run reach "
+        f"{return_text(sampled.mean)}; leave out --greedy or --temperature 0"
+    )

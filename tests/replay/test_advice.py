@@ -1,0 +1,82 @@
+"""A run that does not learn says so, with the most likely cause."""
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from tests.replay.synthetic import finish
+from udrl.config import Budget
+from udrl.setting_groups import NetworkSettings
+from udrl_launch.training import Adviser
+from udrl_proto.reports import IterationStatus
+from udrl_replay.advice import advice, cause
+from udrl_replay.reporting import Throughput, Waits, status
+from udrl_replay.run import Run
+
+WARM_UP = IterationStatus(
+    iteration=0, commands=50, env_steps=5000, eval_env_steps=0, wall_s=1.0, weights_version=0,
+    loss=None, return_min=-40.0, return_mean=-20.0, return_max=10.0, explored_return=-22.0,
+    commanded_min=None, commanded_max=None, admitted=50,
+)  # fmt: skip
+NETWORK = NetworkSettings(return_scale=0.05, horizon_scale=0.01)
+
+
+@pytest.fixture
+def run(make_run: Callable[..., Run]) -> Run:
+    made = make_run(max_env_steps=60)
+    finish(made)
+    made.progress.best_mean = -1.0  # its returns are 0 and more
+    return made
+
+
+def test_a_run_that_does_not_learn_says_so_after_a_third_of_its_budget(run: Run) -> None:
+    said = advice(run)
+    assert said.startswith(
+        "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
+    )
+    assert said.endswith("See 'Signs of trouble' in docs/metrics.md")
+    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == said
+    run.budget = Budget(max_env_steps=3 * run.progress.env_steps + 1)
+    assert advice(run) == ""
+
+
+@pytest.mark.parametrize("best", [None, 100.0])
+def test_there_is_no_advice_without_need(run: Run, best: float | None) -> None:
+    run.progress.best_mean = best
+    assert advice(run) == ""
+
+
+@pytest.mark.parametrize(
+    ("network", "warm_up", "expected"),
+    [
+        ({}, {}, "too little data: give it more env steps"),
+        ({"return_scale": 0.001}, {}, "return_scale = 0.001: it makes 0.022 of returns of 22, "
+         "usual in the warm-up, and the network needs the order of 1; try return_scale = 0.05"),
+        ({"return_scale": 1.0}, {}, "return_scale = 1: it makes 22 of returns of 22"),
+        ({"horizon_scale": 0.5}, {}, "horizon_scale = 0.5: it makes 50 of lengths of 100"),
+        # Returns that cancel out are not small.
+        ({}, {"explored_return": 0.0}, "too little data: give it more env steps"),
+        ({}, {"return_min": 0.0, "return_max": 0.0, "explored_return": 0.0},
+         "too little data: all of the warm-up returned the same"),
+        # Of a thousand the buffer may hold the best only, which are alike.
+        ({}, {"return_min": 1.0, "return_max": 1.0, "explored_return": 0.1},
+         "return_scale = 0.05: it makes 0.005 of returns of 0.1"),
+    ],
+)  # fmt: skip
+def test_the_most_likely_cause(
+    network: dict[str, float], warm_up: dict[str, float], expected: str
+) -> None:
+    found = cause(
+        msgspec.structs.replace(NETWORK, **network), msgspec.structs.replace(WARM_UP, **warm_up)
+    )
+    assert found.startswith(expected)
+
+
+def test_the_terminal_is_told_once(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    adviser = Adviser()
+    for _ in range(3):
+        adviser.show(status(run, Throughput(), Waits(), 0.0, 0.0))
+    assert [(r.levelname, r.message) for r in caplog.records if "learn" in r.message] == [
+        ("WARNING", advice(run))
+    ]
