@@ -6,17 +6,50 @@ from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
-from udrl.config import Budget
+from udrl.config import Budget, Config
 from udrl.errors import ConfigError, Deceived, RunFailed
 from udrl_actor.service import ActorService
 from udrl_inspect.address import Address, announced, connected, unique_name
 from udrl_proto import session as sessions
 from udrl_proto.credentials import Credentials
 from udrl_proto.zenoh_transport import ZenohTransport
+from udrl_replay.creation import create, exists, no_empty_folder_left, resume
 from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
+
+
+def open_run(
+    run_dir: Path,
+    config: Config,
+    *,
+    go_on: bool,
+    allow_inexact: bool,
+    listen: str | None,
+    insecure: bool,
+    secure: bool,
+) -> Store:
+    """Go on with a run, or make a new one; none is made where it could not be served.
+
+    Args:
+        run_dir: its directory.
+        config: what it is.
+        go_on: go on with the run in ``run_dir`` if there is one.
+        allow_inexact: accept services of other numerics classes.
+        listen: the endpoint that it will have; None: a router's.
+        insecure: allow that to be beyond loopback without keys.
+        secure: whether keys were given.
+
+    Raises:
+        UdrlError: the settings or the endpoint cannot be used, or there is a run already.
+    """
+    if go_on and exists(run_dir):
+        return resume(run_dir, config, allow_inexact=allow_inexact)
+    with no_empty_folder_left(run_dir):
+        if listen is not None:
+            sessions.check_listening(listen, insecure=insecure, secure=secure)
+        return create(run_dir, config, allow_inexact=allow_inexact)
 
 
 def replay(

@@ -1,6 +1,7 @@
 """Creating a run: settle once what every service of it will be told."""
 
 import logging
+import os
 import re
 import uuid
 from collections.abc import Iterator
@@ -43,7 +44,7 @@ def directory_name(config: Config) -> str:
 
 def _run_id(run_dir: Path) -> str:
     """Return a name that no other run has, on whatever router: the directory's, and some chance."""
-    return f"{_slug(run_dir.resolve().name)}-{uuid.uuid4().hex[:8]}"
+    return f"{_slug(Path(os.path.realpath(run_dir)).name)}-{uuid.uuid4().hex[:8]}"
 
 
 def _slug(text: str) -> str:
@@ -62,11 +63,18 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         EnvironmentFault: it raises, or returns what it may not.
         StoreError: the directory holds a run already, or cannot be written.
     """
-    try:
+    with no_empty_folder_left(run_dir):
         return _create(run_dir.absolute(), config, allow_inexact=allow_inexact)
+
+
+@contextmanager
+def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
+    """Remove a folder that was made for a run if the run is not made and nothing is in it."""
+    try:
+        yield
     except BaseException:
         with suppress(OSError):
-            run_dir.rmdir()  # empty: it was made for this run
+            run_dir.rmdir()
         raise
 
 

@@ -23,11 +23,10 @@ from udrl_launch.process import (
     run_service,
     switch_threads_soon,
 )
-from udrl_launch.settings import Settings
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
-from udrl_replay.creation import config_of, create, directory_name, exists, resume, write_config
+from udrl_replay.creation import config_of, directory_name, write_config
 
 log = logging.getLogger("udrl")
 
@@ -79,22 +78,17 @@ def replay(
 
     def service(stop: threading.Event) -> None:
         log.info("the run's directory is %s", shown(run_dir))
-        store = _open(run_dir, settings, go_on=resume, allow_inexact=allow_inexact)
+        store = roles.open_run(
+            run_dir, settings.config, go_on=resume, allow_inexact=allow_inexact, listen=listen,
+            insecure=insecure, secure=keys is not None,
+        )  # fmt: skip
+        write_config(run_dir, config_of(store), settings.budget)
         roles.replay(
             run_dir, store, settings.budget, stop, listen=listen, connect=connect,
             insecure=insecure, credentials=credentials, audit=audit,
         )  # fmt: skip
 
     return _as_service(parent, service)
-
-
-def _open(run_dir: Path, settings: Settings, *, go_on: bool, allow_inexact: bool) -> Any:
-    if go_on and exists(run_dir):
-        store = resume(run_dir, settings.config, allow_inexact=allow_inexact)
-    else:
-        store = create(run_dir, settings.config, allow_inexact=allow_inexact)
-    write_config(run_dir, config_of(store), settings.budget)
-    return store
 
 
 @click.command()
