@@ -18,6 +18,7 @@ from udrl_proto.access import access_control
 from udrl_proto.codec import decode, encode
 from udrl_proto.credentials import Credentials
 from udrl_proto.messages import Hello, HelloRequest
+from udrl_proto.text import printable
 
 log = logging.getLogger("udrl")
 
@@ -255,14 +256,14 @@ def find_run(
             found = {name: hello for name, hello in found.items() if name == run_id}
         if len(found) > 1:
             raise ConfigError(
-                f"several runs are here: {', '.join(sorted(found))}; name one: --run RUN"
+                f"several runs are here: {printable(', '.join(sorted(found)))}; name one: --run RUN"
             )
         if found:
             ((protocol, payload),) = found.values()
             if protocol != str(PROTOCOL):
                 raise ConfigError(
-                    f"the run speaks protocol {protocol}, this program speaks {PROTOCOL}; "
-                    f"install the same version of udrl on both sides"
+                    f"the run speaks protocol {printable(protocol)}, this program speaks "
+                    f"{PROTOCOL}; install the same version of udrl on both sides"
                 )
             return decode(payload, Hello)
         if time.monotonic() >= deadline:

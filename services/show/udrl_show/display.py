@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from udrl_proto.reports import EvaluationStatus, Status, Waiting
+from udrl_proto.text import printable
 
 _PLAIN_EVERY_S = 5.0
 
@@ -70,7 +71,7 @@ def line(status: Status) -> str:
     if status.time_left_s is not None:
         parts.append(f"left {duration(status.time_left_s)}")
     parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
-    return "; ".join(parts)
+    return printable("; ".join(parts))
 
 
 def panel(status: Status) -> Table:
@@ -102,12 +103,12 @@ def panel(status: Status) -> Table:
             f"{audit.disputed} disputed"
         )
     for name, value in rows.items():
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(printable(value)))
     for actor in status.quarantined:
-        table.add_row("quarantined", Text(f"{actor.id}: {actor.why}"))
+        table.add_row("quarantined", Text(printable(f"{actor.id}: {actor.why}")))
     for wait in _long(status):
         said = f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
-        table.add_row("waiting", Text(said))
+        table.add_row("waiting", Text(printable(said)))
     return table
 
 
