@@ -12,6 +12,7 @@ from udrl.errors import Interrupted, Refused, Unreachable
 from udrl_proto import keys
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import JoinRequest, Problem
+from udrl_proto.text import printable
 from udrl_proto.transport import Transport
 from udrl_proto.verbs import JOIN, Reply, Request, Verb
 
@@ -74,7 +75,7 @@ class Asker:
             for answer in self._transport.ask(key, payload, attempt_s):
                 if answer.is_problem:
                     problem = decode(answer.data, Problem)
-                    raise Refused(problem.code, problem.message)
+                    raise Refused(problem.code, printable(problem.message))
                 return decode(answer.data, verb.reply, verb.reply_limit)
             now = time.monotonic()
             if now - asked >= attempt_s:

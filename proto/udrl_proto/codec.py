@@ -11,6 +11,7 @@ import numpy.typing as npt
 from udrl.episode import Episode
 from udrl.errors import ConfigError, InvalidMessage
 from udrl_proto.messages import Array, EpisodeMessage, Message
+from udrl_proto.text import printable
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
@@ -58,11 +59,12 @@ def decode(data: bytes, kind: type[AnyMessage], limit: int = SMALL) -> AnyMessag
         )
     except (ValueError, msgpack.UnpackException, RecursionError, MemoryError) as error:
         name = type(error).__name__
-        raise InvalidMessage(f"{kind.__name__}: not MessagePack: {name}: {error}") from error
+        said = printable(error)
+        raise InvalidMessage(f"{kind.__name__}: not MessagePack: {name}: {said}") from error
     try:
         return msgspec.convert(plain, kind, builtin_types=(bytes,))
     except (msgspec.ValidationError, ConfigError) as error:
-        raise InvalidMessage(f"{kind.__name__}: {error}") from error
+        raise InvalidMessage(f"{kind.__name__}: {printable(error)}") from error
 
 
 def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:

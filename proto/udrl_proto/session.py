@@ -4,6 +4,7 @@ import ipaddress
 import json
 import logging
 import re
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from udrl_proto.access import access_control
 from udrl_proto.codec import decode, encode
 from udrl_proto.credentials import Credentials
 from udrl_proto.messages import Hello, HelloRequest
+from udrl_proto.text import printable
 
 log = logging.getLogger("udrl")
 
@@ -106,6 +108,52 @@ def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
     return config
 
 
+def check_listening(endpoint: str, *, insecure: bool = False, secure: bool = False) -> None:
+    """Make sure that this machine could listen on an endpoint now, before anything is made for it.
+
+    Args:
+        endpoint: where others would connect to.
+        insecure: allow an endpoint beyond loopback although nobody is authenticated.
+        secure: whether keys were given.
+
+    Raises:
+        ConfigError: the endpoint is malformed, in use, not this machine's, or would let strangers
+            in.
+    """
+    _check_audience(endpoint, insecure=insecure, secure=secure)
+    host, port = _host_and_port(endpoint)
+    errors: list[OSError] = []
+    try:
+        for family, _, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.socket(family) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind(address)
+                except OSError as error:
+                    errors.append(error)
+                else:
+                    return
+    except OSError as error:  # the host has no address
+        errors.append(error)
+    raise _cannot_listen(endpoint, errors[0]) from errors[0]
+
+
+def _check_audience(endpoint: str, *, insecure: bool, secure: bool) -> None:
+    check_endpoint(endpoint, secure=secure)
+    if not secure and not insecure and not _is_loopback(endpoint):
+        raise ConfigError(
+            f"endpoint {endpoint!r} can be reached from other machines and nobody would be "
+            f"authenticated; make keys (`udrl keys create DIR`) and give --keys DIR with "
+            f"tls/HOST:PORT, listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
+        )
+
+
+def _cannot_listen(endpoint: str, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"cannot listen on {endpoint!r}: {error}; is the port in use? choose another endpoint"
+    )
+
+
 def listen(
     endpoint: str, *, insecure: bool = False, credentials: Credentials | None = None
 ) -> zenoh.Session:
@@ -120,13 +168,7 @@ def listen(
     Raises:
         ConfigError: the endpoint is malformed, in use, or would let strangers in.
     """
-    check_endpoint(endpoint, secure=credentials is not None)
-    if credentials is None and not insecure and not _is_loopback(endpoint):
-        raise ConfigError(
-            f"endpoint {endpoint!r} can be reached from other machines and nobody would be "
-            f"authenticated; make keys (`udrl keys create DIR`) and give --keys DIR with "
-            f"tls/HOST:PORT, listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
-        )
+    _check_audience(endpoint, insecure=insecure, secure=credentials is not None)
     config = _config("router", credentials)
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     if credentials is not None:
@@ -134,9 +176,7 @@ def listen(
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise ConfigError(
-            f"cannot listen on {endpoint!r}: {error}; is the port in use? choose another endpoint"
-        ) from error
+        raise _cannot_listen(endpoint, error) from error
 
 
 def connect(
@@ -226,14 +266,14 @@ def find_run(
             found = {name: hello for name, hello in found.items() if name == run_id}
         if len(found) > 1:
             raise ConfigError(
-                f"several runs are here: {', '.join(sorted(found))}; name one: --run RUN"
+                f"several runs are here: {printable(', '.join(sorted(found)))}; name one: --run RUN"
             )
         if found:
             ((protocol, payload),) = found.values()
             if protocol != str(PROTOCOL):
                 raise ConfigError(
-                    f"the run speaks protocol {protocol}, this program speaks {PROTOCOL}; "
-                    f"install the same version of udrl on both sides"
+                    f"the run speaks protocol {printable(protocol)}, this program speaks "
+                    f"{PROTOCOL}; install the same version of udrl on both sides"
                 )
             return decode(payload, Hello)
         if time.monotonic() >= deadline:

@@ -17,7 +17,7 @@ from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import make_environment
 from udrl.errors import UnsupportedEnvironment
 from udrl.rows import INDEX
-from udrl_replay.creation import open_run
+from udrl_replay.creation import create, write_config
 
 NESTED = {"layout": ["SF", "FG"], "robot": {"arms": [{"length": 1.5}, {"length": 2}], "on": True}}
 
@@ -34,7 +34,8 @@ def test_keyword_arguments_may_be_lists_and_tables(tmp_path: Path) -> None:
     assert isinstance(layout, Layout)
     assert layout.given == NESTED
     # It can be stored, and written as TOML.
-    open_run(tmp_path / "run", config, Budget(), go_on=False).close()
+    create(tmp_path / "run", config).close()
+    write_config(tmp_path / "run", config, Budget())
     assert read_toml(tmp_path / "run" / "config.toml")["environment_kwargs"] == NESTED
 
 

@@ -62,10 +62,14 @@ def taken_port() -> Iterator[int]:
 
 def test_port_in_use_is_refused(taken_port: int, cli: Callable[..., Cli], tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{taken_port}"
-    code, error = refusal(cli("replay", "Figure2-v0", "--listen", endpoint))
-    assert code == 2
-    assert endpoint in error
-    assert "in use" in error
+    for command in ("replay", "train"):
+        run_dir = tmp_path / command
+        given = [command, "Figure2-v0", "--listen", endpoint, "--run-dir", str(run_dir)]
+        code, error = refusal(cli(*given))
+        assert code == 2
+        assert endpoint in error
+        assert "in use" in error
+        assert not run_dir.exists()  # so that another port can be tried
 
 
 @pytest.mark.parametrize("role", ["actor", "learner"])
@@ -85,6 +89,15 @@ def test_run_directory_with_a_run_is_not_overwritten(
     code, error = refusal(cli(*given))
     assert code == 8
     assert "--resume" in error
+
+
+def test_run_directory_that_leads_nowhere_is_named(cli: Callable[..., Cli], tmp_path: Path) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    code, error = refusal(cli("train", "Figure2-v0", "--run-dir", str(loop)))
+    assert code == 8
+    assert f"run directory {loop}: " in error
+    assert "Too many levels of symbolic links" in error
 
 
 def test_run_directory_of_another_configuration_is_refused(

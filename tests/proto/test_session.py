@@ -74,6 +74,8 @@ def test_malformed_endpoint_is_named_with_what_was_expected(endpoint: str) -> No
 def test_listening_beyond_loopback_must_be_asked_for(endpoint: str) -> None:
     with pytest.raises(ConfigError, match=r"other machines .* --insecure"):
         sessions.listen(endpoint)
+    with pytest.raises(ConfigError, match=r"other machines .* --insecure"):
+        sessions.check_listening(endpoint)
 
 
 def test_listening_beyond_loopback_is_possible_by_name(endpoint: str) -> None:
@@ -92,6 +94,24 @@ def test_port_in_use_is_named(endpoint: str) -> None:
         pytest.raises(ConfigError, match=rf"{endpoint}.*in use\? choose another"),
     ):
         sessions.listen(endpoint)
+    sessions.check_listening(endpoint)
+    with (
+        socket.create_server((host, int(port))),
+        pytest.raises(ConfigError, match=rf"{endpoint}.*in use\? choose another"),
+    ):
+        sessions.check_listening(endpoint)
+    with (
+        sessions.listen(endpoint),
+        pytest.raises(ConfigError, match=rf"{endpoint}.*in use\? choose another"),
+    ):
+        sessions.check_listening(endpoint)
+    sessions.check_listening(endpoint)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "nowhere.invalid"])
+def test_address_of_another_machine_is_named(host: str) -> None:
+    with pytest.raises(ConfigError, match=rf"cannot listen on 'tcp/{host}:7447': "):
+        sessions.check_listening(f"tcp/{host}:7447", insecure=True)
 
 
 def test_nobody_at_an_endpoint_is_said_in_time(endpoint: str) -> None:

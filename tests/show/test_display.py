@@ -56,6 +56,22 @@ def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
         assert "left at most 1:01:40" in text
 
 
+def test_what_a_terminal_would_obey_is_written_out() -> None:
+    hostile = "\x1b]0;owned\x07 \x9b2J\nended: all is well \u202e"
+    status = msgspec.structs.replace(
+        STATUS,
+        run_id=hostile,
+        waiting=(Waiting(who=hostile, on=hostile, why=hostile, seconds=2.0),),
+        quarantined=(Quarantined(id=hostile, why=hostile),),
+    )
+    console = Console(file=io.StringIO(), force_terminal=True, color_system=None, width=1000)
+    console.print(panel(status))
+    assert isinstance(console.file, io.StringIO)
+    for text in (line(status), *console.file.getvalue().splitlines()):
+        assert text.isprintable(), text
+    assert "\\x1b]0;owned\\x07" in line(status)
+
+
 def test_line_before_anything_is_known() -> None:
     empty = BufferStatus(episodes=0, return_min=None, return_mean=None, return_max=None)
     text = line(

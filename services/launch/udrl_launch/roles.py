@@ -11,13 +11,65 @@ from udrl.errors import ConfigError, Deceived, RunFailed
 from udrl.numerics import has_cuda
 from udrl_actor.service import ActorService
 from udrl_inspect.address import Address, announced, connected, unique_name
+from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto.credentials import Credentials
 from udrl_proto.zenoh_transport import ZenohTransport
+from udrl_replay.creation import (
+    config_of,
+    create,
+    exists,
+    no_empty_folder_left,
+    write_config,
+)
+from udrl_replay.resuming import closed_on_error, resume
 from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
+
+
+def open_run(
+    run_dir: Path,
+    settings: Settings,
+    *,
+    go_on: bool,
+    allow_inexact: bool,
+    listen: str | None,
+    insecure: bool,
+    secure: bool,
+    check_environment: bool = True,
+) -> Store:
+    """Go on with a run, or make a new one, and write its configuration beside it.
+
+    None is made where it could not be served.
+
+    Args:
+        run_dir: its directory.
+        settings: what it is, and when it ends.
+        go_on: go on with the run in ``run_dir`` if there is one.
+        allow_inexact: accept services of other numerics classes, and a changed environment.
+        listen: the endpoint that it will have; None: a router's.
+        insecure: allow that to be beyond loopback without keys.
+        secure: whether keys were given.
+        check_environment: with ``go_on``, play some stored episodes again.
+
+    Raises:
+        UdrlError: the settings or the endpoint cannot be used, or there is a run already.
+    """
+    if go_on and exists(run_dir):
+        store = resume(
+            run_dir, settings.config, allow_inexact=allow_inexact,
+            check_environment=check_environment,
+        )  # fmt: skip
+    else:
+        with no_empty_folder_left(run_dir):
+            if listen is not None:
+                sessions.check_listening(listen, insecure=insecure, secure=secure)
+            store = create(run_dir, settings.config, allow_inexact=allow_inexact)
+    with closed_on_error(store):
+        write_config(run_dir, config_of(store), settings.budget)
+    return store
 
 
 def replay(

@@ -15,7 +15,7 @@ from udrl_inspect.address import Address, connected
 from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.paths import shown
-from udrl_launch.roles import require_device, require_torch
+from udrl_launch.roles import open_run, require_device, require_torch
 from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto import verbs
@@ -23,7 +23,6 @@ from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
 from udrl_proto.reports import Status, StatusRequest
-from udrl_replay.creation import open_run
 from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run
 
@@ -128,7 +127,10 @@ def train(
     if keys is not None:
         for role in ROLES:
             load(keys, role)
-    store = open_run(run_dir, config, budget, go_on=go_on, allow_inexact=allow_inexact)
+    store = open_run(
+        run_dir, settings, go_on=go_on, allow_inexact=allow_inexact, listen=endpoint,
+        insecure=insecure, secure=keys is not None,
+    )  # fmt: skip
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
         progress = Run(store, budget).progress

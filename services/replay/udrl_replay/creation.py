@@ -1,9 +1,11 @@
 """Creating a run: settle once what every service of it will be told."""
 
 import logging
+import os
 import re
 import uuid
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -26,7 +28,7 @@ from udrl_replay.arrival import inspect
 from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
 from udrl_replay.remedies import remedy
-from udrl_replay.resuming import closed_on_error, resume
+from udrl_replay.resuming import closed_on_error
 from udrl_replay.run import Run
 from udrl_replay.store import Store
 
@@ -44,7 +46,7 @@ def directory_name(config: Config) -> str:
 
 def _run_id(run_dir: Path) -> str:
     """Return a name that no other run has, on whatever router: the directory's, and some chance."""
-    return f"{_slug(run_dir.resolve().name)}-{uuid.uuid4().hex[:8]}"
+    return f"{_slug(Path(os.path.realpath(run_dir)).name)}-{uuid.uuid4().hex[:8]}"
 
 
 def _slug(text: str) -> str:
@@ -63,11 +65,18 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         EnvironmentFault: it raises, or returns what it may not.
         StoreError: the directory holds a run already, or cannot be written.
     """
-    try:
+    with no_empty_folder_left(run_dir):
         return _create(run_dir.absolute(), config, allow_inexact=allow_inexact)
+
+
+@contextmanager
+def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
+    """Remove a folder that was made for a run if the run is not made and nothing is in it."""
+    try:
+        yield
     except BaseException:
         with suppress(OSError):
-            run_dir.rmdir()  # empty: it was made for this run
+            run_dir.rmdir()
         raise
 
 
@@ -111,39 +120,6 @@ def _begin_with(store: Store, episodes: list[Episode]) -> None:
             message = decode(encode_episode(episode, OFFLINE), EpisodeMessage, LARGEST)
             run.accept(inspect(message, spec), 0.0)
         run.save()
-
-
-def open_run(
-    run_dir: Path,
-    config: Config,
-    budget: Budget,
-    *,
-    go_on: bool,
-    allow_inexact: bool = False,
-    check_environment: bool = True,
-) -> Store:
-    """Make a new run, or open the one that is there, and write its configuration beside it.
-
-    Args:
-        run_dir: its directory.
-        config: what it is.
-        budget: when it ends.
-        go_on: go on with the run in ``run_dir``, if there is one.
-        allow_inexact: as for :func:`create` and :func:`resume`.
-        check_environment: as for :func:`resume`.
-
-    Raises:
-        UdrlError: as :func:`create`, :func:`resume` and :func:`write_config`.
-    """
-    if go_on and exists(run_dir):
-        store = resume(
-            run_dir, config, allow_inexact=allow_inexact, check_environment=check_environment
-        )
-    else:
-        store = create(run_dir, config, allow_inexact=allow_inexact)
-    with closed_on_error(store):
-        write_config(run_dir, config_of(store), budget)
-    return store
 
 
 def config_of(store: Store) -> Config:

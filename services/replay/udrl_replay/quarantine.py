@@ -4,6 +4,7 @@ import logging
 from collections import Counter
 
 from udrl.errors import Refused
+from udrl_proto.text import printable
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -33,6 +34,7 @@ class Quarantine:
 
     def add(self, actor: str, why: str) -> None:
         """Shut an actor out."""
+        why = printable(why)
         log.warning("actor %s is quarantined: %s", actor, why)
         self.reasons[actor] = why[:1000]
         if len(self.reasons) > _MOST_REMEMBERED:

@@ -17,6 +17,7 @@ from udrl.replay import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import IterationStatus
+from udrl_proto.text import printable
 from udrl_replay.arrival import Arrival
 from udrl_replay.dealing import SUSPICIOUS
 from udrl_replay.progress import STOPPED
@@ -149,12 +150,13 @@ class Run(Standing):
         if not self.dealer.holds(failure.actor, failure.command_id):
             return  # said again, or by an actor whose commands have gone to others
         self.progress.env_failures += 1
-        log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, failure.error)
+        error = printable(failure.error)
+        log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, error)
         self.dealer.fail(failure.command_id, failure.actor)
         if self.dealer.is_hopeless(failure.command_id):
             self._give_up(
                 failure.command_id,
-                f"command {failure.command_id} failed three times: {failure.error}",
+                f"command {failure.command_id} failed three times: {error}",
             )
 
     def lose(self, actor: str) -> None:

@@ -51,6 +51,7 @@ from udrl_proto.messages import (
     WeightsRequest,
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
+from udrl_proto.text import printable
 from udrl_proto.transport import Declaration, Presence, Transport
 from udrl_replay.admission import Admission
 from udrl_replay.arrival import Arrival, Malformed, inspect
@@ -244,12 +245,12 @@ class ReplayService:
             if question.verb.name == verbs.EPISODE.name:
                 self.run.progress.delivered += 1
                 self.run.progress.rejected += 1
-            log.warning("invalid %s: %s", question.verb.name, request)
+            log.warning("invalid %s: %s", question.verb.name, printable(request))
             return Problem(code="invalid", message=str(request)[:4000])
         try:
             return self._handlers[question.verb.name](request, now)
         except Refused as error:
-            log.warning("refused %s: %s", question.verb.name, error)
+            log.warning("refused %s: %s", question.verb.name, printable(error))
             return Problem(code=error.code, message=str(error)[:4000])
 
     def _note_presence(self, presence: Presence, now: float) -> None:
@@ -258,12 +259,12 @@ class ReplayService:
         peer = role, name
         if presence.here:
             self._here.add(peer)
-            log.info("%s %s is here", *peer)
+            log.info("%s is here", printable(f"{role} {name}"))
         else:
             self._here.discard(peer)
             self._waits.end(f"{role} {name}")
             self._admission.leave(role, name)
-            log.info("%s %s left", *peer)
+            log.info("%s left", printable(f"{role} {name}"))
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
         self._waits.begin(who, on, why, now)
@@ -276,7 +277,7 @@ class ReplayService:
 
     def _join(self, request: JoinRequest, now: float) -> JoinReply:
         self._admission.join(request, now)
-        log.info("%s %s joined from %s", request.role, request.id, request.host)
+        log.info("%s %s joined from %s", request.role, request.id, printable(request.host))
         return JoinReply()
 
     def _commands(self, request: CommandsRequest, now: float) -> CommandsReply:

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from udrl.evaluation import return_text
 from udrl_proto.reports import EvaluationStatus, Status, Waiting
+from udrl_proto.text import printable
 
 _PLAIN_EVERY_S = 5.0
 
@@ -73,7 +74,7 @@ def line(status: Status) -> str:
     if status.ended_because:
         parts.append(status.ended_because)
     parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
-    return "; ".join(parts)
+    return printable("; ".join(parts))
 
 
 def panel(status: Status) -> Table:
@@ -109,12 +110,12 @@ def panel(status: Status) -> Table:
     if status.advice:
         rows["advice"] = status.advice
     for name, value in rows.items():
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(printable(value)))
     for actor in status.quarantined:
-        table.add_row("quarantined", Text(f"{actor.id}: {actor.why}"))
+        table.add_row("quarantined", Text(printable(f"{actor.id}: {actor.why}")))
     for wait in _long(status):
         said = f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
-        table.add_row("waiting", Text(said))
+        table.add_row("waiting", Text(printable(said)))
     return table
 
 

@@ -10,6 +10,7 @@ from udrl.evaluation import return_text
 from udrl_inspect.runs import Summary, find
 from udrl_launch.commands.options import FILE, RUN_DIR
 from udrl_launch.output import print_json
+from udrl_proto.text import printable
 from udrl_show import curve
 from udrl_show.display import duration
 
@@ -32,14 +33,14 @@ def runs(folder: Path, as_json: bool) -> int:
     if not found:
         click.echo(f"no runs in {folder}; begin one: udrl train LunarLander-v3", err=True)
         return 0
-    rows = [_HEAD, *map(_cells, found)]
+    rows = [_HEAD, *([printable(cell) for cell in _cells(summary)] for summary in found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         click.echo("  ".join(cells).rstrip())
     for summary in found:
         if summary.problem:
-            click.echo(f"{summary.run_dir}: {summary.problem}", err=True)
+            click.echo(printable(f"{summary.run_dir}: {summary.problem}"), err=True)
     return 0
 
 

@@ -26,7 +26,7 @@ from udrl_launch.process import (
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
-from udrl_replay.creation import directory_name, open_run
+from udrl_replay.creation import directory_name
 
 log = logging.getLogger("udrl")
 
@@ -78,9 +78,9 @@ def replay(
 
     def service(stop: threading.Event) -> None:
         log.info("the run's directory is %s", shown(run_dir))
-        store = open_run(
-            run_dir, settings.config, settings.budget, go_on=resume, allow_inexact=allow_inexact,
-            check_environment=parent is None,
+        store = roles.open_run(
+            run_dir, settings, go_on=resume, allow_inexact=allow_inexact, listen=listen,
+            insecure=insecure, secure=keys is not None, check_environment=parent is None,
         )  # fmt: skip
         roles.replay(
             run_dir, store, settings.budget, stop, listen=listen, connect=connect,

@@ -19,6 +19,7 @@ from udrl_launch.settings import Settings
 from udrl_launch.training import Adviser, Watchers
 from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
+from udrl_proto.text import printable
 from udrl_replay.creation import directory_name
 from udrl_show.curve import draw
 from udrl_show.display import Display
@@ -103,7 +104,7 @@ def train(
         if as_json:
             print_json(status)
         if status.problem:
-            raise UdrlError(status.problem)
+            raise UdrlError(printable(status.problem))
 
     return run_service(service)
 

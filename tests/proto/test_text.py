@@ -1,0 +1,60 @@
+"""What others say, as a log shows it."""
+
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.proto.scripted import Scripted
+from udrl.errors import InvalidMessage, Refused
+from udrl_proto import verbs
+from udrl_proto.asking import Asker
+from udrl_proto.codec import decode, encode
+from udrl_proto.messages import Acknowledged, FailureMessage, Problem, StateRequest
+from udrl_proto.text import printable
+
+HOSTILE = (
+    "no\n2026-01-01 00:00:00,000 ERROR   forged\r\x1b[2J\x1b]0;title\x07\x9b31m\u202e\u2028\x00"
+)
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("", ""),
+        ("läuft ± 3.5 観測 🙂", "läuft ± 3.5 観測 🙂"),
+        ("a\nb", r"a\nb"),
+        ("\x1b[31mred\x1b[0m", r"\x1b[31mred\x1b[0m"),
+        ("\x07\x00\x7f\x9b", r"\x07\x00\x7f\x9b"),
+        ("\u202e\u2028\ud800", r"\u202e\u2028\ud800"),
+        ("\U000e0001", r"\U000e0001"),
+        (ValueError("two\nlines"), r"two\nlines"),
+    ],
+)
+def test_what_a_terminal_would_obey_is_written_out(said: object, shown: str) -> None:
+    assert printable(said) == shown
+
+
+@given(st.text())
+def test_no_control_character_is_left(text: str) -> None:
+    shown = printable(text)
+    assert all(unicodedata.category(c)[0] != "C" for c in shown)
+    assert "\n" not in shown
+    assert printable(shown) == shown
+
+
+def test_name_of_an_unknown_field_is_written_out() -> None:
+    data = encode(Acknowledged()).replace(b"\x80", b"\x81\xa6\x1b[2J\n!\x01")
+    with pytest.raises(InvalidMessage) as no:
+        decode(data, FailureMessage)
+    assert str(no.value).isprintable()
+    assert r"\x1b[2J" in str(no.value)
+
+
+def test_refusal_is_written_out() -> None:
+    scripted = Scripted("run")
+    scripted.answers(verbs.STATE, lambda _: Problem(code="rewind", message=HOSTILE))
+    with pytest.raises(Refused, match=r"no\\n2026") as no:
+        Asker(scripted.transport, "run", "learner l").ask(verbs.STATE, StateRequest(learner="l"))
+    assert str(no.value).isprintable()

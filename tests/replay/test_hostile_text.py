@@ -1,0 +1,74 @@
+"""Peers whose words would forge a line of the log, or take over the terminal that shows it."""
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from tests.proto.test_text import HOSTILE
+from tests.replay.synthetic import create, join
+from udrl.config import Budget
+from udrl.errors import Refused
+from udrl_proto import keys, verbs
+from udrl_proto.asking import Asker
+from udrl_proto.codec import encode
+from udrl_proto.memory_transport import Exchange, MemoryTransport
+from udrl_proto.messages import CommandsRequest, FailureMessage
+from udrl_proto.reports import Status, StatusRequest
+from udrl_replay.service import ReplayService
+
+RUN = "synthetic"
+
+
+@pytest.fixture
+def transport(tmp_path: Path) -> Iterator[MemoryTransport]:
+    """Reaches a replay service that is served."""
+    with ExitStack() as stack:
+        store = stack.enter_context(closing(create(tmp_path)))
+        transport, stop = MemoryTransport(Exchange()), threading.Event()
+        service = ReplayService(transport, store, Budget(max_env_steps=1000), tmp_path)
+        stack.callback(service.close)
+        serving = threading.Thread(target=service.serve, args=[stop])
+        serving.start()
+        stack.callback(serving.join)
+        stack.callback(stop.set)
+        yield transport
+
+
+def tell_everything(transport: MemoryTransport) -> Status:
+    """Say something hostile wherever text can be said; return what the run says of itself."""
+    asker = Asker(transport, RUN, "the test", patience_s=10.0)
+    unknown = encode(CommandsRequest(actor="a", wanted=1)).replace(b"wanted", b"\n\x1b[2Jw")
+    for _ in range(2):
+        with pytest.raises(Refused, match="unknown field"):
+            asker.ask(verbs.COMMANDS, unknown)
+    hostile = replace(join("a"), host=HOSTILE, software=HOSTILE, numerics_class=HOSTILE)
+    asker.ask(verbs.JOIN, hostile)
+    transport.appear(keys.alive(RUN, "actor", HOSTILE)).undeclare()
+    spec = hostile.environment
+    assert spec is not None
+    with pytest.raises(Refused, match="the run's environment is"):
+        asker.ask(verbs.JOIN, replace(hostile, environment=replace(spec, max_episode_steps=3)))
+    for _ in range(3):
+        (command,) = asker.ask(verbs.COMMANDS, CommandsRequest(actor="a", wanted=1)).commands
+        failure = FailureMessage(actor="a", command_id=command.id, error=HOSTILE)
+        asker.ask(verbs.FAILURE, failure)
+    return asker.ask(verbs.STATUS, StatusRequest())
+
+
+def test_nothing_that_peers_say_forges_a_line_of_the_log(
+    transport: MemoryTransport, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, "udrl"):
+        status = tell_everything(transport)
+    said = [record.getMessage() for record in caplog.records]
+    for part in ("joined from no", " is here", " left", "invalid commands: ", "refused join: ",
+                 "failed on command", "failed three times"):  # fmt: skip
+        assert any(part in line for line in said), part
+    assert [line for line in said if not line.isprintable()] == []
+    assert status.state == "failed"
+    assert status.problem.isprintable()
