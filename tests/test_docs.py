@@ -60,9 +60,17 @@ def described(kind: inspect.Type) -> tuple[str, str]:
     """Return how the tables name a type, and the values that it allows."""
     match kind:
         case inspect.UnionType():
-            (held,) = (t for t in kind.types if not isinstance(t, inspect.NoneType))
+            held, *words = sorted(
+                (t for t in kind.types if not isinstance(t, inspect.NoneType)),
+                key=lambda t: isinstance(t, inspect.LiteralType),
+            )
             name, allowed = described(held)
-            return f"{name} or unset", allowed
+            for word in words:
+                assert isinstance(word, inspect.LiteralType)
+                (value,) = word.values
+                name, allowed = f"{name} or `{value}`", f"{allowed}; `{value}`"
+            optional = any(isinstance(t, inspect.NoneType) for t in kind.types)
+            return f"{name} or unset" if optional else name, allowed
         case inspect.IntType():
             return "integer", bounds(kind)
         case inspect.FloatType():

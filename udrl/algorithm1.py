@@ -18,6 +18,7 @@ from udrl.inference import ActingFunction
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer
+from udrl.scaling import settle_scales
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
@@ -87,6 +88,7 @@ def algorithm1(
     config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
+    config = settle_scales(config, generator, offline)
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
 

@@ -34,7 +34,8 @@ def settle(config: Config) -> Config:
 def settle_as(held: Config, config: Config) -> Config:
     """Return settings with what they leave open as it was chosen for another run."""
     asked, known = flat(config), flat(held)
-    chosen = {name: known[name] for name in ("device", "precision") if asked[name] == "auto"}
+    open_ = ("device", "precision", "return_scale", "horizon_scale")
+    chosen = {name: known[name] for name in open_ if asked[name] == "auto"}
     if asked["dataset"] is not None and asked["dataset"] == known["dataset"]:
         chosen["n_warm_up_episodes"] = known["n_warm_up_episodes"]
         chosen["dataset_sha256"] = asked["dataset_sha256"] or known["dataset_sha256"]

@@ -22,7 +22,6 @@ class ReturnInTime:
             TakeCover).
         least: what return and horizon are raised to before they are read; in acting the horizon
             counts down beyond what was seen in training.
-        scales: factors on return and horizon at the networks' input (section 3.2).
     """
 
     #: Numbers of a target.
@@ -31,7 +30,12 @@ class ReturnInTime:
     def __init__(self, network: NetworkSettings) -> None:
         self.horizon_follows = network.desired_horizon == "return"
         self.least = (1.0 if self.horizon_follows else -math.inf, 1.0)
-        self.scales = (network.return_scale, network.horizon_scale)
+        self._network = network
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Factors on return and horizon at the networks' input (section 3.2)."""
+        return self._network.scales
 
     def settle(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0 as it is said: with a horizon of 1 at least, and one that follows."""

@@ -158,7 +158,7 @@ def _label(
             for part in experience.observations()
         ]
     expected: npt.NDArray[np.float32] = np.concatenate(parts)
-    experience.label(expected[:, 0] / config.network.return_scale, config.training.return_lambda)
+    experience.label(expected[:, 0] / config.network.scales[0], config.training.return_lambda)
     return expected
 
 

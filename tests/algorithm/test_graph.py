@@ -67,8 +67,8 @@ def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
             horizon, least = desired_horizon, -np.inf
         rows.append(
             [
-                max(desired_return, least) * config.network.return_scale,
-                max(horizon, 1.0) * config.network.horizon_scale,
+                max(desired_return, least) * config.network.scales[0],
+                max(horizon, 1.0) * config.network.scales[1],
             ]
         )
     return np.array(rows, np.float32)

@@ -149,7 +149,7 @@ def test_the_value_function_learns_what_follows() -> None:
     assert value is not None
     observation = torch.zeros(3, 3)
     observation[:, 0] = torch.tensor([1.0, 0.5, 0.1])
-    expected, deviation = (value(observation) / config.network.return_scale).unbind(1)
+    expected, deviation = (value(observation) / config.network.scales[0]).unbind(1)
     torch.testing.assert_close(expected, torch.tensor([40.0, 20.0, 4.0]), atol=3.0, rtol=0)
     assert (deviation < 3.0).all()
 

@@ -187,10 +187,10 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
         ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
     ):
-        if size > 0 and not 0.1 <= scale * size <= 20:
+        if scale != "auto" and size > 0 and not 0.1 <= scale * size <= 20:
             advice.append(
                 f"{name} = {scale:g} makes numbers of about {scale * size:.2g} for the network of "
-                f"what is about {size:.3g}; try {name} = {1 / size:.1g}."
+                f"what is about {size:.3g}; try {name} = auto."
             )
     return advice
 

@@ -19,6 +19,7 @@ from udrl.graph import acting_graph
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.repeating import environment_digest, environment_repeats
+from udrl.scaling import settle_scales
 from udrl.strategies import make_strategy
 from udrl.version import __version__
 from udrl_proto import PROTOCOL
@@ -85,6 +86,7 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:
         config, offline = settle_dataset(config, generator.spec)
+        config = settle_scales(config, generator, offline)
         exact = environment_repeats(generator)
         digest = environment_digest(generator) if exact else ""
     progress = Progress(exact=exact)
