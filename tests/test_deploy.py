@@ -64,6 +64,24 @@ def test_torch_is_in_the_image_of_the_learner_only() -> None:
     assert "TORCH_INDEX" not in compose["replay"]["build"]["args"]
 
 
+def test_images_of_ones_own_are_built_on_what_there_is() -> None:
+    """What the documentation tells to build is not built here; it names these places."""
+    told = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    told = told.split("### An environment of your own")[1].split("\n## ")[0]
+    dockerfile = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    assert "pip --python /opt/udrl/bin/python install" in told
+    assert "RUN python3 -m venv /opt/udrl" in dockerfile
+    assert "pip uninstall --yes pip" in dockerfile, "so that PATH finds the base image's pip"
+    actor, learner = dockerfile.split(" AS actor\n")[1].split("FROM actor AS learner")
+    assert "USER udrl" in told
+    assert "\nUSER udrl\n" in actor
+    assert "PYTHONPATH" not in actor, "an image of one's own may set it"
+    assert "PYTHONPATH=/opt/torch" in learner
+    images = {name: service["image"] for name, service in services("compose.yaml").items()}
+    assert images["actor"] == images["replay"] == "${UDRL_IMAGE:-udrl}"
+    assert "${ENV:-" in services("compose.yaml")["replay"]["command"]
+
+
 def test_no_override_publishes_a_port_where_nobody_is_asked() -> None:
     overrides = ["compose.secure.yaml", "compose.gpu.yaml"]
     assert "--insecure" in services("compose.yaml")["replay"]["command"]

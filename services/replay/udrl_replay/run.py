@@ -289,7 +289,7 @@ class Run(Standing):
             and last.iteration == self.progress.iteration
             and last.evaluation.mean >= wanted
         ):
-            return f"reached return {wanted:g}"
+            return f"reached return {wanted:.10g}"
         if self.progress.env_steps >= most:
             return f"spent its budget of {most:,} env steps"
         return ""
