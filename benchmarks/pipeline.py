@@ -49,6 +49,8 @@ from udrl_replay.run import Run
 #: between a question and its answer; from an episode's end to its acknowledgement, besides; from an
 #: iteration's end to its episodes at the learner; from a version trained to commands that name it.
 _MESSAGES = {"replay": 0.002, "answer": 0.001, "sync": 0.003, "fetch": 0.010, "delivery": 0.0126}
+#: From the first commands to a learner that has loaded torch.
+_START_S = 1.9
 
 _CORES = (2, 4, 8, 16, 32, 64, 128, 256)
 #: Seconds of an environment step in the table.
@@ -89,7 +91,12 @@ def measure(config: Config, version_s: float) -> Costs:
     row, beside = statistics.linear_regression(sizes, cpu)
     sleep = statistics.linear_regression(sizes, wall).slope - row
     return Costs(
-        round=max(beside, 0.0), row=row, sleep=max(sleep, 0.0), version=version_s, **_MESSAGES
+        round=max(beside, 0.0),
+        row=row,
+        sleep=max(sleep, 0.0),
+        version=version_s,
+        start=_START_S,
+        **_MESSAGES,
     )
 
 

@@ -30,6 +30,7 @@ class Costs(NamedTuple):
         sync: from an episode's end to its acknowledgement, besides ``replay``.
         fetch: from an iteration's end to its episodes at the learner.
         delivery: from a version trained to commands that name it.
+        start: from the first commands to a learner that can train.
     """
 
     round: float
@@ -41,6 +42,7 @@ class Costs(NamedTuple):
     sync: float
     fetch: float
     delivery: float
+    start: float
 
 
 class Recorded(NamedTuple):
@@ -160,7 +162,8 @@ class Simulation:
         self._load += actor.load
         others = self._training_threads * self._is_training + (self._now < self._replay_free)
         cores = max(self._cores - others, _LEAST_CORES)
-        self._at(cpu * max(1.0, self._load / cores) + sleep, "stepped", actor)
+        # Each gets its part of the cores: whoever sleeps most of the time does not need one.
+        self._at((cpu + sleep) * max(1.0, self._load / cores), "stepped", actor)
 
     def _stepped(self, actor: Actor) -> None:
         self._load -= actor.load
@@ -188,7 +191,8 @@ class Simulation:
         while self._left.get(len(self._ends)) == 0:
             completed = len(self._ends)
             self._ends.append(self._now)
-            self._at(self._costs.fetch, "fetched", completed)
+            awake = max(self._now, self._costs.start) - self._now
+            self._at(awake + self._costs.fetch, "fetched", completed)
             for opened in opened_by(completed, self._lead):
                 self._open(opened)
         self._ask(actor)
