@@ -174,7 +174,8 @@ def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str)
     values = preset(name)
     budget = {key: values.pop(key) for key in Budget.__struct_fields__ if key in values}
     build(Budget, budget)
-    assert build(Config, values).environment == name.removesuffix("-paper")
+    named = name.removesuffix("-paper").removesuffix("-fleet")
+    assert build(Config, values).environment == named
 
 
 def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
