@@ -201,8 +201,8 @@ def _halved(costs: Costs, *names: str) -> Costs:
 def _seconds(recorded: Recorded, costs: Costs, cores: int) -> float:
     """Return the seconds of a run with an actor for every core but the learner's."""
     config = recorded.config
-    actors = max(1, cores - config.training_threads)
-    environments = math.ceil(config.n_episodes_per_iter * (config.lead + 1) / actors)
+    actors = max(1, cores - config.arithmetic.training_threads)
+    environments = math.ceil(config.commands.n_episodes_per_iter * (config.lead + 1) / actors)
     return Simulation(recorded, costs, cores, actors, environments).run().end
 
 

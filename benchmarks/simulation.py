@@ -100,7 +100,7 @@ class Simulation:
     ) -> None:
         self._lengths, self._costs, self._cores = recorded.lengths, costs, cores
         self._lead = recorded.config.lead
-        self._training_threads = recorded.config.training_threads
+        self._training_threads = recorded.config.arithmetic.training_threads
         self._last = len(self._lengths) - 1
         self._actors = [Actor(environments) for _ in range(actors)]
         self._events: list[tuple[float, int, str, Any]] = []

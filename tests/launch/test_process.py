@@ -48,7 +48,7 @@ def test_freed_memory_is_kept() -> None:
 
 
 SERVICE = """
-import signal, sys, threading, time
+import os, signal, threading, time
 from udrl.errors import Interrupted, StoreError
 from udrl_launch.process import log_to_stderr, run_service
 
@@ -60,7 +60,7 @@ def service(stop):
     print("up", flush=True)
     BODY
 
-sys.exit(run_service(service))
+os._exit(run_service(service))  # as the command does: at its end Python drops all handlers
 """
 
 
