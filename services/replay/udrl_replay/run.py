@@ -24,6 +24,7 @@ from udrl_replay.progress import STOPPED
 from udrl_replay.standing import Standing
 from udrl_replay.store import EvaluationRow, Store, Version
 from udrl_replay.trust import Trust
+from udrl_replay.versions import is_known
 
 log = logging.getLogger("udrl")
 
@@ -356,44 +357,14 @@ class Run(Standing):
 
     # Weights.
 
-    def awaits_version(self) -> int | None:
-        """Return the version that can be trained now, or None: its buffer is not there yet."""
-        version = self.progress.latest_version + 1
-        return version if self.is_trainable(version) else None
-
-    def is_trainable(self, version: int) -> bool:
-        """Whether the buffer that a version is trained on is there, and the run needs it."""
-        needed = self.progress.state == "running" or version <= self.progress.iteration
-        return needed and version <= self.progress.iteration + 1
-
     def add_version(self, version: Version, train_s: float) -> Literal["accepted", "duplicate"]:
         """Take in a weights version once.
 
         Raises:
             Refused: it is not the next one, or differs from the one of that number.
         """
-        known = self.store.version(version.version)
-        if known is not None:
-            if known.digest != version.digest:
-                raise Refused(
-                    "unequal_version",
-                    f"weights version {version.version} was delivered before with other values: "
-                    f"{known.digest.hex()[:16]}, now {version.digest.hex()[:16]}; the learner is "
-                    f"not deterministic, or belongs to another run",
-                )
+        if is_known(self, version):
             return "duplicate"
-        if not math.isfinite(version.loss):
-            raise Refused(
-                "invalid",
-                f"weights version {version.version} has the loss {version.loss}; training "
-                f"diverged, lower learning_rate",
-            )
-        if version.version != self.awaits_version():
-            raise Refused(
-                "rewind",
-                f"weights version {version.version} was delivered, "
-                f"{self.progress.latest_version + 1} is next; ask for the state and go on there",
-            )
         self.store.add_version(version, train_s)
         self.progress.latest_version = version.version
         self._keep_needed_weights()

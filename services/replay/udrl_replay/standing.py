@@ -59,6 +59,16 @@ class Standing:
         """Seconds that the run was being worked on."""
         return time.monotonic() - self._began
 
+    def awaits_version(self) -> int | None:
+        """Return the version that can be trained now, or None: its buffer is not there yet."""
+        version = self.progress.latest_version + 1
+        return version if self.is_trainable(version) else None
+
+    def is_trainable(self, version: int) -> bool:
+        """Whether the buffer that a version is trained on is there, and the run needs it."""
+        needed = self.progress.state == "running" or version <= self.progress.iteration
+        return needed and version <= self.progress.iteration + 1
+
     def mark_inexact(self, reason: str) -> None:
         """Say that the result no longer depends on the configuration alone."""
         if self.progress.exact:
