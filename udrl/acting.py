@@ -54,7 +54,7 @@ class EpisodeGenerator:
         config: the run's settings.
         n_environments: episodes that can run at the same time.
         make: makes one environment.
-        first_index: of the environments (:data:`udrl.rows.INDEX`).
+        first_index: of the environments (:data:`udrl.environments.making.INDEX`).
 
     Attributes:
         spec: of the environments.

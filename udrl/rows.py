@@ -1,7 +1,5 @@
 """Many environments side by side, stepped one after another in one thread."""
 
-import os
-import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,17 +10,12 @@ from udrl.config import Config
 from udrl.environments.making import (
     Environment,
     EnvironmentSpec,
+    indexed,
     limit_steps,
     make_environment,
     specify,
 )
 from udrl.spaces import Observations
-
-#: The environment variable that holds an environment's index while it is made: no other that a run
-#: has on the same machine has the same.
-INDEX = "UDRL_ENVIRONMENT_INDEX"
-
-_making = threading.RLock()
 
 
 class Step(NamedTuple):
@@ -44,7 +37,8 @@ class Rows:
         config: the run's settings.
         n: how many.
         make: makes one of them.
-        first_index: what the first of them is told that its index is (:data:`INDEX`).
+        first_index: what the first of them is told that its index is
+            (:data:`udrl.environments.making.INDEX`).
 
     Attributes:
         spec: of the environments.
@@ -65,7 +59,13 @@ class Rows:
         self._config = config
         self._make = make
         self._first_index = first_index
-        self._envs = [self._made(row) for row in range(n)]
+        self._envs: list[Environment] = []
+        try:
+            for row in range(n):
+                self._envs.append(self._made(row))
+        except BaseException:
+            self.close()
+            raise
         self.spec: EnvironmentSpec = specify(self._envs[0], config)
         self._limits = [self.spec.max_episode_steps] * n
         space = self.spec.observation_space
@@ -114,13 +114,8 @@ class Rows:
         self._limits[row] = self.spec.max_episode_steps
 
     def _made(self, row: int) -> Environment:
-        """Make an environment that can learn its index, e.g. for a port of its own."""
-        with _making:
-            os.environ[INDEX] = str(self._first_index + row)
-            try:
-                return self._make(self._config)
-            finally:
-                del os.environ[INDEX]
+        with indexed(self._first_index + row):
+            return self._make(self._config)
 
     def close(self) -> None:
         """Close all environments."""

@@ -13,6 +13,8 @@ from udrl.episode import Episode
 
 #: Random episodes that are looked at.
 _EPISODES = 20
+#: What the network reads well.
+_LEAST, _MOST = 0.1, 10.0
 
 
 def settle_scales(
@@ -45,6 +47,11 @@ def settle_scales(
         "horizon_scale": _rounded(1 / length),
     }
     return change(config, **{n: v for n, v in found.items() if getattr(network, n) == "auto"})
+
+
+def fits(scale: float, size: float) -> bool:
+    """Say whether a scale makes a number that a network reads well of what is usual."""
+    return size == 0 or _LEAST <= scale * size <= _MOST
 
 
 def _rounded(scale: float) -> float:

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -45,6 +46,9 @@ class TrainingState:
         return weights_of(self.behavior)
 
 
+#: What those who compute exactly found, in the order in which they began.
+_before: list[tuple[bool, bool, str | None]] = []
+_exactly = threading.Lock()
 #: What CUDA's matrix products need to be deterministic.
 _WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
 
@@ -64,19 +68,29 @@ def use_one_thread() -> None:
 
 @contextlib.contextmanager
 def exact_arithmetic() -> Iterator[None]:
-    """Let torch compute deterministically in one thread, and leave it as it was."""
-    threads = torch.get_num_threads()
-    deterministic = torch.are_deterministic_algorithms_enabled()
-    warns_only = torch.is_deterministic_algorithms_warn_only_enabled()
-    workspace = os.environ.get(_WORKSPACE)
-    use_one_thread()
+    """Let torch compute deterministically in one thread, and leave it as it was.
+
+    Others may do so at the same time, in threads of this process; the last one restores.
+    """
+    threads = torch.get_num_threads()  # which torch keeps for each thread apart
+    with _exactly:
+        found = (
+            torch.are_deterministic_algorithms_enabled(),
+            torch.is_deterministic_algorithms_warn_only_enabled(),
+            os.environ.get(_WORKSPACE),
+        )
+        _before.append(found)
+        use_one_thread()
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-        torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
-        if workspace is None:
-            os.environ.pop(_WORKSPACE, None)
+        with _exactly:
+            # All but the first began within another; what the first found goes last.
+            deterministic, warns_only, workspace = _before.pop()
+            torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
+            if workspace is None:
+                os.environ.pop(_WORKSPACE, None)
 
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:

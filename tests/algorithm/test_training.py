@@ -1,3 +1,5 @@
+import os
+from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from typing import Any
 
@@ -19,7 +21,7 @@ from udrl.inference import ActingFunction
 from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import TrainingState, train, untrained, use_one_thread
+from udrl.training import TrainingState, exact_arithmetic, train, untrained, use_one_thread
 
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=3), action_space=Categorical(n=4), max_episode_steps=90
@@ -298,3 +300,18 @@ def test_gathering_a_few_updates_at_a_time_changes_nothing(
         train(state, ranked(config, EPISODES), config)
         digests.add(digest(state))
     assert len(digests) == 1
+
+
+def test_exact_arithmetic_is_left_when_the_last_one_leaves() -> None:
+    torch.use_deterministic_algorithms(mode=False)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            with exact_arithmetic():
+                other = exact_arithmetic()
+                pool.submit(other.__enter__).result()
+            assert torch.are_deterministic_algorithms_enabled(), "the other still computes"
+            pool.submit(other.__exit__, None, None, None).result()
+        assert not torch.are_deterministic_algorithms_enabled()
+        assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
+    finally:
+        use_one_thread()

@@ -1,5 +1,6 @@
 """Settings and circumstances that other people's environments need."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -15,8 +16,8 @@ from tests.foreign.conventions import Plain, register
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import make_environment
+from udrl.environments.making import INDEX
 from udrl.errors import UnsupportedEnvironment
-from udrl.rows import INDEX
 from udrl_replay.creation import create, write_config
 
 NESTED = {"layout": ["SF", "FG"], "robot": {"arms": [{"length": 1.5}, {"length": 2}], "on": True}}
@@ -50,7 +51,30 @@ def test_every_environment_can_learn_an_index_of_its_own() -> None:
     config = build(Config, {"environment": register(Indexed)})
     EpisodeGenerator(config, 3, first_index=32).close()
     assert found == [32, 33, 34]
+    make_environment(config).close()  # as whoever looks at a run does
+    assert found[3:] == [0]
     assert INDEX not in os.environ
+
+
+def test_what_was_made_is_closed_when_another_cannot_be_made() -> None:
+    closed = []
+
+    class Single(Plain):
+        made = 0
+
+        def __init__(self, render_mode: str | None = None) -> None:
+            super().__init__(render_mode)
+            Single.made += 1
+            if Single.made > 2:
+                raise OSError(errno.EADDRINUSE, "Address already in use")
+
+        def close(self) -> None:
+            closed.append(self)
+
+    config = build(Config, {"environment": register(Single)})
+    with pytest.raises(UnsupportedEnvironment, match="--actors 1 --envs-per-actor 1"):
+        EpisodeGenerator(config, 3)
+    assert len(closed) == 2
 
 
 class OldStyle(Plain):

@@ -95,10 +95,29 @@ def test_signal_stops_a_service(number: signal.Signals) -> None:
     assert "in the middle" in said
 
 
+def test_other_signals_are_the_environments_own() -> None:
+    body = (
+        "signal.signal(signal.SIGALRM, lambda *_: None); "
+        "signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01); time.sleep(0.2); "
+        "signal.setitimer(signal.ITIMER_REAL, 0); assert not stop.is_set()"
+    )
+    assert ended(body) == (0, "")
+
+
+def test_forked_child_has_its_signals_for_itself() -> None:
+    body = (
+        "import multiprocessing as m; context = m.get_context('fork'); up = context.Event(); "
+        "child = context.Process(target=lambda: (up.set(), time.sleep(30))); child.start(); "
+        "assert up.wait(10); child.terminate(); child.join(10); "
+        "assert child.exitcode == -15, child.exitcode; assert not stop.is_set()"
+    )
+    assert ended(body) == (0, "")
+
+
 def test_service_that_does_not_listen_is_abandoned() -> None:
     code, said = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
-    assert "did not end in 4 s and is abandoned" in said
+    assert "did not end in 3 s and is abandoned" in said
 
 
 @pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])

@@ -6,7 +6,10 @@ what is supported.
 """
 
 import errno
+import os
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -24,6 +27,13 @@ from udrl.spaces import MOST_CATEGORIES, ObservationSpace, observation_space
 Environment = gym.Env[Any, Any]
 
 _EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot", "vizdoom": "doom"}
+
+
+#: The environment variable that holds an environment's index while it is made: no other that a run
+#: has on the same machine has the same.
+INDEX = "UDRL_ENVIRONMENT_INDEX"
+
+_making = threading.RLock()
 
 
 class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,6 +57,21 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         return self.observation_space.n_bytes + self.action_space.n_bytes + 4
 
 
+@contextmanager
+def indexed(number: int) -> Iterator[None]:
+    """Let the environment that is made within learn its index, e.g. for a port of its own."""
+    with _making:
+        before = os.environ.get(INDEX)
+        os.environ[INDEX] = str(number)
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[INDEX]
+            else:
+                os.environ[INDEX] = before
+
+
 def make_environment(config: Config) -> Adapter:
     """Return the environment of a run, with observations and actions as the algorithm sees them.
 
@@ -60,9 +85,10 @@ def make_environment(config: Config) -> Adapter:
     if config.max_episode_steps is not None:
         limit["max_episode_steps"] = config.max_episode_steps
     try:
-        env: Environment = gym.make(
-            name, disable_env_checker=True, **(limit | config.environment_kwargs)
-        )
+        with indexed(int(os.environ.get(INDEX, "0"))):
+            env: Environment = gym.make(
+                name, disable_env_checker=True, **(limit | config.environment_kwargs)
+            )
     except Exception as error:
         raise UnsupportedEnvironment(
             f"environment {name!r} cannot be made: {type(error).__name__}: {error}; "
@@ -125,8 +151,10 @@ def _remedy(error: Exception, config: Config) -> str:
             "another copy of it, or another program, has that port; if only one copy can run at a "
             "time, add --actors 1 --envs-per-actor 1"
         )
-    if isinstance(error, TypeError) and "argument" in text:
+    if isinstance(error, TypeError) and "unexpected keyword argument" in text:
         return "environment_kwargs has its arguments; leave out those that it does not take"
+    if isinstance(error, TypeError) and "missing" in text and "required" in text:
+        return "give it that, e.g. --set 'environment_kwargs={NAME=VALUE}'"
     return (
         f"the fault is in the environment or its arguments; in Python, "
         f"gymnasium.make({config.environment!r}) shows where"

@@ -27,7 +27,7 @@ log = logging.getLogger("udrl")
 #: How often the watchdog is told that all is well, as a part of its patience: it starts a thread
 #: each time, which at four times a second took 2 % of an actor's time.
 _REARM_PART = 0.05
-#: Seconds that making an environment may take at least.
+#: Seconds that making an environment, and the probe, may take at least.
 _MAKING_S = 300.0
 
 
@@ -42,7 +42,7 @@ class ActorService:
         stop: ends everything.
         hang_s: end the whole process, from outside Python, when a round of environment steps takes
             so many seconds (five minutes at least for making an environment); None: do not.
-        first_index: of its environments (:data:`udrl.rows.INDEX`).
+        first_index: of its environments (:data:`udrl.environments.making.INDEX`).
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class ActorService:
         """
         config, run_id = self._hello.config, self._hello.run_id
         generator = EpisodeGenerator(config, self._environments, self._make, self._first_index)
-        self._arm()
+        self._arm(_MAKING_S)  # for the probe, which is many steps
         asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
@@ -111,6 +111,7 @@ class ActorService:
 
     def _act(self, generator: EpisodeGenerator, courier: Courier, outbox: Outbox) -> None:
         """Step environments; rest while as many episodes as these wait for delivery."""
+        self._arm()
         outcomes: list[Episode | Failure] = []
         steps = running = 0
         armed = time.monotonic()
@@ -138,15 +139,15 @@ class ActorService:
 
     def _make(self, config: Config) -> Environment:
         """Make an environment, which may take longer than a step: simulators have to start."""
-        if self._hang_s is not None:
-            faulthandler.dump_traceback_later(max(self._hang_s, _MAKING_S), exit=True)
+        self._arm(_MAKING_S)
         env = make_environment(config)
         self._arm()
         return env
 
-    def _arm(self) -> None:
+    def _arm(self, at_least_s: float = 0.0) -> None:
         if self._hang_s is not None:
-            faulthandler.dump_traceback_later(self._hang_s * (1 + _REARM_PART), exit=True)
+            seconds = max(self._hang_s * (1 + _REARM_PART), at_least_s)
+            faulthandler.dump_traceback_later(seconds, exit=True)
 
     def _disarm(self) -> None:
         if self._hang_s is not None:

@@ -19,6 +19,7 @@ from udrl.config import Config, change
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
 from udrl.repeating import environment_digest, environment_repeats
+from udrl.scaling import fits
 
 #: Random episodes that are looked at, and seconds after which no other one is begun.
 _EPISODES = 20
@@ -125,10 +126,10 @@ def _play(generator: EpisodeGenerator, config: Config) -> tuple[list[Episode], f
     began = time.perf_counter()
     for command in sampler.warm_up():
         at = time.perf_counter()
-        generator_started = generator.start(command, None)
+        failure = generator.start(command, None)
         resets += time.perf_counter() - at
-        if generator_started is not None:
-            raise generator_started.error
+        if failure is not None:
+            raise failure.error
         at = time.perf_counter()
         while not (ended := generator.step()):
             pass
@@ -187,7 +188,7 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
         ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
     ):
-        if scale != "auto" and size > 0 and not 0.1 <= scale * size <= 20:
+        if scale != "auto" and not fits(scale, size):
             advice.append(
                 f"{name} = {scale:g} makes numbers of about {scale * size:.2g} for the network of "
                 f"what is about {size:.3g}; try {name} = auto."

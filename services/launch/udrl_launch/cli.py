@@ -41,7 +41,7 @@ _GROUP = "udrl.commands"
 def main() -> NoReturn:
     """Run the command line; errors of ours are one line, without a traceback."""
     find_modules_of_the_user()
-    if "--json" in sys.argv:
+    if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
     try:
         code = cli(standalone_mode=False)

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from udrl.errors import UdrlError
 from udrl_inspect.address import Address
 from udrl_launch import roles
 from udrl_launch.process import switch_threads_soon
@@ -39,7 +40,7 @@ class Local(Protocol):
         ...
 
     def end(self) -> None:
-        """End all of them, within five seconds."""
+        """End all of them."""
         ...
 
 
@@ -63,7 +64,11 @@ class Processes:
         secured = ("--keys", str(keys)) if keys else ()
 
         def start(name: str, *arguments: str) -> None:
-            self._supervisor.start(name, *arguments, *secured)
+            try:
+                self._supervisor.start(name, *arguments, *secured)
+            except OSError as error:
+                self._supervisor.end()
+                raise UdrlError(f"{name} cannot be started: {error}; free some of that") from error
 
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",

@@ -4,6 +4,8 @@ import os
 import sys
 from pathlib import Path
 
+from udrl.errors import ConfigError
+
 STARTED_IN = Path.cwd()
 
 #: Tells a child where its parent looks for modules, after everything that the child knows itself.
@@ -19,17 +21,21 @@ def new_run_dir(name: str) -> Path:
     """Make a directory for a new run in ``./runs``, with a number behind its name if it is taken.
 
     Raises:
-        OSError: it cannot be made.
+        ConfigError: it cannot be made.
     """
-    number = 1
-    while True:
-        path = Path("runs", name if number == 1 else f"{name}-{number}").absolute()
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            number += 1
-        else:
-            return path
+    runs, number = Path("runs").absolute(), 1
+    try:
+        runs.mkdir(exist_ok=True)
+        while True:
+            path = runs / (name if number == 1 else f"{name}-{number}")
+            try:
+                path.mkdir()
+            except FileExistsError:
+                number += 1
+            else:
+                return path
+    except OSError as error:
+        raise ConfigError(f"{runs}: {error}; name a directory with --run-dir") from error
 
 
 def find_modules_of_the_user() -> None:

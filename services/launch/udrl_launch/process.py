@@ -1,23 +1,22 @@
 """One service in one process: signals, the parent's death, memory, exit codes."""
 
-import contextlib
 import ctypes
 import logging
 import os
 import resource
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 
 from udrl.errors import Interrupted, UdrlError
+from udrl_launch.signals import Signals
 
 log = logging.getLogger("udrl")
 
-#: Seconds that a service gets to end after SIGINT or SIGTERM.
-GRACE_S = 4.0
+#: Seconds that a service gets to end after SIGINT or SIGTERM; and one that has others to end.
+GRACE_S, PARENTS_GRACE_S = 3.0, 4.5
 
 _PR_SET_PDEATHSIG = 1
 
@@ -88,62 +87,29 @@ def switch_threads_soon() -> float:
     return before
 
 
-def run_service(service: Callable[[threading.Event], None]) -> int:
+def run_service(service: Callable[[threading.Event], None], grace_s: float = GRACE_S) -> int:
     """Run a service until it returns or a signal comes; return the exit code.
 
     The service has the main thread, since some environments can be made and stepped nowhere else:
-    those that handle signals, run an event loop or draw. A thread beside it hears of signals even
-    while native code keeps the main thread, and ends the process if the service does not.
-    The process may open more files from then on.
+    those that handle signals, run an event loop or draw. The process may open more files from then
+    on.
+
+    Args:
+        service: ends soon after the event that it is given is set.
+        grace_s: seconds that it has for that.
     """
     allow_open_files()
     stop = threading.Event()
-    ended = threading.Event()
-    received: list[int] = []
-    ear, mouth = socket.socketpair()
-    mouth.settimeout(0.0)
-
-    def watch() -> None:
-        number = ear.recv(1)[0]
-        if number == 0:  # the service has ended
-            return
-        received.append(number)
-        stop.set()
-        if not ended.wait(GRACE_S):
-            log.warning("the service did not end in %.0f s and is abandoned", GRACE_S)
-            sys.stderr.flush()
-            os._exit(128 + number)
-
-    def on_signal(number: int, frame: object) -> None:
-        # Nothing that takes a lock: the next signal may come in the middle of this one.
-        with contextlib.suppress(OSError):
-            mouth.send(bytes([number]))
-
-    previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
-    # The interpreter writes to it at once, and calls on_signal when the main thread is back.
-    before = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
-    watcher = threading.Thread(target=watch, name="signals", daemon=True)
-    watcher.start()
     error: UdrlError | None = None
-    try:
-        service(stop)
-    except UdrlError as raised:
-        error = raised
-    finally:
-        ended.set()
-        signal.set_wakeup_fd(before)
-        if not received:  # else the process ends, and may be told so again
-            for number, handler in previous.items():
-                signal.signal(number, handler)
-        with contextlib.suppress(OSError):
-            mouth.send(b"\0")
-        watcher.join(1.0)
-        mouth.close()
-        ear.close()
-    if received and (error is None or isinstance(error, Interrupted)):
-        by = signal.Signals(received[0]).name
-        log.warning("%s", f"{by}: {error or 'stopped'}")
-        return 128 + received[0]
+    with Signals(stop, grace_s) as signals:
+        try:
+            service(stop)
+        except UdrlError as raised:
+            error = raised
+    received = signals.received
+    if received is not None and (error is None or isinstance(error, Interrupted)):
+        log.warning("%s", f"{received.name}: {error or 'stopped'}")
+        return 128 + received
     if error is None:
         return 0
     log.error("%s", error)

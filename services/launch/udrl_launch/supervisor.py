@@ -22,7 +22,7 @@ _MOST_DEATHS = 6
 #: Bytes of a child's log, of which a quarter is kept.
 _LONGEST_LOG = 1 << 20
 #: Seconds that services have to end after the run has ended or after SIGTERM.
-END_S = 4.5
+END_S = 4.0
 
 
 @dataclass

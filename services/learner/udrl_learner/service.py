@@ -12,7 +12,7 @@ import os
 import platform
 import threading
 import time
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -198,7 +198,7 @@ class LearnerService:
         """Return what was fetched, unless the delivery before it fails."""
         pending: list[Future[Any]] = [fetched] if delivered is None else [fetched, delivered]
         while not fetched.done() and not self._stop.is_set():
-            wait(pending, _LOOK_S, FIRST_EXCEPTION)
+            wait(pending, _LOOK_S, FIRST_COMPLETED)
             if delivered is not None and delivered.done():
                 delivered.result()
                 pending = [fetched]

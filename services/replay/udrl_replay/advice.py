@@ -3,14 +3,13 @@
 import math
 
 from udrl.evaluation import return_text
+from udrl.scaling import fits
 from udrl.setting_groups import NetworkSettings
 from udrl_proto.reports import IterationStatus
 from udrl_replay.standing import Standing
 
 #: Share of the budget after which a run should obtain more than random actions do.
 _PATIENCE = 1 / 3
-#: What the network reads as desired return and horizon should be of this order.
-_LEAST, _MOST = 0.1, 10.0
 
 
 def advice(run: Standing) -> str:
@@ -48,7 +47,7 @@ def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
         ("return_scale", network.scales[0], "returns", size),
         ("horizon_scale", network.scales[1], "lengths", length),
     ):
-        if not _LEAST <= scale * usual <= _MOST:
+        if not fits(scale, usual):
             return (
                 f"{name} = {scale:g}: it makes {scale * usual:.2g} of {what} of {usual:.3g}, usual "
                 f"in the warm-up, and the network needs the order of 1; try {name} = 'auto'"

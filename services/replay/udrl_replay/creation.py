@@ -85,10 +85,11 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
     config = settle(config)
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:
-        config, offline = settle_dataset(config, generator.spec)
-        config = settle_scales(config, generator, offline)
+        # First, as an actor does it: in an instance that has seen nothing else.
         exact = environment_repeats(generator)
         digest = environment_digest(generator) if exact else ""
+        config, offline = settle_dataset(config, generator.spec)
+        config = settle_scales(config, generator, offline)
     progress = Progress(exact=exact)
     if not exact:
         progress.inexact_reason = (

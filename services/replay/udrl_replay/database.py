@@ -114,7 +114,10 @@ class Database:
                 raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
 
     def _check_tallies(self) -> None:
-        self._tallies = Tallies(self._db)
+        try:
+            self._tallies = Tallies(self._db)
+        except sqlite3.Error as error:
+            raise self._fault(error) from error
         written = self.fact(TALLIES, dict[str, Tally])
         for table, tally in self._tallies.held().items():
             expected = written.get(table)

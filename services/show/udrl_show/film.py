@@ -67,7 +67,12 @@ class Film:
             return
         frame = self.frame(picture, caption)
         if self._process is None:
-            self._process = self._open(frame)
+            self._process, self._shape = self._open(frame), frame.shape
+        if frame.shape != self._shape:
+            raise ConfigError(
+                f"--video {self._path}: the environment's pictures changed from {self._shape} to "
+                f"{frame.shape}, and those of a film have one size"
+            )
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
@@ -126,12 +131,16 @@ class Film:
             raise ConfigError(
                 f"--video {self._path}: {error.strerror}; name a file that you may write"
             ) from error
-        return subprocess.Popen(  # noqa: S603 - the library's own program
-            [
-                self._ffmpeg(), "-y", "-loglevel", "error",
-                "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-                "-r", f"{self._fps:g}", "-i", "-", *_KINDS[self._path.suffix],
-                f"file:{self._path}",
-            ],
-            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
+        arguments = (
+            "-y", "-loglevel", "error",
+            "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+            "-r", f"{self._fps:g}", "-i", "-", *_KINDS[self._path.suffix], f"file:{self._path}",
         )  # fmt: skip
+        try:
+            return subprocess.Popen(  # noqa: S603 - the library's own program
+                [self._ffmpeg(), *arguments],
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
+            )  # fmt: skip
+        except (OSError, RuntimeError) as error:
+            self._path.unlink(missing_ok=True)
+            raise ConfigError(f"--video {self._path}: ffmpeg cannot be started: {error}") from error

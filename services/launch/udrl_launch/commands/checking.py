@@ -1,5 +1,6 @@
 """``udrl check``."""
 
+import shlex
 from pathlib import Path
 
 import click
@@ -8,6 +9,7 @@ from udrl_inspect.checking import Check
 from udrl_inspect.checking import check as check_environment
 from udrl_launch.commands.options import FILE
 from udrl_launch.output import print_json
+from udrl_launch.paths import shown
 from udrl_launch.settings import gather
 
 
@@ -29,6 +31,11 @@ def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bo
         return 0
     for name, text in _lines(found):
         click.echo(f"{name:<13} {text}")
+    given = [f"--set={assignment}" for assignment in assignments]
+    given += ["--config", shown(file)] if file else []
+    click.echo(
+        f"{'verdict':<13} it can be trained on: {shlex.join(['udrl', 'train', env, *given])}"
+    )
     return 0
 
 
@@ -57,5 +64,4 @@ def _lines(found: Check) -> list[tuple[str, str]]:
             f"{found.step_bytes:,} bytes a step; about {found.memory_mib:g} MiB an environment",
         ),
         *(("advice", sentence) for sentence in found.advice),
-        ("verdict", f"it can be trained on: udrl train {found.environment}"),
     ]

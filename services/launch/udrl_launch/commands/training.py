@@ -14,7 +14,7 @@ from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
 from udrl_launch.commands.settings import gather_settings, settings_options
 from udrl_launch.output import print_json
 from udrl_launch.paths import new_run_dir, shown
-from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.process import PARENTS_GRACE_S, log_to_stderr, run_service
 from udrl_launch.settings import Settings
 from udrl_launch.training import Adviser, Watchers
 from udrl_launch.training import train as run_training
@@ -106,7 +106,7 @@ def train(
         if status.problem:
             raise UdrlError(printable(status.problem))
 
-    return run_service(service)
+    return run_service(service, PARENTS_GRACE_S)
 
 
 def warn_of_idle_environments(settings: Settings) -> None:
