@@ -80,8 +80,8 @@ class Adviser:
 
 #: Seconds after which a status says nothing of now.
 _STALE_S = 10.0
-#: Seconds between two looks at the services.
-_POLL_S = 0.5
+#: Seconds between two looks at the processes, and at what they do.
+_CHECK_S, _POLL_S = 0.1, 0.5
 #: Seconds that freshly started services get until the replay service answers.
 _START_S = 60.0
 
@@ -163,10 +163,14 @@ def _watch(
     give_up = _GiveUp(services, stop)
     with connected("observer", address, give_up) as (transport, hello):
         asker = Asker(transport, hello.run_id, "the display", give_up)
-        while not stop.wait(_POLL_S):
+        asked = time.monotonic() - _POLL_S
+        while not stop.wait(_CHECK_S):
             services.check()
             if services.done:
                 return
+            if time.monotonic() - asked < _POLL_S:
+                continue
+            asked = time.monotonic()
             try:
                 status = asker.ask(verbs.STATUS, StatusRequest())
             except (Unreachable, Interrupted) as error:
