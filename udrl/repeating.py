@@ -27,15 +27,15 @@ def environment_digest(generator: EpisodeGenerator) -> str:
     return _short_episode(generator, index=0).hex()[:16]
 
 
-def environment_repeats(generator: EpisodeGenerator) -> bool:
-    """Say whether an episode is the same again after another one ran in the same instance.
+def repeated_digest(generator: EpisodeGenerator) -> str:
+    """Return :func:`environment_digest`, or "" if it is another after an episode in between.
 
     Raises:
         EnvironmentFault: the environment raised, or returned what it may not.
     """
-    first = _short_episode(generator, index=0)
+    first = environment_digest(generator)
     _short_episode(generator, index=1)
-    return _short_episode(generator, index=0) == first
+    return first if environment_digest(generator) == first else ""
 
 
 def _short_episode(generator: EpisodeGenerator, index: int) -> bytes:

@@ -17,7 +17,7 @@ from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import acting_class
-from udrl.repeating import environment_digest, environment_repeats
+from udrl.repeating import environment_digest, repeated_digest
 from udrl.spaces import Vector
 from udrl.training_class import training_class
 
@@ -34,7 +34,7 @@ def settings(environment: str = "CartPole-v1", **values: Any) -> Config:
 @pytest.mark.parametrize("name", ["CartPole-v1", "Figure2-v0", "LunarLander-v3", "Obedience-v0"])
 def test_environments_of_the_paper_and_the_toys_replay(name: str) -> None:
     config = settings(name)
-    assert environment_repeats(EpisodeGenerator(config, 1))
+    assert repeated_digest(EpisodeGenerator(config, 1))
 
 
 class Drifting(Obedience):
@@ -65,13 +65,13 @@ def generator_of(env: Callable[..., Environment]) -> EpisodeGenerator:
 
 
 def test_an_environment_that_remembers_other_episodes_does_not_replay() -> None:
-    assert environment_repeats(generator_of(Obedience))
-    assert not environment_repeats(generator_of(Drifting))
+    assert repeated_digest(generator_of(Obedience))
+    assert not repeated_digest(generator_of(Drifting))
 
 
 def test_an_environment_that_fails_the_probe_is_at_fault() -> None:
     with pytest.raises(EnvironmentFault, match="out of order"):
-        environment_repeats(generator_of(Failing))
+        repeated_digest(generator_of(Failing))
 
 
 def class_of(config: Config) -> str:
@@ -88,8 +88,7 @@ def test_the_environment_digest_does_not_depend_on_the_number_of_environments() 
 def test_a_generator_is_as_good_as_new_after_the_probes() -> None:
     generator = EpisodeGenerator(settings(), 2)
     first = environment_digest(generator)
-    assert environment_repeats(generator)
-    assert environment_digest(generator) == first
+    assert repeated_digest(generator) == environment_digest(generator) == first
     assert generator.free == 2
 
 

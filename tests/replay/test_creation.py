@@ -56,7 +56,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
 def test_environment_that_does_not_replay_marks_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(creation, "environment_repeats", lambda generator: False)
+    monkeypatch.setattr(creation, "repeated_digest", lambda generator: "")
     with closing(creation.create(tmp_path, TOY)) as store:
         progress = store.fact("progress", Progress)
         assert not progress.exact

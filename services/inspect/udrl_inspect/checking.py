@@ -18,7 +18,7 @@ from udrl.commands import CommandSampler
 from udrl.config import Config, change
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
-from udrl.repeating import environment_digest, environment_repeats
+from udrl.repeating import environment_digest, repeated_digest
 from udrl.scaling import fits
 
 #: Random episodes that are looked at, and seconds after which no other one is begun.
@@ -88,11 +88,10 @@ def check(config: Config) -> Check:
     with closing(EpisodeGenerator(config, 1)) as generator:
         spec = generator.spec
         memory = (_memory() - before) / 2  # two were made
-        repeats = environment_repeats(generator)
-        digest = environment_digest(generator)
+        digest = repeated_digest(generator)
         episodes, reset_s, step_s = _play(generator, config)
     with closing(EpisodeGenerator(config, 1)) as another:
-        repeats = repeats and environment_digest(another) == digest
+        repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
     advice += _unusual(config, episodes, repeats=repeats)
     return Check(

@@ -18,7 +18,7 @@ from udrl.errors import StoreError
 from udrl.graph import acting_graph
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
-from udrl.repeating import environment_digest, environment_repeats
+from udrl.repeating import repeated_digest
 from udrl.scaling import settle_scales
 from udrl.strategies import make_strategy
 from udrl.version import __version__
@@ -86,10 +86,10 @@ def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First, as an actor does it: in an instance that has seen nothing else.
-        exact = environment_repeats(generator)
-        digest = environment_digest(generator) if exact else ""
+        digest = repeated_digest(generator)
         config, offline = settle_dataset(config, generator.spec)
         config = settle_scales(config, generator, offline)
+    exact = digest != ""
     progress = Progress(exact=exact)
     if not exact:
         progress.inexact_reason = (
