@@ -92,6 +92,14 @@ def test_signal_is_called_by_its_name_and_what_it_usually_means(supervisor: Supe
     assert module.how_it_ended(-40) == "ended by signal 40"
 
 
+def test_log_that_somebody_removed_harms_nothing(supervisor: Supervisor) -> None:
+    start(supervisor, "child", WAIT)
+    (log_file,) = (child.log_file for child in supervisor.children)
+    log_file.unlink()
+    supervisor.check()
+    assert supervisor.children[0].last_words() == f"{log_file} is gone"
+
+
 def test_log_without_end_is_shortened(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -72,12 +72,14 @@ class Child:
             )
 
     def last_words(self) -> str:
-        """Return the end of its log."""
+        """Return the end of its log, as far as nobody has removed it."""
+        if not self.log_file.exists():
+            return f"{self.log_file} is gone"
         return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
 
     def shorten_log(self) -> None:
         """Keep the end of a log that has become long: environments may print without end."""
-        if self.log_file.stat().st_size > _LONGEST_LOG:
+        if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
             end = _end_of(self.log_file, _LONGEST_LOG // 4)
             # The child appends, so it goes on behind whatever is there.
             with self.log_file.open("r+", encoding="utf-8") as log_file:
