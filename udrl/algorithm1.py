@@ -3,7 +3,7 @@
 At ``lead = 0`` the distributed system gives the same bits as this file.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from udrl.acting import EpisodeGenerator, generate_episodes
@@ -13,12 +13,12 @@ from udrl.digests import Digest, arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
+from udrl.fitting import fit
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.replay import Entry, ReplayBuffer
-from udrl.scaling import settle_scales
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
@@ -72,6 +72,7 @@ def algorithm1(
     budget: Budget,
     n_environments: int = 16,
     report: Callable[[Run], None] = lambda run: None,
+    left_open: Collection[str] = (),
 ) -> Run:
     """Train with Algorithm 1 until the budget is spent, and return where the run stands.
 
@@ -80,6 +81,7 @@ def algorithm1(
         budget: when to stop.
         n_environments: episodes generated side by side; changes the speed, not the result.
         report: called after every iteration.
+        left_open: settings to choose by what the environment is like (:mod:`udrl.fitting`).
     """
     if config.lead != 0:
         raise ConfigError(
@@ -88,7 +90,7 @@ def algorithm1(
     config = settle(config)
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
-    config = settle_scales(config, generator, offline)
+    config = fit(config, left_open, generator, offline)
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
 

@@ -15,7 +15,7 @@ from udrl.architecture import layer_widths
 from udrl.config import Config
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
-from udrl.streams import Purpose, Stream, stream_key
+from udrl.initialisation import draw_weights
 from udrl.targets import ReturnInTime
 from udrl.value import ValueFunction, relative
 
@@ -41,9 +41,7 @@ class BehaviorFunction(nn.Module):
         self.command = fully_connected(ReturnInTime.size, first)
         self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
         self.action = fully_connected(widths[-1], spec.action_space.n_parameters)
-        self.value = (
-            ValueFunction(spec, network, precision) if network.baseline == "value" else None
-        )
+        self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
     def forward(self, observation: Tensor, command: Tensor) -> Tensor:
         """Return the parameters of P(a | s, c).
@@ -82,24 +80,5 @@ class BehaviorFunction(nn.Module):
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
     """Return the behavior function of weights version 0, a function of the run's seed."""
     behavior = BehaviorFunction(spec, config)
-    stream = Stream(stream_key(config.seed, Purpose.INITIALISE))
-    generator = torch.Generator().manual_seed(int(stream.integers(1, 0, 2**52)[0]))
-    gain = nn.init.calculate_gain(config.network.activation)
-    for name, layer in behavior.named_modules():
-        if isinstance(layer, nn.Embedding):
-            # Vectors as different as can be, as long as those of the first layer for one-hot input.
-            nn.init.orthogonal_(layer.weight, 1.0, generator)
-            with torch.no_grad():
-                layer.weight.mul_(gain / layer.weight.norm(dim=1, keepdim=True))
-        if not isinstance(layer, nn.Linear | nn.Conv2d):
-            continue
-        bound = layer.weight[0].numel() ** -0.5
-        assert layer.bias is not None
-        if config.network.initialisation == "orthogonal":
-            hidden = name not in ("command", "action", "value.expected")
-            nn.init.orthogonal_(layer.weight, gain if hidden else 1.0, generator)
-            nn.init.zeros_(layer.bias)
-        else:
-            nn.init.uniform_(layer.weight, -bound, bound, generator)
-            nn.init.uniform_(layer.bias, -bound, bound, generator)
+    draw_weights(behavior, config, 0, ("command", "action", "value.expected"))
     return behavior

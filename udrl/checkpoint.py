@@ -9,15 +9,17 @@ import torch
 from udrl.behavior import BehaviorFunction
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
-from udrl.graph import Weights
-from udrl.training import TrainingState, make_optimizer
+from udrl.graph import Weights, critic_shapes
+from udrl.training import TrainingState, assemble, make_critic
 from udrl.weights import MOMENTS, decode_weights, encode_weights, optimizer_shapes
 
 
 def encode_optimizer(state: TrainingState) -> bytes:
-    """Return Adam's state as safetensors; empty at version 0, when there is none."""
+    """Return Adam's state, and the critic, as safetensors; no moments at version 0."""
     tensors: dict[str, npt.NDArray[np.float32]] = {}
-    for name, parameter in state.behavior.named_parameters():
+    for name, parameter in state.parameters().items():
+        if name.startswith("critic."):
+            tensors[name] = parameter.detach().cpu().numpy()
         held = state.optimizer.state.get(parameter)
         if held:
             for key in (*MOMENTS, "step"):
@@ -33,17 +35,19 @@ def decode_state(
     Raises:
         InvalidWeights: the bytes are not those of such a state.
     """
-    behavior = BehaviorFunction(spec, config)
+    behavior, critic = BehaviorFunction(spec, config), make_critic(config, spec)
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items()}
     behavior.load_state_dict(_tensors(decode_weights(weights, shapes)))
-    behavior.to(config.arithmetic.device)
-    tensors = _tensors(decode_weights(optimizer, optimizer_shapes(shapes)))
-    adam = make_optimizer(behavior, config.training)
-    for name, parameter in behavior.named_parameters():
-        adam.state[parameter] = {
+    expected = optimizer_shapes(shapes, critic_shapes(config.network, spec))
+    tensors = _tensors(decode_weights(optimizer, expected))
+    if critic is not None:
+        critic.load_state_dict({n: tensors[f"critic.{n}"] for n in critic.state_dict()})
+    state = assemble(version, behavior, critic, config)
+    for name, parameter in state.parameters().items():
+        state.optimizer.state[parameter] = {
             k: tensors[f"{k}.{name}"].to(config.arithmetic.device) for k in ("step", *MOMENTS)
         }
-    return TrainingState(version, behavior, adam)
+    return state
 
 
 def _tensors(weights: Weights) -> Mapping[str, torch.Tensor]:

@@ -112,11 +112,26 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
     stop_return: float | None = None
 
 
+#: Settings that may be left open, as ``auto``, and what they are until they are chosen
+#: (:mod:`udrl.fitting`).
+OPEN: Mapping[str, Any] = {
+    "return_scale": 1.0,
+    "horizon_scale": 1.0,
+    "baseline": "value",
+    "n_warm_up_episodes": 1,
+    "warm_up_hold": 1,
+    "hold_steps": 1,
+    "n_episodes_per_iter": 1,
+    "last_few": 1,
+    "replay_size": 1_000_000,
+    "recent_size": 0,
+}
+
 #: What some settings need to have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
-    "return_lambda": (lambda config: config.network.baseline == "value", "baseline = 'value'"),
+    "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),
 }
 

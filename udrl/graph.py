@@ -62,6 +62,15 @@ def weight_shapes(graph: bytes) -> dict[str, tuple[int, ...]]:
     return {t.name: tuple(t.dims) for t in _parse(graph).graph.initializer if not t.raw_data}
 
 
+def critic_shapes(network: NetworkSettings, spec: EnvironmentSpec) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each tensor of a run's critic (:mod:`udrl.value`), if it has one."""
+    if network.baseline != "action_value":
+        return {}
+    graph = _Builder(network, spec)
+    graph.action_values()
+    return weight_shapes(graph.model())
+
+
 class _Builder:
     """Appends nodes; each method returns the name of a result."""
 
@@ -108,7 +117,7 @@ class _Builder:
         network = self._network
         activation = _OPERATORS[network.activation]
         command = self._command()
-        if network.baseline == "value":
+        if network.baseline != "none":
             command = self._relative(command)
         first, *_ = widths = layer_widths(self._seen, network)
         features = self._encode("encoder", activation, first)
@@ -117,6 +126,10 @@ class _Builder:
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self._append(activation, self._layer(f"layers.{k}", features, n_in, n_out))
         return self._layer("action", features, widths[-1], self._n_parameters)
+
+    def action_values(self) -> str:
+        """Append the critic; see :class:`udrl.value.Critic`."""
+        return self._expected("critic", self._n_parameters)
 
     def _command(self) -> str:
         """Append what is read of a command: bounded and scaled (:mod:`udrl.targets`)."""
@@ -131,10 +144,7 @@ class _Builder:
 
     def _relative(self, command: str) -> str:
         """Append the desired return relative to V(s) and D(s); see :mod:`udrl.value`."""
-        features = self._encode("value.encoder", "Tanh", VALUE_WIDTH)
-        width = n_features(self._seen, self._network.convolutions, VALUE_WIDTH)
-        features = self._append("Tanh", self._layer("value.hidden", features, width, VALUE_WIDTH))
-        expected = self._layer("value.expected", features, VALUE_WIDTH, 2)
+        expected = self._expected("value", 2)
         d = self._column(expected, 1)
         root = self._append("Mul", d, d)
         root = self._append("Sqrt", self._append("Add", root, self._number(SQUAREPLUS)))
@@ -148,6 +158,13 @@ class _Builder:
             self._number(DEVIATIONS),
         )
         return self._append("Concat", bounded, self._column(command, 1), axis=1)
+
+    def _expected(self, name: str, n: int) -> str:
+        """Append a network that expects ``n`` numbers of an observation."""
+        features = self._encode(f"{name}.encoder", "Tanh", VALUE_WIDTH)
+        width = n_features(self._seen, self._network.convolutions, VALUE_WIDTH)
+        features = self._append("Tanh", self._layer(f"{name}.hidden", features, width, VALUE_WIDTH))
+        return self._layer(f"{name}.expected", features, VALUE_WIDTH, n)
 
     def _encode(self, name: str, activation: str, width: int) -> str:
         """Append an encoder; see :func:`udrl.encoders.make_encoder`."""

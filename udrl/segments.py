@@ -174,8 +174,10 @@ class RankedExperience:
 
     Attributes:
         lengths: of the episodes, by rank.
-        expected: (V, D) at every step, in the order of :meth:`observations`, scaled, float32
-            [steps, 2] (:mod:`udrl.value`); None: unknown.
+        labels: the desired return of each step's trailing segment, in the order of
+            :meth:`steps`, float64 [steps]; None: what was obtained.
+        expected: (V, D) at every step, in the same order, scaled, float32 [steps, 2]
+            (:mod:`udrl.value`); None: unknown.
         observation_shape: of one, as the networks see it.
         observation_dtype: likewise.
     """
@@ -183,7 +185,7 @@ class RankedExperience:
     def __init__(self, experience: Experience, slots: Indices) -> None:
         self._experience = experience
         self._slots = slots
-        self._labels: Numbers | None = None
+        self.labels: Numbers | None = None
         self.expected: npt.NDArray[np.float32] | None = None
         self.observation_shape = experience._memory.shape
         self.observation_dtype: np.dtype[Any] = experience._observations.dtype
@@ -195,8 +197,8 @@ class RankedExperience:
         held = self._experience
         slot = self._slots[segments.rank]
         row = self._row(slot, segments.t1)
-        if self._labels is not None:
-            desired_return = self._labels[self._step(segments)]
+        if self.labels is not None:
+            desired_return = self.labels[self._step(segments)]
         else:
             earned_at_t2 = held._returns[slot]
             inner = np.flatnonzero(segments.t2 < held._lengths[slot])
@@ -212,16 +214,17 @@ class RankedExperience:
         return None if self.expected is None else self.expected[self._step(segments)]
 
     def _step(self, segments: Segments) -> Indices:
-        """Return the number of each t1 in the order of :meth:`observations`."""
+        """Return the number of each t1 in the order of :meth:`steps`."""
         steps: Indices = self._first_step[segments.rank] + segments.t1
         return steps
 
-    def observations(self, at_once: int = 4096) -> Iterator[Observations]:
-        """Yield what the network sees at every step, episode by episode."""
+    def steps(self, at_once: int = 4096) -> Iterator[tuple[Observations, Array]]:
+        """Yield what the network sees at every step, and the action, episode by episode."""
         slot, t = self._all_steps()
+        actions = self._experience._actions
         for first in range(0, len(t), at_once):
             part = slice(first, first + at_once)
-            yield self._observed(slot[part], t[part])
+            yield self._observed(slot[part], t[part]), actions[self._row(slot[part], t[part])]
 
     def label(self, expected: npt.NDArray[np.floating[Any]], lam: float) -> None:
         """Make lambda-returns the desired returns of all trailing segments.
@@ -231,7 +234,7 @@ class RankedExperience:
         kept).
 
         Args:
-            expected: V at every step, in the order of :meth:`observations`, float32.
+            expected: V at every step, in the order of :meth:`steps`, float32.
             lam: lambda, in [0, 1].
         """
         held, slots, first = self._experience, self._slots, self._first_step
@@ -248,7 +251,7 @@ class RankedExperience:
         for t in reversed(range(int(lengths[0]) - 1)):
             step = first[: np.searchsorted(-lengths, -(t + 1), side="left")] + t
             labels[step] += lam * labels[step + 1]
-        self._labels = labels
+        self.labels = labels
 
     def _all_steps(self) -> tuple[Indices, Indices]:
         """Return slot and time of every step, episode by episode."""

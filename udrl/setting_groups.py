@@ -51,14 +51,14 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             embedded command (3.2).
         activation: of the hidden layers.
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
-        return_scale: factor on the desired return at the network's input; ``auto``: what suits
-            the returns of random episodes when a run is created (:mod:`udrl.scaling`).
-        horizon_scale: factor on the desired horizon at the network's input; ``auto``: likewise.
+        return_scale: factor on the desired return at the network's input.
+        horizon_scale: factor on the desired horizon at the network's input.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
         baseline: what desired returns are relative to where the network reads them: ``none``, the
-            paper's; or ``value``: what a learned value function expects (:mod:`udrl.value`).
+            paper's; ``value``: what a learned value function expects; or ``action_value``: the
+            same, of what actions bring on average (:mod:`udrl.value`).
     """
 
     frame_stack: Annotated[int, Meta(ge=1, le=64)] = 1
@@ -66,24 +66,10 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     hidden: Widths = (32, 128, 128, 128)
     activation: Literal["relu", "tanh"] = "relu"
     initialisation: Literal["orthogonal", "uniform"] = "orthogonal"
-    return_scale: Scale | Literal["auto"] = 0.025
-    horizon_scale: Scale | Literal["auto"] = 0.01
+    return_scale: Scale = 0.025
+    horizon_scale: Scale = 0.01
     desired_horizon: Literal["mean", "return"] = "mean"
-    baseline: Literal["none", "value"] = "none"
-
-    @property
-    def scales(self) -> tuple[float, float]:
-        """``return_scale`` and ``horizon_scale``.
-
-        Raises:
-            ConfigError: one of them is not settled yet.
-        """
-        if self.return_scale == "auto" or self.horizon_scale == "auto":
-            raise ConfigError(
-                f"return_scale = {self.return_scale!r}, horizon_scale = {self.horizon_scale!r}: "
-                f"'auto' is settled when a run is created; give numbers here"
-            )
-        return self.return_scale, self.horizon_scale
+    baseline: Literal["none", "value", "action_value"] = "none"
 
 
 class BufferSettings(SettingsGroup, frozen=True, kw_only=True):

@@ -35,7 +35,7 @@ class ReturnInTime:
     @property
     def scales(self) -> tuple[float, float]:
         """Factors on return and horizon at the networks' input (section 3.2)."""
-        return self._network.scales
+        return self._network.return_scale, self._network.horizon_scale
 
     def settle(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0 as it is said: with a horizon of 1 at least, and one that follows."""

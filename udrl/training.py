@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
+from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
+from udrl.initialisation import draw_weights
 from udrl.segments import RankedExperience, Segments, draw_segments
-from udrl.setting_groups import TrainingSettings
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
-from udrl.value import ValueFunction, relative, value_loss
+from udrl.value import Critic, ValueFunction, relative, value_loss
 
 #: Bytes of observations that are gathered at once for the next updates.
 _GATHERED_BYTES = 16 << 20
@@ -32,11 +33,15 @@ class TrainingState:
 
     Attributes:
         version: v; 0 is untrained.
+        behavior: B(s, c; theta).
+        critic: where ``baseline`` is ``action_value``.
+        optimizer: of both.
         loss: mean cross-entropy, in nats, over the updates that made this version; NaN at 0.
     """
 
     version: int
     behavior: BehaviorFunction
+    critic: Critic | None
     optimizer: torch.optim.Adam
     loss: float = float("nan")
 
@@ -44,6 +49,10 @@ class TrainingState:
     def weights(self) -> Weights:
         """The weights that act."""
         return weights_of(self.behavior)
+
+    def parameters(self) -> dict[str, nn.Parameter]:
+        """Return all that is trained, by name."""
+        return trained(self.behavior, self.critic)
 
 
 #: What those who compute exactly found, in the order in which they began.
@@ -95,13 +104,37 @@ def exact_arithmetic() -> Iterator[None]:
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
     """Return version 0, a function of the seed."""
-    behavior = initialise(config, spec).to(config.arithmetic.device)
-    return TrainingState(0, behavior, make_optimizer(behavior, config.training))
+    behavior, critic = initialise(config, spec), make_critic(config, spec)
+    if critic is not None:
+        draw_weights(critic, config, 1, ("expected",))
+    return assemble(0, behavior, critic, config)
 
 
-def make_optimizer(behavior: BehaviorFunction, training: TrainingSettings) -> torch.optim.Adam:
-    """Return a new Adam for a behavior function."""
-    return torch.optim.Adam(behavior.parameters(), lr=training.learning_rate, fused=True)
+def make_critic(config: Config, spec: EnvironmentSpec) -> Critic | None:
+    """Return a critic without weights, if the run has one."""
+    if config.network.baseline != "action_value":
+        return None
+    return Critic(spec, config.network, PRECISIONS[config.arithmetic.precision])
+
+
+def assemble(
+    version: int, behavior: BehaviorFunction, critic: Critic | None, config: Config
+) -> TrainingState:
+    """Return the state of a version with a new Adam, on the device that trains."""
+    behavior.to(config.arithmetic.device)
+    if critic is not None:
+        critic.to(config.arithmetic.device)
+    parameters = trained(behavior, critic).values()
+    adam = torch.optim.Adam(parameters, lr=config.training.learning_rate, fused=True)
+    return TrainingState(version, behavior, critic, adam)
+
+
+def trained(behavior: BehaviorFunction, critic: Critic | None) -> dict[str, nn.Parameter]:
+    """Return the parameters of the networks by name; the critic's begin with ``critic``."""
+    parameters = dict(behavior.named_parameters())
+    if critic is not None:
+        parameters |= {f"critic.{name}": p for name, p in critic.named_parameters()}
+    return parameters
 
 
 def train(state: TrainingState, experience: RankedExperience, config: Config) -> None:
@@ -129,13 +162,12 @@ def _update(
     """Make one Adam update for each row of ``segments``; return the sum of their losses."""
     batches = _Batches(config, experience)
     losses = torch.zeros((), dtype=torch.float64, device=config.arithmetic.device)
-    one = torch.ones((), device=config.arithmetic.device)
-    parameters = list(state.behavior.parameters())
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
+    step = _Stepper(state)
     for observation, command, action in batches.gather(segments):
         loss = state.behavior.loss(state.behavior.obey(observation, command), action)
-        _step(state.optimizer, parameters, loss, one)
+        step(loss)
         losses += loss.detach()
     return float(losses)
 
@@ -148,42 +180,61 @@ def _learn_value(
     config: Config,
     batches: "_Batches",
 ) -> None:
-    """Bring V to the lambda-returns, one update for each row, then label the examples anew.
+    """Bring V, and Q before it, to the lambda-returns; then label the examples anew.
 
-    V and D do not change any more in this version, so the examples carry them from here on.
+    Each makes one update for each row. They do not change any more in this version, so the examples
+    carry V and D from here on.
     """
-    parameters = list(state.behavior.parameters())
-    one = torch.ones((), device=config.arithmetic.device)
+    step, scale, lam = _Stepper(state), config.network.return_scale, config.training.return_lambda
+    device = config.arithmetic.device
     experience.expected = None
-    _label(value, experience, config)
+    experience.label(_at_all_steps(value, experience, device)[:, 0] / scale, lam)
+    if state.critic is not None:
+        for observation, command, action in batches.gather(segments):
+            step((state.critic(observation, action) - command[:, 0]).square().mean())
+        experience.labels = _at_all_steps(state.critic, experience, device) / np.float64(scale)
     for observation, command, _ in batches.gather(segments):
-        loss = value_loss(value(observation), command[:, 0])
-        _step(state.optimizer, parameters, loss, one)
-    experience.expected = _label(value, experience, config)
+        step(value_loss(value(observation), command[:, 0]))
+    experience.expected = _at_all_steps(value, experience, device)
+    if state.critic is None:
+        experience.label(experience.expected[:, 0] / scale, lam)
 
 
-def _label(
-    value: ValueFunction, experience: RankedExperience, config: Config
+def _at_all_steps(
+    network: ValueFunction | Critic, experience: RankedExperience, device: str
 ) -> npt.NDArray[np.float32]:
-    """Label all steps of the buffer with lambda-returns; return V and D at each."""
+    """Return what a network expects at every step of the buffer, float32 [steps, ...]."""
+    parts = []
     with torch.inference_mode():
-        parts = [
-            value(torch.from_numpy(part).clone().to(config.arithmetic.device)).cpu().numpy()
-            for part in experience.observations()
-        ]
+        for observations, actions in experience.steps():
+            observed = torch.from_numpy(observations).clone().to(device)
+            if isinstance(network, Critic):
+                acted = torch.from_numpy(actions.astype(np.int64)).to(device)
+                parts.append(network(observed, acted).cpu().numpy())
+            else:
+                parts.append(network(observed).cpu().numpy())
     expected: npt.NDArray[np.float32] = np.concatenate(parts)
-    experience.label(expected[:, 0] / config.network.scales[0], config.training.return_lambda)
     return expected
 
 
-def _step(
-    optimizer: torch.optim.Adam, parameters: list[nn.Parameter], loss: Tensor, one: Tensor
-) -> None:
-    """Make one update."""
-    for parameter in parameters:
-        parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
-    loss.backward(one)
-    optimizer.step()
+class _Stepper:
+    """Makes Adam's updates.
+
+    Args:
+        state: what it updates.
+    """
+
+    def __init__(self, state: TrainingState) -> None:
+        self._parameters = list(state.parameters().values())
+        self._optimizer = state.optimizer
+        self._one = torch.ones((), device=self._parameters[0].device)
+
+    def __call__(self, loss: Tensor) -> None:
+        """Make one, of the parameters that a loss depends on."""
+        for parameter in self._parameters:
+            parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
+        loss.backward(self._one)
+        self._optimizer.step()
 
 
 @contextlib.contextmanager

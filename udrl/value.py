@@ -10,6 +10,11 @@ returns deviate from it. They serve twice:
 - The behavior function reads (desired return - V(s)) / D(s). In training that is what an action
   gained, the generalised advantage estimate of Schulman et al. (2016), in units that are alike in
   all states. In acting it asks for better or worse than usual, until V(s) is what is desired.
+
+Where chance decides, what an action gained was luck for the most part, and an agent that is asked
+for the best of it gambles. With ``baseline = "action_value"`` a third network, the critic, learns
+Q(s, a), what an action brings on average. V and D are then learned from Q, and what the behavior
+function reads in training is (Q(s, a) - V(s)) / D(s).
 """
 
 import torch
@@ -51,6 +56,38 @@ class ValueFunction(nn.Module):
         value, d = apply(self.expected, features).float().unbind(1)
         deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
         return torch.stack([value, deviation], dim=1)
+
+
+class Critic(nn.Module):
+    """Q(s, .): the scaled return to expect after each action. Only the learner needs it.
+
+    Args:
+        spec: observation and action space.
+        network: ``frame_stack``, ``convolutions`` (of images).
+        precision: that it computes in.
+    """
+
+    def __init__(
+        self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
+    ) -> None:
+        super().__init__()
+        space = spec.observation_space
+        self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
+        self.hidden = fully_connected(
+            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
+        )
+        self.expected = fully_connected(VALUE_WIDTH, spec.action_space.n_parameters)
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return Q(s, a), float32 [batch].
+
+        Args:
+            observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
+            action: a, int64 [batch].
+        """
+        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
+        expected = apply(self.expected, features).float()
+        return expected.gather(1, action[:, None])[:, 0]
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Weights and optimizer state as safetensors; never pickle.
 
-A version's weights are one blob with its tensors by name; its optimizer is another, with Adam's two
-moments of each tensor and its step count. What comes from outside is validated for names, shapes,
-dtypes and finite values before it is used.
+A version's weights are one blob with its tensors by name. Its optimizer is another, with Adam's two
+moments of each tensor and its step count, and with the critic, if there is one. What comes from
+outside is validated for names, shapes, dtypes and finite values before it is used.
 """
 
 from collections.abc import Mapping
@@ -69,14 +69,16 @@ def decode_behavior(graph: bytes, blob: bytes) -> ActingFunction:
     return ActingFunction(graph, decode_weights(blob, weight_shapes(graph)))
 
 
-def optimizer_shapes(shapes: Shapes) -> dict[str, tuple[int, ...]]:
+def optimizer_shapes(shapes: Shapes, critic: Shapes) -> dict[str, tuple[int, ...]]:
     """Return the shape of each tensor of an optimizer's state, by name.
 
     Args:
         shapes: of the weights.
+        critic: of the critic's tensors, which only the learner needs, so that they are part of it
+            (:func:`udrl.graph.critic_shapes`).
     """
-    expected: dict[str, tuple[int, ...]] = {}
-    for name, shape in shapes.items():
+    expected: dict[str, tuple[int, ...]] = dict(critic)
+    for name, shape in (*shapes.items(), *critic.items()):
         expected |= {f"{moment}.{name}": shape for moment in MOMENTS}
         expected[f"step.{name}"] = ()
     return expected

@@ -9,6 +9,7 @@ from hypothesis import given
 
 from tests.proto.strategies import configs
 from udrl.config import (
+    OPEN,
     Budget,
     Config,
     build,
@@ -169,13 +170,20 @@ def test_presets_of_the_three_environments_ship() -> None:
     assert {"CartPole-v1", "LunarLander-v3", "LunarLanderSparse-v3"} <= set(preset_names())
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", [n for n in preset_names() if n != "any"])
 def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str) -> None:
     values = preset(name)
     budget = {key: values.pop(key) for key in Budget.__struct_fields__ if key in values}
     build(Budget, budget)
     named = name.removesuffix("-paper").removesuffix("-fleet")
     assert build(Config, values).environment == named
+
+
+def test_the_preset_for_any_environment_leaves_settings_open() -> None:
+    values = preset("any")
+    left_open = {name for name, value in values.items() if value == "auto"}
+    assert left_open == OPEN.keys()
+    build(Config, {n: v for n, v in values.items() if n not in OPEN} | {"environment": "X-v0"})
 
 
 def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:

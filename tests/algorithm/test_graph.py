@@ -39,6 +39,7 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {"frame_stack": 3}),
     (VECTOR, {"baseline": "value"}),
     (VECTOR, {"baseline": "value", "desired_horizon": "return"}),
+    (VECTOR, {"baseline": "action_value"}),
     (CATEGORY, {}),
     (CATEGORY, {"frame_stack": 3, "baseline": "value"}),
     (IMAGE, {}),
@@ -67,8 +68,8 @@ def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
             horizon, least = desired_horizon, -np.inf
         rows.append(
             [
-                max(desired_return, least) * config.network.scales[0],
-                max(horizon, 1.0) * config.network.scales[1],
+                max(desired_return, least) * config.network.return_scale,
+                max(horizon, 1.0) * config.network.horizon_scale,
             ]
         )
     return np.array(rows, np.float32)

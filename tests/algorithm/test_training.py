@@ -89,8 +89,8 @@ def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Conf
             states.append(episode.observations[t1].tolist())
             commands.append(
                 [
-                    desired_return * config.network.scales[0],
-                    desired_horizon * config.network.scales[1],
+                    desired_return * config.network.return_scale,
+                    desired_horizon * config.network.horizon_scale,
                 ]
             )
             actions.append(int(episode.actions[t1]))

@@ -121,12 +121,13 @@ def test_with_lambda_1_labels_are_what_was_obtained() -> None:
     assert experience.examples(segments).command[:, 0].tolist() == before.tolist()
 
 
-def test_observations_come_step_by_step_in_parts() -> None:
+def test_steps_come_one_after_another_in_parts() -> None:
     episodes = [episode(0, [0.0] * 70), episode(1, [0.0] * 3)]
-    parts = list(ranked(episodes).observations(at_once=50))
-    assert [len(part) for part in parts] == [50, 23]
-    expected = np.concatenate([e.observations for e in episodes])
-    np.testing.assert_array_equal(np.concatenate(parts), expected)
+    parts = list(ranked(episodes).steps(at_once=50))
+    assert [(len(seen), len(done)) for seen, done in parts] == [(50, 50), (23, 23)]
+    for k, name in enumerate(["observations", "actions"]):
+        expected = np.concatenate([getattr(e, name) for e in episodes])
+        np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), expected)
 
 
 def test_a_relative_return_is_in_deviations_and_bounded() -> None:
@@ -149,13 +150,38 @@ def test_the_value_function_learns_what_follows() -> None:
     assert value is not None
     observation = torch.zeros(3, 3)
     observation[:, 0] = torch.tensor([1.0, 0.5, 0.1])
-    expected, deviation = (value(observation) / config.network.scales[0]).unbind(1)
+    expected, deviation = (value(observation) / config.network.return_scale).unbind(1)
     torch.testing.assert_close(expected, torch.tensor([40.0, 20.0, 4.0]), atol=3.0, rtol=0)
     assert (deviation < 3.0).all()
 
 
-def test_a_restored_state_trains_on_as_if_nothing_had_happened() -> None:
-    config = settings()
+def test_the_critic_learns_what_actions_bring_on_average() -> None:
+    config = settings(
+        baseline="action_value", n_updates_per_iter=100, learning_rate=3e-3, return_lambda=1.0
+    )
+    # Action a brings a with a chance of a half, and nothing else.
+    episodes = [episode(i, [float(4 * (i % 2))]) for i in range(64)]
+    for i, one in enumerate(episodes):
+        one.observations[:] = 0
+        one.actions[:] = i // 2 % 4
+        one.rewards[:] *= one.actions[0] / 4
+    state = untrained(config, SPEC)
+    experience = ranked(episodes, config)
+    for _ in range(10):
+        train(state, experience, config)
+    assert state.critic is not None
+    observation, actions = torch.zeros(4, 3), torch.arange(4)
+    expected = state.critic(observation, actions) / config.network.return_scale
+    torch.testing.assert_close(expected, torch.tensor([0.0, 0.5, 1.0, 1.5]), atol=0.3, rtol=0)
+    # The examples say the same, whatever these episodes obtained.
+    labels = experience.labels
+    assert labels is not None
+    np.testing.assert_allclose(labels, [0.5 * (i // 2 % 4) for i in range(64)], atol=0.3)
+
+
+@pytest.mark.parametrize("baseline", ["value", "action_value"])
+def test_a_restored_state_trains_on_as_if_nothing_had_happened(baseline: str) -> None:
+    config = settings(baseline=baseline)
     experience = ranked([episode(i, [1.0, 0.0, float(i)]) for i in range(4)], config)
     state = untrained(config, SPEC)
     train(state, experience, config)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from udrl.config import preset, preset_names
+from udrl.config import OPEN, preset, preset_names
 from udrl.errors import ConfigError
 from udrl_launch.commands.training import warn_of_idle_environments
 from udrl_launch.settings import gather
@@ -20,6 +20,40 @@ def test_another_preset_can_be_named() -> None:
     settings = gather("LunarLander-v3", preset_name="CartPole-v1", options={})
     assert settings.config.environment == "LunarLander-v3"
     assert settings.config.buffer.replay_size == preset("CartPole-v1")["replay_size"]
+
+
+def test_without_a_preset_of_its_own_an_environment_gets_that_for_any() -> None:
+    settings = gather("Figure2-v0", options={})
+    assert settings.left_open == OPEN.keys()
+    assert settings.config.buffer.max_age == preset("any")["max_age"]
+    assert gather("Figure2-v0", preset_name="none", options={}).left_open == frozenset()
+
+
+def test_a_setting_is_left_open_or_has_a_value() -> None:
+    settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["last_few=4"])
+    assert settings.left_open == OPEN.keys() - {"return_scale", "last_few"}
+    assert settings.config.network.return_scale == 0.5
+    assert gather("CartPole-v1", options={}, assignments=["last_few=auto"]).left_open == {
+        "last_few"
+    }
+
+
+def test_all_segments_go_without_a_baseline() -> None:
+    settings = gather("Figure2-v0", options={"segments": "all"})
+    assert settings.config.network.baseline == "none"
+    assert "baseline" in settings.left_open
+
+
+def test_a_run_that_exists_keeps_what_was_chosen_for_it() -> None:
+    stored = {"return_scale": 0.5, "last_few": 4}
+    settings = gather("Figure2-v0", stored=stored, options={}, assignments=["return_scale=auto"])
+    assert settings.left_open == frozenset()
+    assert settings.config.network.return_scale == 0.5
+
+
+def test_only_some_settings_can_be_left_open() -> None:
+    with pytest.raises(ConfigError, match=r"batch_size = 'auto'"):
+        gather("Figure2-v0", options={}, assignments=["batch_size=auto"])
 
 
 def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
@@ -69,8 +103,8 @@ def test_setting_that_has_no_effect_is_refused(idle: str, needed: str) -> None:
     with pytest.raises(
         ConfigError, match=rf"^{name} = .* has no effect: it needs .*; leave it out"
     ):
-        gather("Figure2-v0", options={}, assignments=[*without, idle])
-    gather("Figure2-v0", options={}, assignments=[idle, needed])
+        gather("Figure2-v0", preset_name="none", options={}, assignments=[*without, idle])
+    gather("Figure2-v0", preset_name="none", options={}, assignments=[idle, needed])
 
 
 def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_there_is_no_advice_without_need(run: Run, best: float | None) -> None:
     [
         ({}, {}, "too little data: give it more env steps"),
         ({"return_scale": 0.001}, {}, "return_scale = 0.001: it makes 0.022 of returns of 22, "
-         "usual in the warm-up, and the network needs the order of 1; try return_scale = 'auto'"),
+         "usual in the warm-up, and the network needs the order of 1; try return_scale = auto"),
         ({"return_scale": 1.0}, {}, "return_scale = 1: it makes 22 of returns of 22"),
         ({"horizon_scale": 0.5}, {}, "horizon_scale = 0.5: it makes 50 of lengths of 100"),
         # Returns that cancel out are not small.

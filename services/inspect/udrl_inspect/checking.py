@@ -6,6 +6,7 @@ import resource
 import sys
 import time
 import warnings
+from collections.abc import Collection
 from contextlib import closing
 from typing import Any
 
@@ -15,11 +16,11 @@ from gymnasium.utils.env_checker import check_env
 
 from udrl.acting import EpisodeGenerator
 from udrl.commands import CommandSampler
-from udrl.config import Config, change
+from udrl.config import Config, change, flat
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
+from udrl.fitting import fit, fits
 from udrl.repeating import environment_digest, repeated_digest
-from udrl.scaling import fits
 
 #: Random episodes that are looked at, and seconds after which no other one is begun.
 _EPISODES = 20
@@ -48,6 +49,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
         step_s: seconds of a step, mean.
         memory_mib: that an environment takes of this process, about; 0: less than can be told.
         step_bytes: of one step as it is sent and stored.
+        chosen: settings that were left open, and what was chosen.
         advice: what is unusual, a sentence each.
     """
 
@@ -69,11 +71,16 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     step_s: float
     memory_mib: float
     step_bytes: int
+    chosen: dict[str, float | str]
     advice: tuple[str, ...]
 
 
-def check(config: Config) -> Check:
+def check(config: Config, left_open: Collection[str] = ()) -> Check:
     """Make an environment, have it checked, and play random episodes in it.
+
+    Args:
+        config: the settings of a run of it.
+        left_open: those to choose by what it is like (:mod:`udrl.fitting`).
 
     Raises:
         UnsupportedEnvironment: it cannot be made or is not supported; the message says all.
@@ -93,7 +100,8 @@ def check(config: Config) -> Check:
     with closing(EpisodeGenerator(config, 1)) as another:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
-    advice += _unusual(config, episodes, repeats=repeats)
+    fitted = fit(config, left_open, generator, episodes)
+    advice += _unusual(fitted, episodes, repeats=repeats)
     return Check(
         environment=config.environment,
         declared_observations=str(declared[0]),
@@ -113,6 +121,7 @@ def check(config: Config) -> Check:
         step_s=step_s,
         memory_mib=round(max(0.0, memory) / _MIB, 1),
         step_bytes=spec.step_bytes,
+        chosen={name: flat(fitted)[name] for name in sorted(left_open)},
         advice=tuple(advice),
     )
 
@@ -187,7 +196,7 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
         ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
     ):
-        if scale != "auto" and not fits(scale, size):
+        if not fits(scale, size):
             advice.append(
                 f"{name} = {scale:g} makes numbers of about {scale * size:.2g} for the network of "
                 f"what is about {size:.3g}; try {name} = auto."

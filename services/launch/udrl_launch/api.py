@@ -67,7 +67,8 @@ def train(
     Args:
         environment: a Gymnasium id, registered or importable.
         run_dir: the run's directory; None: a new one in ``./runs``.
-        preset: shipped settings; None: those named like the environment, if any; ``"none"``: none.
+        preset: shipped settings; None: those named like the environment, else ``any``;
+            ``"none"``: none.
         resume: go on with the run in ``run_dir``, if there is one.
         callbacks: called about twice a second with the run's status, and at the end; one that
             returns False stops the run, which can be resumed.

@@ -66,7 +66,9 @@ def open_run(
         with no_empty_folder_left(run_dir):
             if listen is not None:
                 sessions.check_listening(listen, insecure=insecure, secure=secure)
-            store = create(run_dir, settings.config, allow_inexact=allow_inexact)
+            store = create(
+                run_dir, settings.config, left_open=settings.left_open, allow_inexact=allow_inexact
+            )
     with closed_on_error(store):
         write_config(run_dir, config_of(store), settings.budget)
     return store

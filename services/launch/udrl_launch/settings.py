@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from udrl.config import (
+    OPEN,
     Budget,
     Config,
     build,
@@ -26,6 +27,10 @@ Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 #: The name of the preset that leaves everything as it is.
 NO_PRESET = "none"
+#: That of environments without one of their own.
+ANY_PRESET = "any"
+#: What is said of a setting that is left open.
+_AUTO = "auto"
 
 
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,11 +63,20 @@ _MOST_ENVS = 16
 
 
 class Settings(NamedTuple):
-    """All settings of a command."""
+    """All settings of a command.
+
+    Attributes:
+        config: what the run is.
+        budget: when it ends.
+        fleet: who carries it out.
+        left_open: settings of ``config`` to choose by what the environment is like, when the run
+            is created (:mod:`udrl.fitting`); until then their values count for nothing.
+    """
 
     config: Config
     budget: Budget
     fleet: Fleet
+    left_open: frozenset[str] = frozenset()
 
     @property
     def envs_per_actor(self) -> int:
@@ -89,7 +103,7 @@ def gather(
     Args:
         environment: its ENV argument, which wins over everything.
         preset_name: a shipped preset, or :data:`NO_PRESET`; None: the one named like the
-            environment, if there is one.
+            environment, or :data:`ANY_PRESET` if there is none.
         file: a TOML file.
         stored: the settings of a run to go on with, instead of a preset's.
         options: command-line options; None means: not given.
@@ -99,8 +113,8 @@ def gather(
         ConfigError: a setting is unknown or impossible, or one of ``--set`` has no effect.
     """
     values: dict[str, Any] = dict(stored or {})
-    if preset_name is None and stored is None and environment in preset_names():
-        preset_name = environment
+    if preset_name is None and stored is None:
+        preset_name = environment if environment in preset_names() else ANY_PRESET
     if preset_name not in (None, NO_PRESET):
         values |= preset(preset_name)
     if file is not None:
@@ -117,9 +131,17 @@ def gather(
     kinds = (Config, Budget, Fleet)
     refuse_unknown(values, tuple(name for kind in kinds for name in setting_names(kind)))
 
+    left_open = {n for n in OPEN if values.get(n) == _AUTO}
+    values |= {name: OPEN[name] for name in left_open}
+    if "baseline" in left_open and values.get("segments") == "all":
+        values["baseline"] = "none"  # no other goes with them
+    if stored is not None:  # there they were chosen long ago
+        values |= {name: stored[name] for name in left_open if name in stored}
+        left_open.clear()
+
     def part(kind: type[Kind]) -> Kind:
         return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)
     refuse_idle(config, asked_for)
-    return Settings(config, part(Budget), part(Fleet))
+    return Settings(config, part(Budget), part(Fleet), frozenset(left_open))

@@ -23,6 +23,7 @@ from udrl_proto.access import ROLES
 from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
 from udrl_proto.reports import Status, StatusRequest
+from udrl_replay.creation import config_of
 from udrl_replay.reporting import write_weights
 from udrl_replay.run import Run
 
@@ -120,8 +121,7 @@ def train(
         Interrupted: ``stop`` was set.
     """
     require_torch()
-    config, budget, _ = settings
-    require_device(config)
+    require_device(settings.config)
     endpoint = listen or f"{'tls' if keys else 'tcp'}/127.0.0.1:{free_port()}"
     sessions.check_endpoint(endpoint, secure=keys is not None)
     if keys is not None:
@@ -131,9 +131,10 @@ def train(
         run_dir, settings, go_on=go_on, allow_inexact=allow_inexact, listen=endpoint,
         insecure=insecure, secure=keys is not None,
     )  # fmt: skip
+    settings = settings._replace(config=config_of(store), left_open=frozenset())
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
-        progress = Run(store, budget).progress
+        progress = Run(store, settings.budget).progress
         if progress.state == "ended":
             write_weights(run_dir, store, progress.latest_version)
             return read_status(run_dir)
@@ -150,7 +151,14 @@ def train(
         raise Interrupted(
             "stopped; go on with: "
             + shlex.join(
-                ["udrl", "train", config.environment, "--run-dir", shown(run_dir), "--resume"]
+                [
+                    "udrl",
+                    "train",
+                    settings.config.environment,
+                    "--run-dir",
+                    shown(run_dir),
+                    "--resume",
+                ]
             )
         )
     return read_status(run_dir)

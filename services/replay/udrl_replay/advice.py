@@ -3,7 +3,7 @@
 import math
 
 from udrl.evaluation import return_text
-from udrl.scaling import fits
+from udrl.fitting import fits
 from udrl.setting_groups import NetworkSettings
 from udrl_proto.reports import IterationStatus
 from udrl_replay.standing import Standing
@@ -44,13 +44,13 @@ def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
             "apart; raise n_warm_up_episodes or warm_up_hold, or begin with a dataset"
         )
     for name, scale, what, usual in (
-        ("return_scale", network.scales[0], "returns", size),
-        ("horizon_scale", network.scales[1], "lengths", length),
+        ("return_scale", network.return_scale, "returns", size),
+        ("horizon_scale", network.horizon_scale, "lengths", length),
     ):
         if not fits(scale, usual):
             return (
                 f"{name} = {scale:g}: it makes {scale * usual:.2g} of {what} of {usual:.3g}, usual "
-                f"in the warm-up, and the network needs the order of 1; try {name} = 'auto'"
+                f"in the warm-up, and the network needs the order of 1; try {name} = auto"
             )
     return (
         "too little data: give it more env steps (--max-env-steps), more warm-up episodes "

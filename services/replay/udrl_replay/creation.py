@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -15,11 +15,11 @@ from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config, flat
 from udrl.episode import Episode
 from udrl.errors import StoreError
+from udrl.fitting import fit
 from udrl.graph import acting_graph
 from udrl.numerics import settle
 from udrl.offline import settle_dataset
 from udrl.repeating import repeated_digest
-from udrl.scaling import settle_scales
 from udrl.strategies import make_strategy
 from udrl.version import __version__
 from udrl_proto import PROTOCOL
@@ -54,11 +54,24 @@ def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:50].rstrip("-") or "run"
 
 
-def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Store:
+def create(
+    run_dir: Path,
+    config: Config,
+    *,
+    left_open: Collection[str] = (),
+    allow_inexact: bool = False,
+) -> Store:
     """Make a new run.
 
-    What the settings leave to the machine is chosen. The environment is made once and asked to
-    replay an episode after another one; if it cannot, the run is marked inexact, and goes on.
+    What the settings leave to the machine or to the environment is chosen. The environment is made
+    once and asked to replay an episode after another one; if it cannot, the run is marked inexact,
+    and goes on.
+
+    Args:
+        run_dir: its directory.
+        config: its settings.
+        left_open: those to choose by what the environment is like (:mod:`udrl.fitting`).
+        allow_inexact: accept services of other numerics classes.
 
     Raises:
         ConfigError: the command strategy cannot be made, or the dataset cannot be used.
@@ -67,7 +80,7 @@ def create(run_dir: Path, config: Config, *, allow_inexact: bool = False) -> Sto
         StoreError: the directory holds a run already, or cannot be written.
     """
     with no_empty_folder_left(run_dir):
-        return _create(run_dir.absolute(), config, allow_inexact=allow_inexact)
+        return _create(run_dir.absolute(), config, left_open, allow_inexact=allow_inexact)
 
 
 @contextmanager
@@ -81,14 +94,16 @@ def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
         raise
 
 
-def _create(run_dir: Path, config: Config, *, allow_inexact: bool) -> Store:
+def _create(
+    run_dir: Path, config: Config, left_open: Collection[str], *, allow_inexact: bool
+) -> Store:
     config = settle(config)
     make_strategy(config)
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First, as an actor does it: in an instance that has seen nothing else.
         digest = repeated_digest(generator)
         config, offline = settle_dataset(config, generator.spec)
-        config = settle_scales(config, generator, offline)
+        config = fit(config, left_open, generator, offline)
     exact = digest != ""
     progress = Progress(exact=exact)
     if not exact:

@@ -18,7 +18,7 @@ import msgspec
 from udrl.config import Budget
 from udrl.digests import arrays_digest
 from udrl.errors import InvalidData, InvalidMessage, Refused
-from udrl.graph import weight_shapes
+from udrl.graph import critic_shapes, weight_shapes
 from udrl.weights import decode_weights, optimizer_shapes
 from udrl_proto import keys, verbs
 from udrl_proto.answering import Question, serve
@@ -176,10 +176,11 @@ class ReplayService:
         """Begin to receive questions, which are checked on the thread that receives them."""
         spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
+        with_critic = optimizer_shapes(shapes, critic_shapes(self.run.config.network, spec))
 
         def check(message: VersionMessage) -> _Delivery:
             digest = arrays_digest(decode_weights(message.weights, shapes))
-            decode_weights(message.optimizer, optimizer_shapes(shapes))
+            decode_weights(message.optimizer, with_critic)
             version = Version(
                 message.version, digest, message.loss, message.weights, message.optimizer
             )

@@ -25,7 +25,7 @@ def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bo
     Example: udrl check your_package.your_module:YourEnv-v0
     """
     settings = gather(env, file=file, assignments=assignments, options={})
-    found = check_environment(settings.config)
+    found = check_environment(settings.config, settings.left_open)
     if as_json:
         print_json(found)
         return 0
@@ -43,7 +43,7 @@ def _lines(found: Check) -> list[tuple[str, str]]:
     limit = f"{found.max_episode_steps:,} steps at most"
     if found.max_return is not None:
         limit += f", a return of {found.max_return:g} at most"
-    return [
+    lines = [
         ("environment", found.environment),
         ("observations", f"{found.declared_observations}; seen as {found.observations}"),
         ("actions", f"{found.declared_actions}; seen as {found.actions}"),
@@ -63,5 +63,8 @@ def _lines(found: Check) -> list[tuple[str, str]]:
             "size",
             f"{found.step_bytes:,} bytes a step; about {found.memory_mib:g} MiB an environment",
         ),
-        *(("advice", sentence) for sentence in found.advice),
     ]
+    if found.chosen:
+        chosen = ", ".join(f"{name} = {value}" for name, value in found.chosen.items())
+        lines.append(("settings", f"{chosen}, by what random episodes show"))
+    return lines + [("advice", sentence) for sentence in found.advice]

@@ -20,7 +20,7 @@ def settings_options(command: Command) -> Command:
     options = (
         click.option("--preset", "preset_name", metavar="NAME",
                      help=f"Shipped settings: {', '.join(preset_names())}. "
-                     "Or none. Default: the one named like ENV, if any."),
+                     "Or none. Default: the one named like ENV, else any."),
         click.option("--config", "file", type=FILE, metavar="FILE",
                      help="Settings from a TOML file."),
         click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",

@@ -111,7 +111,9 @@ def train(
 
 def warn_of_idle_environments(settings: Settings) -> None:
     """Warn if somebody asked for more environments than exploring can keep busy."""
-    config, _, fleet = settings
+    config, _, fleet, left_open = settings
+    if "n_episodes_per_iter" in left_open:
+        return
     useful = config.commands.n_episodes_per_iter * (config.lead + 1)
     asked_for = fleet.actors * (fleet.envs_per_actor or 1)
     if asked_for > 2 * useful:

@@ -1,0 +1,106 @@
+"""What a preset learns in environments of different kinds (docs/results.md).
+
+::
+
+    .venv/bin/python benchmarks/defaults.py
+    .venv/bin/python benchmarks/defaults.py --tasks MountainCar Taxi --seeds 1 2 --set last_few=10
+
+Algorithm 1 in one process for each run, as many at a time as there are cores. A row of the table is
+a run: what random actions obtain, and the mean returns of evaluations during training.
+"""
+
+import argparse
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
+
+from udrl.algorithm1 import Run, algorithm1
+from udrl_launch.settings import ANY_PRESET, gather
+
+_EVALUATIONS = 5
+
+
+class Task(NamedTuple):
+    """An environment, its budget in env steps, and settings that it needs."""
+
+    environment: str
+    max_env_steps: int
+    settings: dict[str, Any]
+
+
+TASKS = {
+    "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
+    "FrozenLakeSlippery": Task("FrozenLake-v1", 300_000, {}),
+    "Blackjack": Task("flat_blackjack:FlatBlackjack-v0", 60_000, {}),
+    "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
+    "Taxi": Task("Taxi-v4", 300_000, {}),
+    "CartPole": Task("CartPole-v1", 100_000, {}),
+    "Acrobot": Task("Acrobot-v1", 100_000, {}),
+    "MountainCar": Task("MountainCar-v0", 150_000, {}),
+    "LunarLander": Task("LunarLander-v3", 200_000, {}),
+    "LunarLanderSparse": Task("LunarLanderSparse-v3", 200_000, {}),
+}
+
+
+class Curve(NamedTuple):
+    """A run: mean returns of the warm-up and of evaluations by env steps; seconds of CPU."""
+
+    warm_up: float
+    evaluations: list[tuple[int, float]]
+    cpu_s: float
+
+
+def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
+    """Train in one task."""
+    task = TASKS[name]
+    given = {"seed": seed, "lead": 0, "max_env_steps": task.max_env_steps, "eval_episodes": 200}
+    given["eval_every"] = task.max_env_steps // _EVALUATIONS
+    settings = gather(
+        task.environment,
+        preset_name=preset,
+        options=given | task.settings,
+        assignments=assignments,
+    )
+    warm_up: list[float] = []
+    steps: dict[int, int] = {}
+
+    def note(run: Run) -> None:
+        if run.iteration == 0:
+            warm_up.extend(entry.episode_return for entry in run.buffer)
+        steps[run.iteration] = run.env_steps
+
+    began = time.process_time()
+    run = algorithm1(settings.config, settings.budget, report=note, left_open=settings.left_open)
+    return Curve(
+        sum(warm_up) / len(warm_up),
+        [(steps[i - 1], e.mean) for i, e in sorted(run.evaluations.items())],
+        time.process_time() - began,
+    )
+
+
+def main() -> None:
+    """Train in all tasks and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--preset", default=ANY_PRESET)
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    options = parser.parse_args()
+    print("| task | seed | random | evaluations: mean return at env steps | CPU, s |")
+    print("|---|---|---|---|---|", flush=True)
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        runs = {
+            (name, seed): pool.submit(learn, name, seed, options.preset, options.set)
+            for name in options.tasks
+            for seed in options.seeds
+        }
+        for (name, seed), run in runs.items():
+            curve = run.result()
+            points = ", ".join(f"{mean:.4g} at {at // 1000}K" for at, mean in curve.evaluations)
+            print(f"| {name} | {seed} | {curve.warm_up:.4g} | {points} | {curve.cpu_s:.0f} |",
+                  flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Settings that are left open are chosen by random episodes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from udrl.acting import EpisodeGenerator
+from udrl.algorithm1 import algorithm1
+from udrl.config import OPEN, Budget, Config, build, change
+from udrl.episode import Episode
+from udrl.fitting import chance, fit, fits
+
+SCALES = ("return_scale", "horizon_scale")
+
+
+def config(**values: Any) -> Config:
+    return build(Config, {"environment": "CartPole-v1", "hidden": [8]} | values)
+
+
+def episodes(*returns_and_lengths: tuple[float, int]) -> list[Episode]:
+    return [
+        Episode(
+            command_id=i,
+            observations=np.zeros((n, 4), np.float32),
+            actions=np.zeros(n, np.uint8),
+            rewards=np.array([r] + [0.0] * (n - 1), np.float32),
+            terminated=True,
+            truncated=False,
+        )
+        for i, (r, n) in enumerate(returns_and_lengths)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("found", "scales"),
+    [
+        ([(0.0, 10), (1.0, 10)], (1.0, 0.1)),
+        ([(-500.0, 100), (100.0, 300)], (0.0017, 0.005)),  # the difference is 600
+        ([(-200.0, 200), (-200.0, 200)], (0.005, 0.005)),
+        ([(0.0, 4), (0.0, 4)], (1.0, 0.25)),
+        ([(1e30, 1)], (1e-6, 1.0)),
+    ],
+)
+def test_scales_are_one_over_what_is_usual(
+    found: list[tuple[float, int]], scales: tuple[float, float]
+) -> None:
+    network = fit(config(), SCALES, EpisodeGenerator(config(), 1), episodes(*found)).network
+    assert (network.return_scale, network.horizon_scale) == scales
+
+
+@pytest.mark.parametrize(
+    ("length", "limit", "expected"),
+    [
+        (20, 500, 10),  # 100 would be 2,000 steps, but up to 50,000
+        (20, 20, 100),
+        (1, 1, 2_000),
+        (300, 500, 10),
+        (9, 100, 50),
+    ],
+)
+def test_iterations_have_as_many_episodes_as_their_lengths_allow(
+    length: int, limit: int, expected: int
+) -> None:
+    settings = config(max_episode_steps=limit)
+    fitted = fit(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, length)))
+    assert fitted.commands.n_episodes_per_iter == expected
+    assert fitted.buffer.replay_size == fitted.buffer.recent_size == 6 * expected
+    assert fitted.commands.n_warm_up_episodes == max(50, expected)
+    assert fitted.commands.last_few == round(0.3 * expected)
+
+
+def test_the_buffer_follows_a_given_iteration() -> None:
+    settings = config(n_episodes_per_iter=7)
+    left_open = OPEN.keys() - {"n_episodes_per_iter"}
+    fitted = fit(settings, left_open, EpisodeGenerator(settings, 1), episodes((1.0, 10)))
+    assert (fitted.commands.n_episodes_per_iter, fitted.buffer.recent_size) == (7, 42)
+
+
+def test_what_is_given_stays() -> None:
+    generator = EpisodeGenerator(config(), 1)
+    given = config(return_scale=0.5, horizon_scale=0.5)
+    assert fit(given, (), generator) == given
+    half = fit(given, ("horizon_scale",), generator).network
+    assert half.return_scale == 0.5
+    assert half.horizon_scale != 0.5
+
+
+def test_the_choice_does_not_depend_on_how_many_environments_there_are() -> None:
+    fitted = [fit(config(), OPEN, EpisodeGenerator(config(), n)) for n in (1, 7)]
+    assert fitted[0] == fitted[1]
+    assert 0.01 < fitted[0].network.return_scale < 0.1
+
+
+def test_algorithm_1_chooses_them() -> None:
+    small = {"n_warm_up_episodes": 4, "n_episodes_per_iter": 2, "n_updates_per_iter": 2,
+             "batch_size": 16, "replay_size": 10, "last_few": 2}  # fmt: skip
+    fitted = fit(config(**small), SCALES, EpisodeGenerator(config(**small), 1))
+    budget = Budget(max_env_steps=300)
+    ways = [
+        algorithm1(config(**small), budget, left_open=SCALES),
+        algorithm1(fitted, budget),
+    ]
+    assert ways[0].weights_sha256 == ways[1].weights_sha256
+
+
+def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
+    """An episode of (category seen, action, reward)."""
+    return Episode(
+        command_id=0,
+        observations=np.array([[s[0]] for s in steps], np.int32),
+        actions=np.array([s[1] for s in steps], np.uint8),
+        rewards=np.array([s[2] for s in steps], np.float32),
+        terminated=not truncated,
+        truncated=truncated,
+    )
+
+
+@pytest.mark.parametrize(
+    ("others", "expected"),
+    [
+        ([walk((0, 0, 0.0), (1, 1, 1.0))], False),  # the same again
+        ([walk((0, 1, 0.0), (2, 1, 1.0))], False),  # another action
+        ([walk((0, 0, 0.0), (2, 1, 1.0))], True),  # it led elsewhere
+        ([walk((0, 0, 0.5), (1, 1, 1.0))], True),  # another reward
+        ([walk((0, 0, 0.0))], True),  # it was the end
+        ([walk((0, 0, 0.0), truncated=True)], False),  # nobody knows what would have followed
+        ([], False),
+    ],
+)
+def test_chance_shows_where_the_same_has_different_consequences(
+    others: list[Episode], expected: bool
+) -> None:
+    assert chance([walk((0, 0, 0.0), (1, 1, 1.0)), *others]) is expected
+
+
+@pytest.mark.parametrize(("slippery", "expected"), [(True, "action_value"), (False, "value")])
+def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expected: str) -> None:
+    settings = build(
+        Config,
+        {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
+    )
+    fitted = fit(settings, ("baseline",), EpisodeGenerator(settings, 1))
+    assert fitted.network.baseline == expected
+    everything = change(settings, segments="all")
+    assert (
+        fit(everything, ("baseline",), EpisodeGenerator(everything, 1)).network.baseline == "none"
+    )
+
+
+@pytest.mark.parametrize(
+    ("scale", "size", "good"), [(1.0, 0.0, True), (0.01, 500.0, True), (0.01, 5.0, False)]
+)
+def test_a_scale_fits_what_is_usual_or_not(scale: float, size: float, good: bool) -> None:
+    assert fits(scale, size) is good
+
+
+@pytest.mark.parametrize(("environment", "expected"), [("MountainCar-v0", 32), ("CartPole-v1", 1)])
+def test_actions_are_held_where_one_step_moves_little(environment: str, expected: int) -> None:
+    settings = config(environment=environment)
+    fitted = fit(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
+    assert fitted.warm_up_hold == expected
+    assert fitted.hold_steps == settings.commands.hold_steps

@@ -1,0 +1,42 @@
+"""The weights that the networks of a run begin with (Appendix B.2), a function of its seed."""
+
+from collections.abc import Collection
+
+import torch
+from torch import nn
+
+from udrl.config import Config
+from udrl.streams import Purpose, Stream, stream_key
+
+
+def draw_weights(
+    module: nn.Module, config: Config, number: int, without_activation: Collection[str]
+) -> None:
+    """Draw all weights of a network.
+
+    Args:
+        module: the network.
+        config: ``seed``, ``initialisation``, ``activation``.
+        number: of the network in the run, from 0 on; each has random numbers of its own.
+        without_activation: names of layers that no activation follows.
+    """
+    stream = Stream(stream_key(config.seed, Purpose.INITIALISE, index=number))
+    generator = torch.Generator().manual_seed(int(stream.integers(1, 0, 2**52)[0]))
+    gain = nn.init.calculate_gain(config.network.activation)
+    for name, layer in module.named_modules():
+        if isinstance(layer, nn.Embedding):
+            # Vectors as different as can be, as long as those of the first layer for one-hot input.
+            nn.init.orthogonal_(layer.weight, 1.0, generator)
+            with torch.no_grad():
+                layer.weight.mul_(gain / layer.weight.norm(dim=1, keepdim=True))
+        if not isinstance(layer, nn.Linear | nn.Conv2d):
+            continue
+        bound = layer.weight[0].numel() ** -0.5
+        assert layer.bias is not None
+        if config.network.initialisation == "orthogonal":
+            active = name not in without_activation
+            nn.init.orthogonal_(layer.weight, gain if active else 1.0, generator)
+            nn.init.zeros_(layer.bias)
+        else:
+            nn.init.uniform_(layer.weight, -bound, bound, generator)
+            nn.init.uniform_(layer.bias, -bound, bound, generator)
