@@ -31,10 +31,10 @@ class Task(NamedTuple):
 
 TASKS = {
     "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
-    "FrozenLakeSlippery": Task("FrozenLake-v1", 300_000, {}),
+    "FrozenLakeSlippery": Task("FrozenLake-v1", 200_000, {}),
     "Blackjack": Task("flat_blackjack:FlatBlackjack-v0", 60_000, {}),
     "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
-    "Taxi": Task("Taxi-v4", 300_000, {}),
+    "Taxi": Task("Taxi-v4", 200_000, {}),
     "CartPole": Task("CartPole-v1", 100_000, {}),
     "Acrobot": Task("Acrobot-v1", 100_000, {}),
     "MountainCar": Task("MountainCar-v0", 150_000, {}),

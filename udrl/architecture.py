@@ -41,7 +41,13 @@ def n_features(space: ObservationSpace, channels: Sequence[int], width: int) -> 
     """Return how many features an encoder makes: of an image what its convolutions leave."""
     if not isinstance(space, Image):
         return width
-    size = [space.height, space.width]
-    for _ in channels:
-        size = [(n + 2 * PADDING - FILTER) // STRIDE + 1 for n in size]
-    return channels[-1] * math.prod(size)
+    return channels[-1] * math.prod(image_sizes(space, len(channels))[-1])
+
+
+def image_sizes(space: Image, n_layers: int) -> list[tuple[int, int]]:
+    """Return height and width behind each of so many convolutions."""
+    sizes = [(space.height, space.width)]
+    for _ in range(n_layers):
+        height, width = ((n + 2 * PADDING - FILTER) // STRIDE + 1 for n in sizes[-1])
+        sizes.append((height, width))
+    return sizes[1:]

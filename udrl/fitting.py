@@ -70,12 +70,14 @@ def fit(
         longest = generator.spec.max_episode_steps
         wanted = math.ceil(min(_USUAL_STEPS / length, _MOST_STEPS / longest))
         n_episodes = max(wanted, _FEWEST_EPISODES)
-    baseline = "action_value" if chance(episodes) else "value"
+    by_chance = chance(episodes)
+    baseline = "action_value" if by_chance else "value"
     if config.training.segments == "all":
         baseline = "none"  # no other goes with them
     chosen = {
         "return_scale": _rounded(1 / reach) if reach else 1.0,
-        "horizon_scale": _rounded(1 / length),
+        # How long an episode lasts is luck too, and one that is asked to be short would gamble.
+        "horizon_scale": 0.0 if by_chance else _rounded(1 / length),
         "baseline": baseline,
         "n_warm_up_episodes": max(n_episodes, _FEWEST_WARM_UP),
         "warm_up_hold": hold,
@@ -147,7 +149,7 @@ def chance(episodes: Sequence[Episode]) -> bool:
 
 def fits(scale: float, size: float) -> bool:
     """Say whether a scale makes a number that a network reads well of what is usual."""
-    return size == 0 or _LEAST <= scale * size <= _MOST
+    return 0.0 in (size, scale) or _LEAST <= scale * size <= _MOST
 
 
 def _rounded(scale: float) -> float:

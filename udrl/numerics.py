@@ -34,7 +34,7 @@ def settle(config: Config) -> Config:
 def settle_as(held: Config, config: Config) -> Config:
     """Return settings with what they leave open as it was chosen for another run."""
     asked, known = flat(config), flat(held)
-    open_ = ("device", "precision", "return_scale", "horizon_scale")
+    open_ = ("device", "precision")
     chosen = {name: known[name] for name in open_ if asked[name] == "auto"}
     if asked["dataset"] is not None and asked["dataset"] == known["dataset"]:
         chosen["n_warm_up_episodes"] = known["n_warm_up_episodes"]

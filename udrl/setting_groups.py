@@ -52,7 +52,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
         activation: of the hidden layers.
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
         return_scale: factor on the desired return at the network's input.
-        horizon_scale: factor on the desired horizon at the network's input.
+        horizon_scale: factor on the desired horizon at the network's input; 0: it is not read.
         desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
             length of the best episodes; or ``return``: as many steps as return, as an integer,
             where each step gives a reward of 1 (TakeCover, 3.1).
@@ -67,7 +67,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     activation: Literal["relu", "tanh"] = "relu"
     initialisation: Literal["orthogonal", "uniform"] = "orthogonal"
     return_scale: Scale = 0.025
-    horizon_scale: Scale = 0.01
+    horizon_scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.01
     desired_horizon: Literal["mean", "return"] = "mean"
     baseline: Literal["none", "value", "action_value"] = "none"
 

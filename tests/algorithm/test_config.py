@@ -125,7 +125,7 @@ def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
         ("hidden", []),
         ("hidden", [32, 0]),
         ("hidden", 32),
-        ("horizon_scale", 0.0),
+        ("horizon_scale", -0.1),
         ("initialisation", "zeros"),
         ("lead", -1),
         ("learning_rate", 0.0),

@@ -22,7 +22,7 @@ def episodes(*returns_and_lengths: tuple[float, int]) -> list[Episode]:
     return [
         Episode(
             command_id=i,
-            observations=np.zeros((n, 4), np.float32),
+            observations=np.arange(4 * n, dtype=np.float32).reshape(n, 4) + 10_000 * i,
             actions=np.zeros(n, np.uint8),
             rewards=np.array([r] + [0.0] * (n - 1), np.float32),
             terminated=True,
@@ -140,8 +140,9 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
         Config,
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
     )
-    fitted = fit(settings, ("baseline",), EpisodeGenerator(settings, 1))
+    fitted = fit(settings, ("baseline", "horizon_scale"), EpisodeGenerator(settings, 1))
     assert fitted.network.baseline == expected
+    assert (fitted.network.horizon_scale == 0) is slippery
     everything = change(settings, segments="all")
     assert (
         fit(everything, ("baseline",), EpisodeGenerator(everything, 1)).network.baseline == "none"
@@ -149,7 +150,8 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
 
 
 @pytest.mark.parametrize(
-    ("scale", "size", "good"), [(1.0, 0.0, True), (0.01, 500.0, True), (0.01, 5.0, False)]
+    ("scale", "size", "good"),
+    [(1.0, 0.0, True), (0.01, 500.0, True), (0.01, 5.0, False), (0.0, 5.0, True)],
 )
 def test_a_scale_fits_what_is_usual_or_not(scale: float, size: float, good: bool) -> None:
     assert fits(scale, size) is good

@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from udrl.acting import EpisodeGenerator
 from udrl.commands import CommandSampler
 from udrl.config import Config, change, flat
+from udrl.cost import slow
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
 from udrl.fitting import fit, fits
@@ -102,6 +103,8 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
     returns = [e.episode_return for e in episodes]
     fitted = fit(config, left_open, generator, episodes)
     advice += _unusual(fitted, episodes, repeats=repeats)
+    if long := slow(fitted, spec):
+        advice.append(f"{long[0].upper()}{long[1:]}.")
     return Check(
         environment=config.environment,
         declared_observations=str(declared[0]),

@@ -13,6 +13,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config, flat
+from udrl.cost import slow
 from udrl.episode import Episode
 from udrl.errors import StoreError
 from udrl.fitting import fit
@@ -111,6 +112,8 @@ def _create(
             f"environment {config.environment} does not repeat an episode from its seed"
         )
         log.warning("the run is not exact: %s", progress.inexact_reason)
+    if long := slow(config, generator.spec):
+        log.warning("%s", long)
     hello = Hello(
         protocol=PROTOCOL,
         software=__version__,

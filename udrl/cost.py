@@ -1,0 +1,67 @@
+"""About how long an iteration trains, so that one that takes minutes is no surprise."""
+
+import math
+from itertools import pairwise
+
+from udrl.architecture import FILTER, VALUE_WIDTH, image_sizes, layer_widths, n_features
+from udrl.config import Config
+from udrl.environments.making import EnvironmentSpec
+from udrl.memory import FrameStack
+from udrl.spaces import Image
+
+#: Floating-point operations of a core per second in convolutions, as measured; machines differ by
+#: a factor of two or three, and this is about minutes.
+_PER_SECOND = 5e10
+#: Operations of an update for each multiplication of acting: one forward, twice as many
+#: backward, each with an addition.
+_OF_AN_UPDATE = 6
+#: Seconds of training in an iteration that are worth a word.
+_LONG_S = 60.0
+
+
+def training_s(config: Config, spec: EnvironmentSpec) -> float:
+    """Return about how many seconds the updates of an iteration take on a CPU."""
+    network, training = config.network, config.training
+    widths = layer_widths(spec.observation_space, network)
+    acting = _encoder(config, spec) + sum(i * o for i, o in pairwise(widths))
+    expecting = (
+        _encoder(config, spec)
+        + n_features(spec.observation_space, network.convolutions, VALUE_WIDTH) * VALUE_WIDTH
+    )
+    networks = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
+    examples = training.n_updates_per_iter * training.batch_size
+    operations = _OF_AN_UPDATE * examples * (acting + networks * expecting)
+    return operations / _PER_SECOND / config.arithmetic.training_threads
+
+
+def slow(config: Config, spec: EnvironmentSpec) -> str:
+    """Return a sentence about what makes training slow; empty where nothing does."""
+    seconds, seen = training_s(config, spec), spec.observation_space
+    if seconds < _LONG_S or config.arithmetic.device == "cuda":
+        return ""
+    training = config.training
+    what = f"examples of {seen}"
+    remedies = "n_updates_per_iter, batch_size or hidden"
+    if isinstance(seen, Image):
+        remedies = (
+            "n_updates_per_iter, batch_size or convolutions, or make the pictures smaller "
+            "(gymnasium.wrappers.ResizeObservation)"
+        )
+    return (
+        f"every iteration will train for about {seconds / 60:.0f} minutes on a CPU "
+        f"({training.n_updates_per_iter} updates of {training.batch_size} {what}); lower {remedies}"
+    )
+
+
+def _encoder(config: Config, spec: EnvironmentSpec) -> float:
+    """Return multiplications of an encoder for one observation."""
+    space, network = spec.observation_space, config.network
+    depth = FrameStack(space, network.frame_stack).shape[0]
+    if not isinstance(space, Image):
+        return depth * network.hidden[0]
+    channels = (depth, *network.convolutions)
+    sizes = image_sizes(space, len(network.convolutions))
+    return sum(
+        math.prod(size) * FILTER**2 * n_in * n_out
+        for size, (n_in, n_out) in zip(sizes, pairwise(channels), strict=True)
+    )
