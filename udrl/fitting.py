@@ -12,12 +12,15 @@ from hashlib import blake2b
 import msgspec
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.commands import Command, CommandSampler
+from udrl.commands import CommandSampler
 from udrl.config import OPEN, Config, change
 from udrl.episode import Episode
 
-#: Random episodes that are looked at: so many, and as many again until there are enough env steps.
-_EPISODES, _MOST_EPISODES, _STEPS = 20, 500, 1_000
+#: Random episodes that are looked at: so many, and more until there are enough env steps; fewer if
+#: they are long.
+_EPISODES, _MOST_EPISODES, _STEPS, _PLENTY = 20, 500, 1_000, 10_000
+#: Steps of an episode that are looked at.
+_LONGEST = 2_000
 #: Steps for which a random action may be held, episodes that are played with each, and how many of
 #: the best count.
 _HOLDS, _TRIED, _COUNT = (2, 8, 32), 40, 3
@@ -25,8 +28,11 @@ _HOLDS, _TRIED, _COUNT = (2, 8, 32), 40, 3
 _LEAST, _MOST = 0.1, 10.0
 #: Env steps in an iteration: if its episodes are like random ones, and at most.
 _USUAL_STEPS, _MOST_STEPS = 2_000, 5_000
-#: Fewest episodes of an iteration, and of the warm-up.
-_FEWEST_EPISODES, _FEWEST_WARM_UP = 10, 50
+#: Fewest episodes of an iteration.
+_FEWEST_EPISODES = 10
+#: Fewest episodes and env steps of the warm-up: where a reward is rare, one must be found by chance
+#: before there is anything to learn from.
+_WARM_UP, _WARM_UP_STEPS = 50, 4_000
 #: Best episodes that commands are drawn from, as a share of an iteration.
 _BEST = 0.3
 #: Iterations that each half of the replay buffer holds.
@@ -54,32 +60,33 @@ def fit(
     assert OPEN.keys() >= set(left_open)
     if not left_open:
         return config
-    hold = config.commands.warm_up_hold
+    hold, n_warm_up = config.commands.warm_up_hold, config.commands.n_warm_up_episodes
     if episodes is None:
-        commands = CommandSampler(
-            change(config, n_warm_up_episodes=_MOST_EPISODES), generator.spec
-        ).warm_up()
         if not {"warm_up_hold", "hold_steps"}.isdisjoint(left_open):
-            hold = _best_hold(generator, commands)
-        episodes = _play(generator, commands, hold)
-    returns = [e.episode_return for e in episodes]
+            hold = _best_hold(config, generator)
+        sample = _play(config, generator, hold, _EPISODES, _MOST_EPISODES)
+    else:
+        sample = Sample()
+        for episode in episodes:
+            sample.add(episode)
+    returns, length = sample.returns, sum(sample.lengths) / len(sample.lengths)
     reach = max(*map(abs, returns), max(returns) - min(returns), 0.0)
-    length = sum(e.length for e in episodes) / len(episodes)
     n_episodes = config.commands.n_episodes_per_iter
     if "n_episodes_per_iter" in left_open:
         longest = generator.spec.max_episode_steps
         wanted = math.ceil(min(_USUAL_STEPS / length, _MOST_STEPS / longest))
         n_episodes = max(wanted, _FEWEST_EPISODES)
-    by_chance = chance(episodes)
-    baseline = "action_value" if by_chance else "value"
+    if episodes is None:
+        n_warm_up = max(n_episodes, _WARM_UP, math.ceil(_WARM_UP_STEPS / length))
+    baseline = "action_value" if sample.by_chance else "value"
     if config.training.segments == "all":
         baseline = "none"  # no other goes with them
     chosen = {
         "return_scale": _rounded(1 / reach) if reach else 1.0,
         # How long an episode lasts is luck too, and one that is asked to be short would gamble.
-        "horizon_scale": 0.0 if by_chance else _rounded(1 / length),
+        "horizon_scale": 0.0 if sample.by_chance else _rounded(1 / length),
         "baseline": baseline,
-        "n_warm_up_episodes": max(n_episodes, _FEWEST_WARM_UP),
+        "n_warm_up_episodes": n_warm_up,
         "warm_up_hold": hold,
         "hold_steps": hold,
         "n_episodes_per_iter": n_episodes,
@@ -90,11 +97,36 @@ def fit(
     return change(config, **{name: chosen[name] for name in left_open})
 
 
-def _held(commands: Sequence[Command], hold: int) -> list[Command]:
-    return [msgspec.structs.replace(c, random_hold=hold) for c in commands]
+class Sample:
+    """What episodes show; they are not kept.
+
+    Attributes:
+        returns: of each.
+        lengths: of each, steps.
+        by_chance: whether the same action after the same observation had different consequences. By
+            chance, or by what is not observed: an agent cannot tell. Where no observation comes
+            twice, nothing can be said, and the answer is no.
+    """
+
+    def __init__(self) -> None:
+        self.returns: list[float] = []
+        self.lengths: list[int] = []
+        self.by_chance = False
+        self._consequences: dict[bytes, bytes] = {}
+
+    def add(self, episode: Episode) -> None:
+        """Look at an episode."""
+        self.returns.append(episode.episode_return)
+        self.lengths.append(episode.length)
+        seen = [blake2b(o.tobytes(), digest_size=16).digest() for o in episode.observations]
+        # What would have followed after a truncation is not known.
+        for t in range(episode.length - episode.truncated):
+            done = seen[t] + episode.actions[t].tobytes()
+            follows = episode.rewards[t].tobytes() + b"".join(seen[t + 1 : t + 2])
+            self.by_chance |= self._consequences.setdefault(done, follows) != follows
 
 
-def _best_hold(generator: EpisodeGenerator, commands: Sequence[Command]) -> int:
+def _best_hold(config: Config, generator: EpisodeGenerator) -> int:
     """Return for how many steps random actions should be held.
 
     Where one step moves little, actions that change at every step cancel each other, and no random
@@ -103,11 +135,10 @@ def _best_hold(generator: EpisodeGenerator, commands: Sequence[Command]) -> int:
     """
 
     def returns(hold: int) -> list[float]:
-        tried = generate_episodes(generator, _held(commands[:_TRIED], hold), None)
-        return sorted(e.episode_return for e in tried)
+        return sorted(_play(config, generator, hold, _TRIED, _TRIED).returns)
 
     without = returns(1)
-    usual = without[_TRIED // 2]
+    usual = without[len(without) // 2]
     if without[-1] > usual:
         return 1
     found = {hold: returns(hold)[-_COUNT:] for hold in _HOLDS}
@@ -115,36 +146,27 @@ def _best_hold(generator: EpisodeGenerator, commands: Sequence[Command]) -> int:
     return max(found, key=lambda hold: sum(found[hold]), default=1)
 
 
-def _play(generator: EpisodeGenerator, commands: Sequence[Command], hold: int) -> list[Episode]:
-    """Return random episodes: some, and as many again until there are enough env steps."""
-    episodes = list[Episode]()
-    while len(episodes) < len(commands) and sum(e.length for e in episodes) < _STEPS:
-        some = commands[len(episodes) :][:_EPISODES]
-        episodes += generate_episodes(generator, _held(some, hold), None)
-    return episodes
+def _play(config: Config, generator: EpisodeGenerator, hold: int, fewest: int, most: int) -> Sample:
+    """Play the first commands of the warm-up, with random actions held for ``hold`` steps.
 
-
-def chance(episodes: Sequence[Episode]) -> bool:
-    """Say whether the same action after the same observation had different consequences.
-
-    By chance, or by what is not observed: an agent cannot tell. Where no observation comes twice,
-    nothing can be said, and the answer is no.
+    Args:
+        config: the settings.
+        generator: plays.
+        hold: in steps.
+        fewest: episodes, unless they have plenty of env steps before.
+        most: episodes, unless they have enough env steps before.
     """
-    seen: dict[bytes, bytes] = {}
-    for episode in episodes:
-        steps = [
-            blake2b(o.tobytes(), digest_size=16).digest() + a.tobytes()
-            for o, a in zip(episode.observations, episode.actions, strict=True)
-        ]
-        follows = [o.tobytes() for o in episode.rewards]
-        for t, step in enumerate(steps):
-            last = t + 1 == episode.length
-            if last and episode.truncated:
-                continue  # what would have followed is not kept
-            after = follows[t] + (b"" if last else steps[t + 1][:16])
-            if seen.setdefault(step, after) != after:
-                return True
-    return False
+    sampler = CommandSampler(change(config, n_warm_up_episodes=most), generator.spec)
+    sample = Sample()
+    for n, command in enumerate(sampler.warm_up()):
+        steps = sum(sample.lengths)
+        if steps >= (_PLENTY if n < fewest else _STEPS):
+            break
+        played = msgspec.structs.replace(
+            command, random_hold=hold, max_steps=min(command.max_steps, _LONGEST)
+        )
+        sample.add(*generate_episodes(generator, [played], None))
+    return sample
 
 
 def fits(scale: float, size: float) -> bool:

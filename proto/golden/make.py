@@ -1,8 +1,8 @@
 """Write the golden vectors: ``python proto/golden/make.py``.
 
 Every message type has one example here. Its bytes are in ``<name>.msgpack`` and its values in
-``README.md``; ``streams.json``, ``choices.json`` and ``probe.json`` are test vectors for an actor's
-arithmetic.
+``README.md``; ``streams.json``, ``choices.json``, ``digests.json`` and ``probe.json`` are test
+vectors for an actor's arithmetic.
 """
 
 import json
@@ -18,7 +18,7 @@ import numpy as np
 from udrl.actions import Categorical
 from udrl.commands import Command
 from udrl.config import Config, build, flat
-from udrl.digests import arrays_digest
+from udrl.digests import arrays_digest, episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.graph import acting_graph
@@ -319,10 +319,12 @@ mean. All files here are written by `make.py` and checked by the tests.
   at the temperatures 0.5 and 0, `action` that at 1.
 - `probe.json` holds the [probe](../README.md#numerics-class), with the graph of
   `hello.msgpack`: the digest of its weights, the digest of its rows as the arrays `command` (`<f8`)
-  and `observation`, the logits of each row, and the 64 actions. The decimals are exact: read as
-  float32 they give the bits. Another kind of processor or version of ONNX Runtime may differ from
-  them in the last bits, and is then of another numerics class. A difference above 0.00001 is a
-  mistake.
+  and `observation`, the logits of each row, the 64 actions, and the class. The decimals are exact:
+  read as float32 they give the bits. Another kind of processor or version of ONNX Runtime may
+  differ from them in the last bits, and is then of another numerics class. A difference above
+  0.00001 is a mistake.
+- `digests.json` holds an episode of two steps, as numbers with the dtype of each array, with the
+  digest of its arrays and its own.
 
 """
 
@@ -389,14 +391,38 @@ def probe() -> dict[str, Any]:
     function = ActingFunction(GRAPH, weights)
     observation, command = probe_rows(function, PROBE_ROWS)
     logits = function.logits(observation, command)
+    actions = [
+        choose(logits[k % PROBE_ROWS].tolist(), u)
+        for k, u in enumerate(Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(64).tolist())
+    ]
+    arrays = {"actions": np.array(actions, np.uint8), "logits": logits}
     return {
         "weights": arrays_digest(weights).hex(),
         "rows": arrays_digest({"command": command, "observation": observation}).hex(),
         "logits": logits.tolist(),
-        "actions": [
-            choose(logits[k % PROBE_ROWS].tolist(), u)
-            for k, u in enumerate(Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(64).tolist())
-        ],
+        "actions": actions,
+        "class": arrays_digest(arrays).hex()[:16],
+    }
+
+
+def digests() -> dict[str, Any]:
+    """Return an episode and its digests."""
+    episode = Episode(
+        command_id=3_000_007,
+        observations=np.array([[0.5, -1.25], [3.0, 0.0]], np.float32),
+        actions=np.array([2, 0], np.uint8),
+        rewards=np.array([-1.0, 0.25], np.float32),
+        terminated=True,
+        truncated=False,
+    )
+    arrays = {name: getattr(episode, name) for name in ("actions", "observations", "rewards")}
+    return {
+        "id": episode.command_id,
+        "terminated": episode.terminated,
+        "truncated": episode.truncated,
+        "arrays": {n: {"dtype": a.dtype.str, "values": a.tolist()} for n, a in arrays.items()},
+        "arrays_digest": arrays_digest(arrays).hex(),
+        "digest": episode_digest(episode).hex(),
     }
 
 
@@ -411,6 +437,7 @@ def contents() -> dict[str, bytes]:
     files["README.md"] = (readme.rstrip() + "\n").encode()
     files["streams.json"] = (as_json(streams()) + "\n").encode()
     files["choices.json"] = (as_json(choices()) + "\n").encode()
+    files["digests.json"] = (as_json(digests()) + "\n").encode()
     files["probe.json"] = (as_json(probe()) + "\n").encode()
     return files
 

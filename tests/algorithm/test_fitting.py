@@ -1,7 +1,9 @@
 """Settings that are left open are chosen by random episodes."""
 
+from contextlib import closing
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -9,7 +11,27 @@ from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
 from udrl.config import OPEN, Budget, Config, build, change
 from udrl.episode import Episode
-from udrl.fitting import chance, fit, fits
+from udrl.fitting import Sample, fit, fits
+
+
+class Endless(gym.Env[Any, Any]):
+    """Nothing ends it and nothing tells actions apart."""
+
+    id = "Endless-v0"
+    observation_space = gym.spaces.Box(0, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+    steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        Endless.steps += 1
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+gym.register(Endless.id, entry_point=f"{__name__}:Endless", max_episode_steps=1_000_000)
 
 SCALES = ("return_scale", "horizon_scale")
 
@@ -66,7 +88,6 @@ def test_iterations_have_as_many_episodes_as_their_lengths_allow(
     fitted = fit(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, length)))
     assert fitted.commands.n_episodes_per_iter == expected
     assert fitted.buffer.replay_size == fitted.buffer.recent_size == 6 * expected
-    assert fitted.commands.n_warm_up_episodes == max(50, expected)
     assert fitted.commands.last_few == round(0.3 * expected)
 
 
@@ -131,7 +152,10 @@ def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
 def test_chance_shows_where_the_same_has_different_consequences(
     others: list[Episode], expected: bool
 ) -> None:
-    assert chance([walk((0, 0, 0.0), (1, 1, 1.0)), *others]) is expected
+    sample = Sample()
+    for one in [walk((0, 0, 0.0), (1, 1, 1.0)), *others]:
+        sample.add(one)
+    assert sample.by_chance is expected
 
 
 @pytest.mark.parametrize(("slippery", "expected"), [(True, "action_value"), (False, "value")])
@@ -163,3 +187,26 @@ def test_actions_are_held_where_one_step_moves_little(environment: str, expected
     fitted = fit(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
     assert fitted.warm_up_hold == expected
     assert fitted.hold_steps == settings.commands.hold_steps
+
+
+def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
+    endless = config(environment=Endless.id)
+    with closing(EpisodeGenerator(endless, 1)) as generator:
+        fitted = fit(endless, OPEN, generator)
+    assert Endless.steps <= 60_000
+    assert fitted.network.horizon_scale == 0.0005
+    assert fitted.commands.n_episodes_per_iter == 10
+    assert fitted.commands.n_warm_up_episodes == 50
+
+
+def test_short_episodes_are_many_in_the_warm_up() -> None:
+    settings = config(environment="FrozenLake-v1")
+    fitted = fit(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
+    assert 300 < fitted.n_warm_up_episodes < 1_000  # of about 8 steps
+
+
+def test_a_dataset_decides_how_many_episodes_the_warm_up_has() -> None:
+    settings = config(n_warm_up_episodes=3)
+    fitted = fit(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
+    assert fitted.commands.n_warm_up_episodes == 3
+    assert fitted.commands.warm_up_hold == 1

@@ -62,6 +62,7 @@ def test_files_are_those_that_the_script_writes() -> None:
     # Logits are those of the machine that wrote them, on another kind up to the last bits.
     then, now = (json.loads(files.pop("probe.json")) for files in (written, expected))
     np.testing.assert_allclose(then.pop("logits"), now.pop("logits"), rtol=0, atol=1e-5)
+    del then["class"], now["class"]
     assert then == now
     assert written == expected
 
@@ -85,6 +86,7 @@ def philox(key: bytes, n: int) -> list[int]:
 
 STREAMS: list[dict[str, Any]] = json.loads((GOLDEN / "streams.json").read_text())
 CHOICES: list[dict[str, Any]] = json.loads((GOLDEN / "choices.json").read_text())
+DIGESTS: dict[str, Any] = json.loads((GOLDEN / "digests.json").read_text())
 PROBE: dict[str, Any] = json.loads((GOLDEN / "probe.json").read_text())
 
 
@@ -108,6 +110,21 @@ def test_probe_is_what_the_page_says() -> None:
     logits = stranger.probe_logits(hello)
     assert logits.tolist() == MAKE["probe"]()["logits"]
     np.testing.assert_allclose(logits, PROBE["logits"], rtol=0, atol=1e-5)
+
+
+def test_the_class_is_the_digest_of_logits_and_actions() -> None:
+    arrays = {
+        "logits": np.array(PROBE["logits"], "<f4"),
+        "actions": np.array(PROBE["actions"], "|u1"),
+    }
+    assert stranger.arrays_digest(arrays).hex()[:16] == PROBE["class"]
+
+
+def test_the_digest_of_an_episode_follows_the_page() -> None:
+    arrays = {n: np.array(a["values"], a["dtype"]) for n, a in DIGESTS["arrays"].items()}
+    assert stranger.arrays_digest(arrays).hex() == DIGESTS["arrays_digest"]
+    episode = arrays | {n: DIGESTS[n] for n in ("terminated", "truncated")}
+    assert stranger.episode_digest(DIGESTS["id"], episode).hex() == DIGESTS["digest"]
 
 
 def test_logits_of_the_probe_are_written_exactly() -> None:
