@@ -70,3 +70,14 @@ def test_command_prints_lines_or_json() -> None:
     assert "verdict       it can be trained on: udrl train CartPole-v1" in told.stdout
     told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(told.stdout)["max_episode_steps"] == 500
+    told = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
+    assert "settings      baseline = value, hold_steps = 32" in told.stdout
+    assert "All random episodes return" not in told.stdout  # held for 32 steps, some succeed
+
+
+def test_settings_that_are_left_open_are_chosen_and_named() -> None:
+    config = build(Config, {"environment": "FrozenLake-v1"})
+    chosen = check(config, ("baseline", "n_warm_up_episodes", "horizon_scale")).chosen
+    assert chosen["baseline"] == "action_value"
+    assert chosen["horizon_scale"] == 0
+    assert int(chosen["n_warm_up_episodes"]) > 300

@@ -97,11 +97,11 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
         spec = generator.spec
         memory = (_memory() - before) / 2  # two were made
         digest = repeated_digest(generator)
-        episodes, reset_s, step_s = _play(generator, config)
+        fitted = fit(config, left_open, generator)
+        episodes, reset_s, step_s = _play(generator, fitted)
     with closing(EpisodeGenerator(config, 1)) as another:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
-    fitted = fit(config, left_open, generator, episodes)
     advice += _unusual(fitted, episodes, repeats=repeats)
     if long := slow(fitted, spec):
         advice.append(f"{long[0].upper()}{long[1:]}.")
