@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from udrl.actions import Categorical
 from udrl.commands import Command
@@ -395,7 +396,10 @@ def probe() -> dict[str, Any]:
         choose(logits[k % PROBE_ROWS].tolist(), u)
         for k, u in enumerate(Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(64).tolist())
     ]
-    arrays = {"actions": np.array(actions, np.uint8), "logits": logits}
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "actions": np.array(actions, np.uint8),
+        "logits": logits,
+    }
     return {
         "weights": arrays_digest(weights).hex(),
         "rows": arrays_digest({"command": command, "observation": observation}).hex(),
@@ -415,7 +419,8 @@ def digests() -> dict[str, Any]:
         terminated=True,
         truncated=False,
     )
-    arrays = {name: getattr(episode, name) for name in ("actions", "observations", "rewards")}
+    names = "actions", "observations", "rewards"
+    arrays: dict[str, npt.NDArray[Any]] = {name: getattr(episode, name) for name in names}
     return {
         "id": episode.command_id,
         "terminated": episode.terminated,
