@@ -131,15 +131,16 @@ def _best_hold(config: Config, generator: EpisodeGenerator) -> int:
 
     Where one step moves little, actions that change at every step cancel each other, and no random
     episode obtains more than the usual. Only there they are held: for as many steps as let the best
-    few of some episodes obtain most, and all of these few more than the usual. If in doubt, 1.
+    few of some episodes obtain most, and all of these few more than the usual. If in doubt, 1; and
+    where chance decides, which might do the same.
     """
 
     def returns(hold: int) -> list[float]:
         return sorted(_play(config, generator, hold, _TRIED, _TRIED).returns)
 
-    without = returns(1)
-    usual = without[len(without) // 2]
-    if without[-1] > usual:
+    sample = _play(config, generator, 1, _TRIED, _TRIED)
+    usual = sorted(sample.returns)[len(sample.returns) // 2]
+    if max(sample.returns) > usual or sample.by_chance:
         return 1
     found = {hold: returns(hold)[-_COUNT:] for hold in _HOLDS}
     found = {hold: few for hold, few in found.items() if few[0] > usual}
