@@ -120,6 +120,7 @@ OPEN: Mapping[str, Any] = {
     "baseline": "value",
     "n_warm_up_episodes": 1,
     "warm_up_hold": 1,
+    "held_actions": 1.0,
     "hold_steps": 1,
     "n_episodes_per_iter": 1,
     "last_few": 1,

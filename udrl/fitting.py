@@ -88,6 +88,8 @@ def fit(
         "baseline": baseline,
         "n_warm_up_episodes": n_warm_up,
         "warm_up_hold": hold,
+        # Averages need all actions to be tried again and again.
+        "held_actions": 0.5 if sample.by_chance else 0.25,
         "hold_steps": hold,
         "n_episodes_per_iter": n_episodes,
         "last_few": max(1, round(_BEST * n_episodes)),

@@ -164,9 +164,12 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
         Config,
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
     )
-    fitted = fit(settings, ("baseline", "horizon_scale"), EpisodeGenerator(settings, 1))
+    fitted = fit(
+        settings, ("baseline", "horizon_scale", "held_actions"), EpisodeGenerator(settings, 1)
+    )
     assert fitted.network.baseline == expected
     assert (fitted.network.horizon_scale == 0) is slippery
+    assert fitted.commands.held_actions == (0.5 if slippery else 0.25)
     everything = change(settings, segments="all")
     assert (
         fit(everything, ("baseline",), EpisodeGenerator(everything, 1)).network.baseline == "none"
