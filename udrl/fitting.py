@@ -131,20 +131,20 @@ class Sample:
 def _best_hold(config: Config, generator: EpisodeGenerator) -> int:
     """Return for how many steps random actions should be held.
 
-    Where one step moves little, actions that change at every step cancel each other, and no random
-    episode obtains more than the usual. Only there they are held: for as many steps as let the best
-    few of some episodes obtain most, and all of these few more than the usual. If in doubt, 1; and
-    where chance decides, which might do the same.
+    Where one step moves little, actions that change at every step cancel each other, and hardly any
+    random episode obtains more than the usual. Only there they are held: for as many steps as let
+    the best few of some episodes obtain most, and all of these few more than the usual. If in
+    doubt, 1; and where chance decides, which might do the same.
     """
-
-    def returns(hold: int) -> list[float]:
-        return sorted(_play(config, generator, hold, _TRIED, _TRIED).returns)
-
     sample = _play(config, generator, 1, _TRIED, _TRIED)
-    usual = sorted(sample.returns)[len(sample.returns) // 2]
-    if max(sample.returns) > usual or sample.by_chance:
+    ordered = sorted(sample.returns)
+    usual = ordered[len(ordered) // 2]
+    if ordered[-_COUNT] > usual or sample.by_chance:
         return 1
-    found = {hold: returns(hold)[-_COUNT:] for hold in _HOLDS}
+    found = {
+        hold: sorted(_play(config, generator, hold, _TRIED, _TRIED).returns)[-_COUNT:]
+        for hold in _HOLDS
+    }
     found = {hold: few for hold, few in found.items() if few[0] > usual}
     return max(found, key=lambda hold: sum(found[hold]), default=1)
 
