@@ -26,7 +26,34 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.setting_groups import NetworkSettings
 
 
-class ValueFunction(nn.Module):
+class _Expectation(nn.Module):
+    """What to expect of an observation: an encoder and two layers.
+
+    Args:
+        spec: observation space.
+        network: ``frame_stack``, ``convolutions`` (of images).
+        precision: that it computes in.
+        n: numbers that are expected.
+    """
+
+    def __init__(
+        self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype, n: int
+    ) -> None:
+        super().__init__()
+        space = spec.observation_space
+        self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
+        self.hidden = fully_connected(
+            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
+        )
+        self.expected = fully_connected(VALUE_WIDTH, n)
+
+    def expect(self, observation: Tensor) -> Tensor:
+        """Return float32 [batch, n] for s, as the networks see it, [batch, *shape]."""
+        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
+        return apply(self.expected, features).float()
+
+
+class ValueFunction(_Expectation):
     """V(s) and D(s): the scaled return to expect, and its mean absolute deviation.
 
     Args:
@@ -38,13 +65,7 @@ class ValueFunction(nn.Module):
     def __init__(
         self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
     ) -> None:
-        super().__init__()
-        space = spec.observation_space
-        self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
-        self.hidden = fully_connected(
-            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
-        )
-        self.expected = fully_connected(VALUE_WIDTH, 2)
+        super().__init__(spec, network, precision, 2)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return (V(s), D(s)), float32 [batch, 2].
@@ -52,13 +73,12 @@ class ValueFunction(nn.Module):
         Args:
             observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
         """
-        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
-        value, d = apply(self.expected, features).float().unbind(1)
+        value, d = self.expect(observation).unbind(1)
         deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
         return torch.stack([value, deviation], dim=1)
 
 
-class Critic(nn.Module):
+class Critic(_Expectation):
     """Q(s, .): the scaled return to expect after each action. Only the learner needs it.
 
     Args:
@@ -70,13 +90,7 @@ class Critic(nn.Module):
     def __init__(
         self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
     ) -> None:
-        super().__init__()
-        space = spec.observation_space
-        self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
-        self.hidden = fully_connected(
-            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
-        )
-        self.expected = fully_connected(VALUE_WIDTH, spec.action_space.n_parameters)
+        super().__init__(spec, network, precision, spec.action_space.n_parameters)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """Return Q(s, a), float32 [batch].
@@ -85,9 +99,7 @@ class Critic(nn.Module):
             observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
             action: a, int64 [batch].
         """
-        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
-        expected = apply(self.expected, features).float()
-        return expected.gather(1, action[:, None])[:, 0]
+        return self.expect(observation).gather(1, action[:, None])[:, 0]
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:
