@@ -220,11 +220,11 @@ class Fleet:
 
 
 def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
-    rng = np.random.default_rng(seed)
+    rng, acted = np.random.default_rng(seed), spec.action_space
     episode = Episode(
         command_id=0,
         observations=rng.normal(size=(steps, *spec.observation_space.shape)).astype(np.float32),
-        actions=rng.integers(0, spec.action_space.n, steps).astype(spec.action_space.dtype),
+        actions=rng.integers(0, acted.n_parameters, steps).astype(acted.dtype),
         rewards=rng.normal(size=steps).astype(np.float32),
         terminated=True,
         truncated=False,

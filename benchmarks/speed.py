@@ -237,10 +237,12 @@ def _window(run_dir: Path) -> Window:
 def _recorded(run_dir: Path) -> tuple[Config, list[Episode]]:
     """Return a run's settings and the episodes in its buffer."""
     with closing(Store(run_dir, read_only=True)) as store:
-        config = store.fact("hello", Hello).config
+        hello = store.fact("hello", Hello)
         held = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
         bodies = [store.episode_bodies([i], LARGEST)[0] for i in held]
-    return config, [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in bodies]
+    space = hello.environment.observation_space
+    messages = [decode(body, EpisodeMessage, LARGEST) for body in bodies]
+    return hello.config, [decode_episode(m, space) for m in messages]
 
 
 def _time_parts(run_dir: Path, processes: int) -> Parts:
@@ -288,9 +290,9 @@ def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
     """
     state, n = untrained(config, spec), config.training.batch_size
     seen = spec.observation_space
-    shape = FrameStack(seen, config.network.frame_stack).shape
-    observation = (torch.rand(n, *shape) * 255).to(getattr(torch, seen.dtype.name))
-    command, action = torch.rand(n, 2), torch.randint(spec.action_space.n, (n,))
+    (shape,) = FrameStack(seen, config.network.frame_stack).shapes
+    observed = ((torch.rand(n, *shape) * 255).to(getattr(torch, seen.dtype.name)),)
+    command, action = torch.rand(n, 2), torch.randint(spec.action_space.n_parameters, (n,))
 
     def step(loss: torch.Tensor) -> None:
         state.optimizer.zero_grad()
@@ -299,8 +301,8 @@ def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
 
     def update() -> None:
         if state.behavior.value is not None:
-            step(value_loss(state.behavior.value(observation), command[:, 0]))
-        step(state.behavior.loss(state.behavior.obey(observation, command), action))
+            step(value_loss(state.behavior.value(observed), command[:, 0]))
+        step(state.behavior.loss(state.behavior.obey(observed, command), action))
 
     return _seconds(update, 100)
 

@@ -182,7 +182,8 @@ class EpisodeGenerator:
         if seen is None:
             seen = self._recording.stacks(self._memory)
         for call, rows in self._calls:
-            seen.take(rows, axis=0, out=call.observation, mode="clip")
+            for all_rows, asked in zip(seen, call.seen, strict=True):
+                all_rows.take(rows, axis=0, out=asked, mode="clip")
             self._desired.take(rows, axis=0, out=call.command, mode="clip")
             call.run()
             self._parameters[rows] = call.logits

@@ -1,11 +1,19 @@
-"""What actions are: how they are chosen from the behavior function's outputs, and checked."""
+"""What actions are: how they are chosen from the behavior function's outputs, and checked.
 
+A ``Discrete`` action is one index. All others are several at once, each chosen by itself given the
+observation and the command: the components of a ``MultiDiscrete``, the bits of a ``MultiBinary``,
+and the dimensions of a ``Box``, whose values fall into bins
+(:mod:`udrl.environments.action_conversions`).
+"""
+
+from functools import lru_cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from udrl.spaces import Indices
+from udrl.spaces import IndexVectors, Indices
 
 Actions = npt.NDArray[np.integer[Any]]
 Numbers = npt.NDArray[np.float64]
@@ -84,5 +92,110 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         return int(self.sample(logits[None], divisor, np.array([uniform]))[0])
 
 
+class Product(IndexVectors, frozen=True, tag="product"):
+    """Several indices at once, component i one of ``ns[i]``; each has a distribution of its own.
+
+    The behavior function's outputs are the logits of all components, one after another. An action
+    takes one uniform number for each component.
+    """
+
+    @property
+    def n_parameters(self) -> int:
+        """Outputs of the behavior function."""
+        return sum(self.ns)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The smaller of uint8 and int32 that holds them."""
+        return np.dtype(np.uint8 if max(self.ns) <= 256 else np.int32)
+
+    def sample(self, logits: Numbers, temperature: Numbers, uniforms: Numbers) -> Actions:
+        """Return an action of each row, by inverse CDF in float64.
+
+        Args:
+            logits: of P(a | s, c), float64 [rows, n_parameters].
+            temperature: logits are divided by it, float64 [rows, 1], more than 0.
+            uniforms: float64 [rows, components] in [0, 1).
+
+        Returns:
+            int64 [rows, components].
+        """
+        weights = self._weights(logits, temperature[:, :, None])
+        cumulative = np.add.accumulate(weights, axis=2)
+        threshold = uniforms * cumulative[:, :, -1]
+        actions: Actions = np.add.reduce(cumulative <= threshold[:, :, None], axis=2)
+        np.minimum(actions, np.array(self.ns) - 1, out=actions)
+        return actions
+
+    def mode(self, logits: Numbers) -> Actions:
+        """Return the likeliest action of each row, int64 [rows, components].
+
+        Args:
+            logits: float64 [rows, n_parameters].
+        """
+        actions: Actions = self._padded(logits).argmax(axis=2)
+        return actions
+
+    def uniform(self, uniforms: Numbers) -> Actions:
+        """Return actions that are all as likely, int64, for float64 [rows, components]."""
+        actions: Actions = (uniforms * np.array(self.ns)).astype(np.int64)
+        return actions
+
+    def probabilities(self, logits: Numbers, temperature: float) -> Numbers:
+        """Return the distributions of all components, one after another, float64 [n_parameters].
+
+        Args:
+            logits: of P(a | s, c), float64 [n_parameters].
+            temperature: logits are divided by it; 0: all on the modes.
+        """
+        parts = np.split(logits, self.ends[:-1])
+        shares = [
+            Categorical(n).probabilities(part, temperature)
+            for n, part in zip(self.ns, parts, strict=True)
+        ]
+        return np.concatenate(shares)
+
+    def choose(self, logits: Numbers, temperature: float, uniform: Numbers) -> Actions:
+        """Return the action that Algorithm 2 takes in one row, int64 [components].
+
+        Args:
+            logits: of P(a | s, c), float64 [n_parameters].
+            temperature: logits are divided by it; 0: take the mode.
+            uniform: the numbers in [0, 1) that decide, float64 [components].
+        """
+        row, divisor = logits[None], np.array([[temperature]])
+        chosen = self.sample(row, divisor, uniform[None]) if temperature else self.mode(row)
+        action: Actions = chosen[0]
+        return action
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Where the logits of each component end."""
+        return tuple(accumulate(self.ns))
+
+    def _weights(self, logits: Numbers, temperature: Numbers) -> Numbers:
+        """Return numbers in proportion to the probabilities, [rows, components, most]."""
+        padded = self._padded(logits)
+        padded -= np.maximum.reduce(padded, axis=2, keepdims=True)
+        weights: Numbers = np.exp(padded / temperature)
+        return weights
+
+    def _padded(self, logits: Numbers) -> Numbers:
+        """Return logits by component, [rows, components, most]; impossible ones are -inf."""
+        places, impossible = _places(self.ns)
+        padded: Numbers = logits[:, places]
+        padded[:, impossible] = -np.inf
+        return padded
+
+
+@lru_cache
+def _places(ns: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Return where a component's logits stand, [components, most], and which do not exist."""
+    number = np.arange(max(ns))[None, :]
+    sizes = np.array(ns)[:, None]
+    first = np.cumsum(sizes)[:, None] - sizes
+    return first + np.minimum(number, sizes - 1), number >= sizes
+
+
 #: The kinds there are.
-ActionSpace = Categorical
+ActionSpace = Categorical | Product

@@ -30,7 +30,8 @@ DEVIATIONS = 2.0
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:
     """Return the widths of the behavior function: of its encoder, and of the layers that follow.
 
-    An image's convolutions stand before all layers of ``hidden``, any other encoder is the first.
+    An image's convolutions stand before all layers of ``hidden``; any other encoder, also the one
+    of a record, is the first.
     """
     if isinstance(space, Image):
         return (n_features(space, network.convolutions, 0), *network.hidden)

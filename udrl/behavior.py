@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+from udrl.action_losses import negative_log_likelihood
 from udrl.architecture import layer_widths
 from udrl.config import Config
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
@@ -36,6 +36,7 @@ class BehaviorFunction(nn.Module):
         super().__init__()
         network, precision = config.network, PRECISIONS[config.arithmetic.precision]
         self._activation = activation = ACTIVATIONS[network.activation]
+        self._actions = spec.action_space
         first, *_ = widths = layer_widths(spec.observation_space, network)
         self.encoder = make_encoder(spec.observation_space, network, first, activation, precision)
         self.command = fully_connected(ReturnInTime.size, first)
@@ -43,11 +44,11 @@ class BehaviorFunction(nn.Module):
         self.action = fully_connected(widths[-1], spec.action_space.n_parameters)
         self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
-    def forward(self, observation: Tensor, command: Tensor) -> Tensor:
+    def forward(self, seen: tuple[Tensor, ...], command: Tensor) -> Tensor:
         """Return the parameters of P(a | s, c).
 
         Args:
-            observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
             command: (desired return, desired horizon), each scaled, float32 [batch, 2].
 
         Returns:
@@ -55,12 +56,12 @@ class BehaviorFunction(nn.Module):
         """
         if self.value is not None:
             with torch.no_grad():
-                command = relative(command, self.value(observation))
-        return self.obey(observation, command)
+                command = relative(command, self.value(seen))
+        return self.obey(seen, command)
 
-    def obey(self, observation: Tensor, command: Tensor) -> Tensor:
+    def obey(self, seen: tuple[Tensor, ...], command: Tensor) -> Tensor:
         """Return the same for commands that are relative already, where there is a value."""
-        features: Tensor = self.encoder(observation)
+        features: Tensor = self.encoder(*seen)
         features = features * torch.sigmoid(apply(self.command, command.to(features.dtype)))
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
@@ -72,9 +73,9 @@ class BehaviorFunction(nn.Module):
 
         Args:
             parameters: float32 [batch, n_parameters], from :meth:`forward`.
-            action: a, int64 [batch].
+            action: a, int64 [batch], or [batch, components].
         """
-        return functional.cross_entropy(parameters, action)
+        return negative_log_likelihood(self._actions, parameters, action)
 
 
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:

@@ -23,6 +23,7 @@ from msgspec import Meta
 
 from udrl.errors import ConfigError
 from udrl.setting_groups import (
+    ActionSettings,
     ArithmeticSettings,
     BufferSettings,
     CommandSettings,
@@ -60,6 +61,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
             return in evaluation (2.3.2); None: what the environment declares, if anything.
         seed: the seed that every random stream is keyed by.
         lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
+        actions: of ``Box`` action spaces.
         network: all that the acting graph is a function of, and its initialisation.
         buffer: of the replay buffer.
         commands: of warm-up and exploratory episodes.
@@ -76,6 +78,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
     lead: Annotated[int, Meta(ge=0, le=64)] = 0
 
+    actions: ActionSettings = ActionSettings()
     network: NetworkSettings = NetworkSettings()
     buffer: BufferSettings = BufferSettings()
     commands: CommandSettings = CommandSettings()

@@ -7,7 +7,8 @@ from udrl.architecture import FILTER, VALUE_WIDTH, image_sizes, layer_widths, n_
 from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.memory import FrameStack
-from udrl.spaces import Image
+from udrl.setting_groups import NetworkSettings
+from udrl.spaces import Image, LeafSpace, Record, leaves_of
 
 #: Floating-point operations of a core per second in convolutions, as measured; machines differ by
 #: a factor of two or three, and this is about minutes.
@@ -23,9 +24,9 @@ def training_s(config: Config, spec: EnvironmentSpec) -> float:
     """Return about how many seconds the updates of an iteration take on a CPU."""
     network, training = config.network, config.training
     widths = layer_widths(spec.observation_space, network)
-    acting = _encoder(config, spec) + sum(i * o for i, o in pairwise(widths))
+    acting = _encoder(config, spec, widths[0]) + sum(i * o for i, o in pairwise(widths))
     expecting = (
-        _encoder(config, spec)
+        _encoder(config, spec, VALUE_WIDTH)
         + n_features(spec.observation_space, network.convolutions, VALUE_WIDTH) * VALUE_WIDTH
     )
     networks = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
@@ -42,7 +43,7 @@ def slow(config: Config, spec: EnvironmentSpec) -> str:
     training = config.training
     what = f"examples of {seen}"
     remedies = "n_updates_per_iter, batch_size or hidden"
-    if isinstance(seen, Image):
+    if any(isinstance(leaf.space, Image) for leaf in leaves_of(seen)):
         remedies = (
             "n_updates_per_iter, batch_size or convolutions, or make the pictures smaller "
             "(gymnasium.wrappers.ResizeObservation)"
@@ -53,12 +54,22 @@ def slow(config: Config, spec: EnvironmentSpec) -> str:
     )
 
 
-def _encoder(config: Config, spec: EnvironmentSpec) -> float:
+def _encoder(config: Config, spec: EnvironmentSpec, width: int) -> float:
     """Return multiplications of an encoder for one observation."""
     space, network = spec.observation_space, config.network
-    depth = FrameStack(space, network.frame_stack).shape[0]
+    shapes = FrameStack(space, network.frame_stack).shapes
+    leaves = [leaf.space for leaf in leaves_of(space)]
+    encoding = sum(
+        _leaf(leaf, shape[0], network, width) for leaf, shape in zip(leaves, shapes, strict=True)
+    )
+    if not isinstance(space, Record):
+        return encoding
+    return encoding + width * sum(n_features(leaf, network.convolutions, width) for leaf in leaves)
+
+
+def _leaf(space: LeafSpace, depth: int, network: NetworkSettings, width: int) -> float:
     if not isinstance(space, Image):
-        return depth * network.hidden[0]
+        return depth * width
     channels = (depth, *network.convolutions)
     sizes = image_sizes(space, len(network.convolutions))
     return sum(

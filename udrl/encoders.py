@@ -1,7 +1,8 @@
 """From what is observed to a vector of features (section 3.2, Appendix B.2).
 
 A vector passes one fully connected layer, a category has an embedding, an image passes
-convolutions, each with a 3x3 filter and a stride of 2. The behavior function and the value function
+convolutions, each with a 3x3 filter and a stride of 2. The leaves of a record have an encoder each,
+and a fully connected layer joins their features. The behavior function and the value function
 (:mod:`udrl.value`) each have an encoder of their own. :mod:`udrl.graph` has the same for acting.
 """
 
@@ -12,10 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from udrl.architecture import FILTER, PADDING, STRIDE
+from udrl.architecture import FILTER, PADDING, STRIDE, n_features
 from udrl.memory import FrameStack
 from udrl.setting_groups import NetworkSettings
-from udrl.spaces import Category, Image, ObservationSpace
+from udrl.spaces import Categories, Category, Image, LeafSpace, ObservationSpace, Record
 
 Activation = Callable[[Tensor], Tensor]
 
@@ -50,8 +51,8 @@ class Encoder(nn.Module):
         self._activation = activation
         self._precision = precision
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return features, [batch, n_features], of observations as the networks see them."""
+    def forward(self, *seen: Tensor) -> Tensor:
+        """Return features, [batch, n_features], of what the networks see (:mod:`udrl.memory`)."""
         raise NotImplementedError
 
 
@@ -64,25 +65,41 @@ class VectorEncoder(Encoder):
         super().__init__(activation, precision)
         self.layer = fully_connected(size, width)
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return features, [batch, width], of float32 [batch, size]."""
+    def forward(self, *seen: Tensor) -> Tensor:
+        """Return features, [batch, width], of numbers, [batch, size]."""
+        (observation,) = seen
         return self._activation(apply(self.layer, observation.to(self._precision)))
 
 
 class CategoryEncoder(Encoder):
-    """A learned vector for each category, at each place of the stack; their sum."""
+    """A learned vector for each category of each component, at each place of the stack; their sum.
+
+    Args:
+        ns: categories of each component.
+        length: of the stack.
+        width: of the vectors.
+        activation: of the sum.
+        precision: that it computes in.
+    """
 
     def __init__(
-        self, n: int, length: int, width: int, activation: Activation, precision: torch.dtype
+        self,
+        ns: tuple[int, ...],
+        length: int,
+        width: int,
+        activation: Activation,
+        precision: torch.dtype,
     ) -> None:
         super().__init__(activation, precision)
-        self.embedding = nn.utils.skip_init(nn.Embedding, length * n, width)
+        sizes = torch.tensor(ns * length)
+        self.embedding = nn.utils.skip_init(nn.Embedding, int(sizes.sum()), width)
         self.bias = nn.Parameter(torch.zeros(width))
-        self.register_buffer("first", torch.arange(length) * n, persistent=False)
+        self.register_buffer("first", sizes.cumsum(0) - sizes, persistent=False)
         self.first: Tensor
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return features, [batch, width], of int32 [batch, length]."""
+    def forward(self, *seen: Tensor) -> Tensor:
+        """Return features, [batch, width], of int32 [batch, length * components]."""
+        (observation,) = seen
         vectors: Tensor = self.embedding(observation + self.first)
         return self._activation((vectors.sum(1) + self.bias).to(self._precision))
 
@@ -103,8 +120,9 @@ class ImageEncoder(Encoder):
             for i, o in pairwise((n_channels, *channels))
         )
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def forward(self, *seen: Tensor) -> Tensor:
         """Return features, [batch, n_features], of uint8 [batch, channels, height, width]."""
+        (observation,) = seen
         features = observation.to(self._precision) * (1 / 255)
         features = features.contiguous(memory_format=torch.channels_last)
         for layer in self.layers:
@@ -115,6 +133,35 @@ class ImageEncoder(Encoder):
             convolved = functional.conv2d(features, weight, bias, STRIDE, PADDING)
             features = self._activation(convolved)
         return features.flatten(1)
+
+
+class RecordEncoder(Encoder):
+    """An encoder for each leaf, and a fully connected layer from all their features.
+
+    Args:
+        encoders: of the leaves.
+        n_features: that they make together.
+        width: of the layer.
+        activation: after it.
+        precision: that it computes in.
+    """
+
+    def __init__(
+        self,
+        encoders: list[Encoder],
+        n_features: int,
+        width: int,
+        activation: Activation,
+        precision: torch.dtype,
+    ) -> None:
+        super().__init__(activation, precision)
+        self.leaves = nn.ModuleList(encoders)
+        self.joined = fully_connected(n_features, width)
+
+    def forward(self, *seen: Tensor) -> Tensor:
+        """Return features, [batch, width], of all leaves."""
+        features = [leaf(one) for leaf, one in zip(self.leaves, seen, strict=True)]
+        return self._activation(apply(self.joined, torch.cat(features, 1)))
 
 
 def make_encoder(
@@ -133,10 +180,28 @@ def make_encoder(
         activation: after each layer.
         precision: that it computes in.
     """
-    shape = FrameStack(space, network.frame_stack).shape
+    if not isinstance(space, Record):
+        return _of_leaf(space, network, width, activation, precision)
+    leaves = [leaf.space for leaf in space.leaves]
+    encoders = [_of_leaf(leaf, network, width, activation, precision) for leaf in leaves]
+    together = sum(n_features(leaf, network.convolutions, width) for leaf in leaves)
+    return RecordEncoder(encoders, together, width, activation, precision)
+
+
+def _of_leaf(
+    space: LeafSpace,
+    network: NetworkSettings,
+    width: int,
+    activation: Activation,
+    precision: torch.dtype,
+) -> Encoder:
+    length = network.frame_stack
+    (shape,) = FrameStack(space, length).shapes
     match space:
         case Image():
             return ImageEncoder(shape[0], network.convolutions, activation, precision)
         case Category(n=n):
-            return CategoryEncoder(n, shape[0], width, activation, precision)
+            return CategoryEncoder((n,), length, width, activation, precision)
+        case Categories(ns=ns):
+            return CategoryEncoder(ns, length, width, activation, precision)
     return VectorEncoder(shape[0], width, activation, precision)

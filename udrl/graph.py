@@ -4,8 +4,9 @@ Everything that acts computes this graph in ONNX Runtime; :mod:`udrl.behavior` i
 in torch, for training. A graph without values belongs to a run and says what its weights are; with
 the weights of one version it becomes an :class:`udrl.inference.ActingFunction`.
 
-Inputs: ``observation``, what the networks see ([batch, *shape], :mod:`udrl.memory`), and
-``command``, desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
+Inputs: ``observation``, what the networks see ([batch, *shape], :mod:`udrl.memory`); of a record
+one for each leaf, with its name behind, as ``observation['inventory'][2]``; and ``command``,
+desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
 Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters].
 """
 
@@ -34,7 +35,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.memory import FrameStack
 from udrl.setting_groups import NetworkSettings
-from udrl.spaces import Category, Image
+from udrl.spaces import Bits, Categories, Category, Image, Record, leaves_of
 from udrl.targets import ReturnInTime
 
 #: The tensors of a weights version by name, float32.
@@ -76,8 +77,9 @@ class _Builder:
 
     def __init__(self, network: NetworkSettings, spec: EnvironmentSpec) -> None:
         self._network = network
-        self._seen = spec.observation_space
-        self._shape = FrameStack(self._seen, network.frame_stack).shape
+        self._space = spec.observation_space
+        self._leaves = [(f"observation{leaf.name}", leaf.space) for leaf in leaves_of(self._space)]
+        self._shapes = FrameStack(self._space, network.frame_stack).shapes
         self._n_parameters = spec.action_space.n_parameters
         self._target = ReturnInTime(network)
         self._nodes: list[onnx.NodeProto] = []
@@ -85,13 +87,18 @@ class _Builder:
 
     def model(self) -> bytes:
         """Return the model, with what was appended last as its output."""
-        seen = helper.np_dtype_to_tensor_dtype(self._seen.dtype)
+        observed = [
+            helper.make_tensor_value_info(
+                name, helper.np_dtype_to_tensor_dtype(leaf.dtype), ["batch", *shape]
+            )
+            for (name, leaf), shape in zip(self._leaves, self._shapes, strict=True)
+        ]
         self._nodes[-1].output[0] = "logits"
         graph = helper.make_graph(
             self._nodes,
             "behavior_function",
             [
-                helper.make_tensor_value_info("observation", seen, ["batch", *self._shape]),
+                *observed,
                 helper.make_tensor_value_info(
                     "command", TensorProto.DOUBLE, ["batch", self._target.size]
                 ),
@@ -119,7 +126,7 @@ class _Builder:
         command = self._command()
         if network.baseline != "none":
             command = self._relative(command)
-        first, *_ = widths = layer_widths(self._seen, network)
+        first, *_ = widths = layer_widths(self._space, network)
         features = self._encode("encoder", activation, first)
         gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
         features = self._append("Mul", features, gate)
@@ -162,33 +169,51 @@ class _Builder:
     def _expected(self, name: str, n: int) -> str:
         """Append a network that expects ``n`` numbers of an observation."""
         features = self._encode(f"{name}.encoder", "Tanh", VALUE_WIDTH)
-        width = n_features(self._seen, self._network.convolutions, VALUE_WIDTH)
+        width = n_features(self._space, self._network.convolutions, VALUE_WIDTH)
         features = self._append("Tanh", self._layer(f"{name}.hidden", features, width, VALUE_WIDTH))
         return self._layer(f"{name}.expected", features, VALUE_WIDTH, n)
 
     def _encode(self, name: str, activation: str, width: int) -> str:
         """Append an encoder; see :func:`udrl.encoders.make_encoder`."""
-        match self._seen:
+        if not isinstance(self._space, Record):
+            return self._encode_leaf(0, name, activation, width)
+        channels = self._network.convolutions
+        features = [
+            self._encode_leaf(k, f"{name}.leaves.{k}", activation, width)
+            for k in range(len(self._leaves))
+        ]
+        together = sum(n_features(leaf, channels, width) for _, leaf in self._leaves)
+        joined = self._append("Concat", *features, axis=1)
+        return self._append(activation, self._layer(f"{name}.joined", joined, together, width))
+
+    def _encode_leaf(self, number: int, name: str, activation: str, width: int) -> str:
+        (observation, leaf), (first, *_) = self._leaves[number], self._shapes[number]
+        match leaf:
             case Image():
-                return self._convolutions(f"{name}.layers", activation)
+                return self._convolutions(observation, first, f"{name}.layers", activation)
             case Category(n=n):
-                features = self._embedding(name, n, width)
+                features = self._embedding(observation, name, (n,), width)
+            case Categories(ns=ns):
+                features = self._embedding(observation, name, ns, width)
+            case Bits():
+                numbers = self._append("Cast", observation, to=TensorProto.FLOAT)
+                features = self._layer(f"{name}.layer", numbers, first, width)
             case _:
-                features = self._layer(f"{name}.layer", "observation", self._shape[0], width)
+                features = self._layer(f"{name}.layer", observation, first, width)
         return self._append(activation, features)
 
-    def _embedding(self, name: str, n: int, width: int) -> str:
-        length = self._shape[0]
-        table = self._weight(f"{name}.embedding.weight", length * n, width)
-        first = self._constant(np.arange(length, dtype=np.int32) * n)
-        vectors = self._append("Gather", table, self._append("Add", "observation", first))
+    def _embedding(self, observation: str, name: str, ns: tuple[int, ...], width: int) -> str:
+        sizes = np.array(ns * self._network.frame_stack, np.int32)
+        table = self._weight(f"{name}.embedding.weight", int(sizes.sum()), width)
+        first = self._constant(np.cumsum(sizes, dtype=np.int32) - sizes)
+        vectors = self._append("Gather", table, self._append("Add", observation, first))
         features = self._append("ReduceSum", vectors, self._constant(np.array([1])), keepdims=0)
         return self._append("Add", features, self._weight(f"{name}.bias", width))
 
-    def _convolutions(self, name: str, activation: str) -> str:
-        features = self._append("Cast", "observation", to=TensorProto.FLOAT)
+    def _convolutions(self, observation: str, n_channels: int, name: str, activation: str) -> str:
+        features = self._append("Cast", observation, to=TensorProto.FLOAT)
         features = self._append("Mul", features, self._number(1 / 255))
-        channels = pairwise((self._shape[0], *self._network.convolutions))
+        channels = pairwise((n_channels, *self._network.convolutions))
         for k, (n_in, n_out) in enumerate(channels):
             weight = self._weight(f"{name}.{k}.weight", n_out, n_in, FILTER, FILTER)
             bias = self._weight(f"{name}.{k}.bias", n_out)

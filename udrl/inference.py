@@ -10,7 +10,8 @@ import onnxruntime
 
 from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes, with_weights
-from udrl.spaces import Observations, noise
+from udrl.memory import Seen
+from udrl.spaces import noise
 from udrl.streams import Purpose, Stream, stream_key
 
 #: Of what can be observed, by ONNX Runtime's names.
@@ -28,12 +29,12 @@ class Call(Protocol):
     """The rows of one call: fill in the inputs, run, read the logits; again and again.
 
     Attributes:
-        observation: as the networks see it (:mod:`udrl.memory`), [n, *shape].
+        seen: observations as the networks see them (:mod:`udrl.memory`), [n, *shape] each.
         command: desired return and desired horizon, float64 [n, 2].
         logits: float32 [n, n_parameters], what the last run returned.
     """
 
-    observation: Observations
+    seen: Seen
     command: Commands
     logits: Logits
 
@@ -83,11 +84,15 @@ class ActingFunction:
             self._calls[n] = rows(self._session, n)
         return self._calls[n]
 
-    def logits(self, observation: Observations, command: Commands) -> Logits:
+    def logits(self, seen: Seen, command: Commands) -> Logits:
         """Return the logits of rows, float32 [n, n_parameters]; for any thread."""
+        names = [one.name for one in self._session.get_inputs()]
         rows = [
-            self._session.run(None, {"observation": s[None], "command": c[None]})[0]
-            for s, c in zip(observation, command, strict=True)
+            self._session.run(
+                None,
+                {n: a[k : k + 1] for n, a in zip(names, (*seen, command), strict=True)},
+            )[0]
+            for k in range(len(command))
         ]
         return np.concatenate(rows)
 
@@ -96,15 +101,15 @@ class _Together:
     """All rows in one run of the session, with inputs and output bound to arrays."""
 
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
-        observation, command = session.get_inputs()
+        *observed, command = session.get_inputs()
         (logits,) = session.get_outputs()
-        seen = _DTYPES[observation.type]
-        self.observation: Observations = np.zeros((n, *observation.shape[1:]), seen)
+        self.seen: Seen = tuple(np.zeros((n, *o.shape[1:]), _DTYPES[o.type]) for o in observed)
         self.command = np.zeros((n, *command.shape[1:]))
         self.logits = np.zeros((n, *logits.shape[1:]), np.float32)
         self._session = session
         self._binding = session.io_binding()
-        self._binding.bind_cpu_input("observation", self.observation)
+        for one, array in zip(observed, self.seen, strict=True):
+            self._binding.bind_cpu_input(one.name, array)
         self._binding.bind_cpu_input("command", self.command)
         self._binding.bind_output(
             "logits", "cpu", 0, np.float32, self.logits.shape, self.logits.ctypes.data
@@ -119,14 +124,16 @@ class _OneByOne:
 
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
         self._one = one = _Together(session, 1)
-        self.observation: Observations = one.observation.repeat(n, axis=0)
+        self.seen: Seen = tuple(array.repeat(n, axis=0) for array in one.seen)
         self.command = one.command.repeat(n, axis=0)
         self.logits = one.logits.repeat(n, axis=0)
 
     def run(self) -> None:
         one = self._one
         for row in range(len(self.logits)):
-            one.observation[0], one.command[0] = self.observation[row], self.command[row]
+            for mine, theirs in zip(one.seen, self.seen, strict=True):
+                mine[0] = theirs[row]
+            one.command[0] = self.command[row]
             one.run()
             self.logits[row] = one.logits[0]
 
@@ -136,9 +143,11 @@ def is_exact_together(graph: bytes, n: int) -> bool:
     """Say whether a call of ``n`` rows gives each the bits that a call for it alone gives."""
     function = _probe(graph)
     rows = _Together(function._session, n)
-    rows.observation[:], rows.command[:] = probe_rows(function, n)
+    seen, rows.command[:] = probe_rows(function, n)
+    for mine, probed in zip(rows.seen, seen, strict=True):
+        mine[:] = probed
     rows.run()
-    return np.array_equal(rows.logits, function.logits(rows.observation, rows.command))
+    return np.array_equal(rows.logits, function.logits(rows.seen, rows.command))
 
 
 @functools.lru_cache(maxsize=1)
@@ -160,11 +169,11 @@ def probe_weights(graph: bytes) -> Weights:
     return weights
 
 
-def probe_rows(function: ActingFunction, n: int) -> tuple[Observations, Commands]:
+def probe_rows(function: ActingFunction, n: int) -> tuple[Seen, Commands]:
     """Return observations of noise, and commands in [-100, 100)."""
-    like = function.call(1).observation
     stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
-    seen = noise(stream, like.dtype, (n, *like.shape[1:]))
+    like = function.call(1).seen
+    seen = tuple(noise(stream, one.dtype, (n, *one.shape[1:])) for one in like)
     command = stream.uniforms(2 * n).reshape(n, 2) * 200 - 100
     return seen, command
 
@@ -182,9 +191,9 @@ def _session(model: bytes) -> onnxruntime.InferenceSession:
             f"and onnxruntime that the run was created with"
         ) from error
     names = [[one.name for one in ends] for ends in (session.get_inputs(), session.get_outputs())]
-    if names != [["observation", "command"], ["logits"]]:
+    if names[0][-1:] != ["command"] or names[1] != ["logits"]:
         raise InvalidWeights(
-            f"acting graph: from {names[0]} to {names[1]}, expected from observation and command "
+            f"acting graph: from {names[0]} to {names[1]}, expected from observations and command "
             f"to logits; the run was created by another version of udrl"
         )
     return session

@@ -6,6 +6,7 @@ round alike: they do when their *numerics class*, the digest of a fixed probe, i
 """
 
 import ctypes
+import math
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,9 @@ def acting_class(graph: bytes, space: ActionSpace) -> str:
     """
     function = ActingFunction(graph, probe_weights(graph))
     logits = function.logits(*probe_rows(function, PROBE_ROWS))
-    numbers = Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(PROBE_CHOICES)
+    shape = (PROBE_CHOICES, *space.shape)
+    stream = Stream(stream_key(0, Purpose.PROBE, 3, 0))
+    numbers = stream.uniforms(math.prod(shape)).reshape(shape)
     rows = logits[np.arange(PROBE_CHOICES) % PROBE_ROWS].astype(np.float64)
     actions = space.sample(rows, np.ones((PROBE_CHOICES, 1)), numbers).astype(space.dtype)
     return arrays_digest({"actions": actions, "logits": logits}).hex()[:16]

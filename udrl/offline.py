@@ -16,7 +16,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from udrl.config import Config, change
 from udrl.digests import episode_digest, replay_digest
-from udrl.environments.conversions import Conversion, action_conversion, observation_conversion
+from udrl.environments.action_conversions import action_conversion
+from udrl.environments.conversions import Conversion, observation_conversion
 from udrl.environments.making import EnvironmentSpec, make_environment
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
@@ -49,7 +50,7 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
     minari = _minari()
     try:
         dataset = minari.load_dataset(name)
-        reader = _Reader(name, dataset, spec)
+        reader = _Reader(name, dataset, config, spec)
         episodes = [reader.episode(i, data) for i, data in enumerate(dataset)]
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
@@ -89,16 +90,18 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
 class _Reader:
     """Makes episodes of a dataset's, whose spaces become plain as an environment's do."""
 
-    def __init__(self, name: str, dataset: Any, spec: EnvironmentSpec) -> None:
+    def __init__(self, name: str, dataset: Any, config: Config, spec: EnvironmentSpec) -> None:
         self._name = name
         self._spec = spec
         seen, done = dataset.observation_space, dataset.action_space
-        observations, actions = observation_conversion(seen), action_conversion(done)
-        if (
-            observations is None
-            or actions is None
-            or (observations.plain, actions.plain) != (spec.observation_space, spec.action_space)
-        ):
+        try:
+            observations = observation_conversion(seen)
+            actions = action_conversion(done, config.actions)
+        except UnsupportedEnvironment as error:
+            raise ConfigError(
+                f"dataset {name!r}: {error}; name a dataset of the run's environment"
+            ) from error
+        if (observations.plain, actions.plain) != (spec.observation_space, spec.action_space):
             raise ConfigError(
                 f"dataset {name!r} has observations {seen} and actions {done}, the run's "
                 f"environment has {spec.observation_space} and {spec.action_space}; name a "
@@ -108,12 +111,13 @@ class _Reader:
 
     def episode(self, number: int, data: Any) -> Episode:
         rewards = np.asarray(data.rewards, np.float32)
-        terminated = bool(data.terminations[-1])
+        n, terminated = len(rewards), bool(data.terminations[-1])
         try:
             episode = Episode(
                 command_id=number,
-                observations=self._observations.all(data.observations[: len(rewards)]),
-                actions=self._actions.all(data.actions),
+                # One more than steps: nothing was done after the last.
+                observations=self._observations.convert(data.observations, (n + 1,))[:-1],
+                actions=self._actions.convert(data.actions, (n,)),
                 rewards=rewards,
                 terminated=terminated,
                 truncated=not terminated,
@@ -163,10 +167,10 @@ def write_dataset(
     buffers = [
         EpisodeBuffer(
             id=number,
-            observations=list(
+            observations=_lists(
                 form.observations.back(np.concatenate([e.observations, e.observations[-1:]]))
             ),
-            actions=list(form.actions.back(e.actions)),
+            actions=_lists(form.actions.back(e.actions)),
             rewards=list(e.rewards),
             terminations=[False] * (e.length - 1) + [e.terminated],
             truncations=[False] * (e.length - 1) + [e.truncated],
@@ -193,6 +197,13 @@ def write_dataset(
         ) from error
 
 
+def _lists(arrays: Any) -> Any:
+    """Return arrays, in whatever dictionaries and tuples, as lists of their rows."""
+    if isinstance(arrays, dict):
+        return {key: _lists(inner) for key, inner in arrays.items()}
+    return tuple(map(_lists, arrays)) if isinstance(arrays, tuple) else list(arrays)
+
+
 class _Form(NamedTuple):
     """How episodes are written: as what, and of which environment, if one can be named."""
 
@@ -211,13 +222,11 @@ def _form(config: Config, spec: EnvironmentSpec) -> _Form:
         env.close()
         if (observations.plain, actions.plain) == (spec.observation_space, spec.action_space):
             return _Form(observations, actions, named if _can_be_written(named) else None)
-    observations_, actions_ = (
+    return _Form(
         observation_conversion(spec.observation_space.gymnasium),
-        action_conversion(spec.action_space.gymnasium),
+        action_conversion(spec.action_space.gymnasium, config.actions),
+        None,
     )
-    assert observations_ is not None
-    assert actions_ is not None
-    return _Form(observations_, actions_, None)
 
 
 def _can_be_written(spec: EnvSpec | None) -> bool:

@@ -9,10 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.config import Config
+from udrl.environments.conversions import describe, nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 from udrl.inference import ActingFunction
 from udrl.memory import FrameStack
+from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
 
 class Policy:
@@ -45,8 +47,7 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        self._memory = memory = FrameStack(spec.observation_space, config.network.frame_stack)
-        self.observation_shape = memory.shape if memory.length > 1 else spec.observation_space.shape
+        self._memory = FrameStack(spec.observation_space, config.network.frame_stack)
         self._rng = rng or np.random.default_rng()
 
     def make_environment(self, **kwargs: Any) -> Environment:
@@ -59,9 +60,11 @@ class Policy:
             UnsupportedEnvironment: it cannot be made here.
         """
         known = self.config.environment_kwargs
-        env = make_environment(
+        env: Environment = make_environment(
             msgspec.structs.replace(self.config, environment_kwargs=known | kwargs)
         )
+        if isinstance(self.spec.observation_space, Record):
+            env = gym.wrappers.TransformObservation(env, self._unpacked, env.observation_space)
         if self.config.network.frame_stack == 1:
             return env
         return gym.wrappers.FrameStackObservation(env, self.config.network.frame_stack)
@@ -72,9 +75,9 @@ class Policy:
         """Return the logits of P(a | s, c).
 
         Args:
-            observation: what the environment shows. With a ``frame_stack`` of more than 1 the most
-                recent ones, the newest last, as ``gymnasium.wrappers.FrameStackObservation`` stacks
-                them.
+            observation: what the environment shows; of a record a structured array will do too.
+                With a ``frame_stack`` of more than 1 the most recent ones, the newest last, as
+                ``gymnasium.wrappers.FrameStackObservation`` stacks them.
             desired_return: what is still to be obtained.
             desired_horizon: in how many steps; less than 1 counts as 1. It is not read where the
                 horizon follows from the return (``desired_horizon = "return"``).
@@ -86,23 +89,38 @@ class Policy:
             InvalidData: the observation has another shape than those it was trained on, or
                 something is not finite, or the temperature less than 0.
         """
-        seen = np.asarray(observation)
-        space, n = self.spec.observation_space, self.config.network.frame_stack
-        if seen.shape not in (self.observation_shape, (n, *space.shape)):
-            raise InvalidData(
-                f"an observation of shape {seen.shape}: expected {self.observation_shape}; show "
-                f"the policy what it was trained on ({self.config.environment})"
-            )
         desired = np.array([[desired_return, desired_horizon]], np.float64)
-        if not (np.isfinite(desired).all() and np.isfinite(seen).all()):
+        if not np.isfinite(desired).all():
             raise InvalidData(
-                f"desired return {desired_return}, desired horizon {desired_horizon}: these and "
-                f"the observation must be finite numbers"
+                f"desired return {desired_return}, desired horizon {desired_horizon}: expected "
+                f"finite numbers"
             )
-        stacks = self._memory.join(seen.reshape(1, n, *space.shape))
-        row = self.behavior.logits(stacks.astype(space.dtype), desired)[0]
+        seen = self._memory.join(self._plain(observation)[None])
+        row = self.behavior.logits(seen, desired)[0]
         logits: npt.NDArray[np.float64] = row.astype(np.float64)
         return logits
+
+    def _unpacked(self, record: Observations) -> Any:
+        """Return the leaves of a record in dictionaries and tuples, as its environment has them."""
+        return nested(self.spec.observation_space.gymnasium, iter(parts_of(record)))
+
+    def _plain(self, observation: Any) -> Observations:
+        """Return what the environment showed as an array, [frame_stack, *observation_shape]."""
+        space, n = self.spec.observation_space, self._memory.length
+        plain: Observations = np.empty((n, *space.shape), space.dtype)
+        parts = zip(leaves_of(space), parts_of(plain), self._memory.shapes, strict=True)
+        for leaf, part, joined in parts:
+            seen = np.asarray(_find(leaf, observation))
+            expected = part.shape[1:] if n == 1 else joined
+            if seen.shape not in (expected, part.shape):
+                raise InvalidData(
+                    f"an observation{leaf.name} of shape {seen.shape}: expected {expected}; show "
+                    f"the policy what it was trained on ({self.config.environment})"
+                )
+            if not np.isfinite(seen).all():
+                raise InvalidData(f"observation{leaf.name}: {seen}; expected finite numbers")
+            part[:] = seen.reshape(part.shape)
+        return plain
 
     def probabilities(
         self,
@@ -111,7 +129,7 @@ class Policy:
         desired_horizon: float,
         temperature: float = 1.0,
     ) -> npt.NDArray[np.float64]:
-        """Return P(a | s, c), float64 [n]; arguments and errors as of :meth:`logits`.
+        """Return P(a | s, c), float64 [n_parameters]; arguments and errors as of :meth:`logits`.
 
         Args:
             observation: see :meth:`logits`.
@@ -131,7 +149,7 @@ class Policy:
         *,
         temperature: float = 1.0,
         deterministic: bool = False,
-    ) -> int:
+    ) -> Any:
         """Return an action of P(a | s, c); arguments and errors as of :meth:`logits`.
 
         Who acts counts down: after a reward r ask for ``desired_return - r`` within
@@ -146,9 +164,22 @@ class Policy:
         """
         _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
-        return self.spec.action_space.choose(
-            logits, 0.0 if deterministic else temperature, self._rng.random()
-        )
+        space = self.spec.action_space
+        uniform: Any = self._rng.random(space.shape)
+        return space.choose(logits, 0.0 if deterministic else temperature, uniform)
+
+
+def _find(leaf: Leaf, observation: Any) -> Any:
+    """Return a leaf of what an environment shows, plain or its own."""
+    try:
+        if isinstance(observation, np.ndarray | np.void) and observation.dtype.names:
+            return observation[leaf.name]
+        return leaf.find(observation)
+    except (LookupError, ValueError) as error:
+        raise InvalidData(
+            f"observation{leaf.name} is missing in {describe(observation)}; show the policy what "
+            f"it was trained on"
+        ) from error
 
 
 def _check(temperature: float) -> None:

@@ -1,12 +1,14 @@
 """The steps of running episodes, in rings that grow with the longest of them."""
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from udrl.commands import Command
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.memory import FrameStack
+from udrl.memory import FrameStack, Seen
 from udrl.spaces import Observations
 from udrl.streams import Stream
 
@@ -39,7 +41,7 @@ class Recording:
             "observations": np.zeros((*shape, *seen.shape), seen.dtype),
             "actions": np.zeros((*shape, *acted.shape), acted.dtype),
             "rewards": np.zeros(shape, np.float32),
-            "uniforms": np.zeros(shape),
+            "uniforms": np.zeros((*shape, *acted.shape)),
         }
         self._commands: dict[int, Command] = {}
 
@@ -50,7 +52,11 @@ class Recording:
         self._lay_out(row, command)
 
     def begin_round(self, observation: Observations) -> npt.NDArray[np.float64]:
-        """Keep what is observed, [n, *observation_shape]; return what decides, float64 [n]."""
+        """Keep what is observed, [n, *observation_shape].
+
+        Returns:
+            The numbers that decide, float64 [n, *action_shape].
+        """
         self._make_room()
         at = self.round % self._capacity
         self._rings["observations"][at] = observation
@@ -64,8 +70,8 @@ class Recording:
         self._rings["rewards"][at] = rewards
         self.round += 1
 
-    def stacks(self, memory: FrameStack) -> Observations:
-        """Return what the networks see in this round, [n, *memory.shape]."""
+    def stacks(self, memory: FrameStack) -> Seen:
+        """Return what the networks see in this round, [n, *shape] of each leaf."""
         rounds = (self.began[:, None] + memory.times(self.round - self.began)) % self._capacity
         rows = np.arange(len(self.began))[:, None]
         return memory.join(self._rings["observations"][rounds, rows])
@@ -87,11 +93,13 @@ class Recording:
         return np.arange(first, first + count) % self._capacity
 
     def _lay_out(self, row: int, command: Command) -> None:
-        numbers = Stream(command.stream_key).uniforms(self._capacity)
+        ring = self._rings["uniforms"]
+        shape = (self._capacity, *ring.shape[2:])
+        numbers = Stream(command.stream_key).uniforms(math.prod(shape)).reshape(shape)
         if command.random_steps and command.random_hold > 1:
             numbers = numbers[command.decisive(np.arange(self._capacity))]
         places = self._places(int(self.began[row]), self._capacity)
-        self._rings["uniforms"][places, row] = numbers
+        ring[places, row] = numbers
 
     def _make_room(self) -> None:
         """Make the ring twice as long if an episode would overwrite its own beginning."""

@@ -77,7 +77,7 @@ def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> s
         for t in range(episode.length):
             if not np.array_equal(observation, episode.observations[t]):
                 return f"step {t} shows another observation"
-            observation, reward, terminated, truncated, _ = env.step(int(episode.actions[t]))
+            observation, reward, terminated, truncated, _ = env.step(episode.actions[t])
             if np.float32(reward) != episode.rewards[t]:
                 return f"step {t} gives the reward {reward:g}, it gave {episode.rewards[t]:g}"
             ends = t == episode.length - 1

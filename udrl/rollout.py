@@ -39,7 +39,7 @@ class Rollout:
         episode_return: obtained so far, a sequential sum in float64.
         terminated: the environment reached a terminal state.
         truncated: a time limit ended the episode.
-        action: the last one; None before the first.
+        action: the last one, an index or one for each component; None before the first.
 
     Raises:
         EnvironmentFault: the environment raised an exception.
@@ -51,12 +51,12 @@ class Rollout:
         self.steps = 0
         self.episode_return = 0.0
         self.terminated = self.truncated = False
-        self.action: int | None = None
+        self.action: int | list[int] | None = None
         self._policy = policy
         self._env = env
         self._target = ReturnInTime(policy.config.network)
         self._cap = np.array([math.inf if command.cap is None else command.cap])
-        self._numbers = np.empty(0)
+        self._numbers = np.empty((0, *policy.spec.action_space.shape))
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.network.frame_stack
@@ -70,7 +70,7 @@ class Rollout:
 
     @property
     def probabilities(self) -> npt.NDArray[np.float64]:
-        """P(a | s_t, c_t), float64 [n]: what the next action is sampled from."""
+        """P(a | s_t, c_t), float64 [n_parameters]: what the next action is sampled from."""
         return self._policy.spec.action_space.probabilities(self._logits(), self.temperature)
 
     def tell(self, desired_return: float, desired_horizon: int) -> None:
@@ -99,10 +99,10 @@ class Rollout:
         assert not self.over
         space, uniform = self._policy.spec.action_space, self._uniform()
         if self.command.is_random(self.steps):
-            action = int(space.uniform(np.array([uniform]))[0])
+            action: Any = space.uniform(uniform[None])[0]
         else:
             action = space.choose(self._logits(), self.temperature, uniform)
-        self.action = action
+        self.action = action = np.asarray(action).tolist()
         observation, reward, self.terminated, self.truncated, _ = self._carefully(
             "step", lambda: self._env.step(action)
         )
@@ -135,14 +135,14 @@ class Rollout:
             )
         return picture
 
-    def _uniform(self) -> float:
-        """Return the number that decides this step's action."""
+    def _uniform(self) -> Any:
+        """Return the number, or numbers, that decide this step's action, float64."""
         t = self.steps
         if t == len(self._numbers):
-            longer = t + _AT_A_TIME
-            numbers = Stream(self.command.stream_key).uniforms(longer)
-            self._numbers = numbers[self.command.decisive(np.arange(longer))]
-        return float(self._numbers[t])
+            longer = (t + _AT_A_TIME, *self._numbers.shape[1:])
+            numbers = Stream(self.command.stream_key).uniforms(math.prod(longer)).reshape(longer)
+            self._numbers = numbers[self.command.decisive(np.arange(len(numbers)))]
+        return self._numbers[t]
 
     def _logits(self) -> npt.NDArray[np.float64]:
         return self._policy.logits(

@@ -89,7 +89,7 @@ class Rows:
 
         Args:
             rows: which.
-            actions: of all rows, [n]; those of the others are not looked at.
+            actions: of all rows, [n, *action_shape]; those of the others are not looked at.
         """
         observation, reward, envs = self.observation, self.reward, self._envs
         over: list[tuple[int, bool, bool]] = []

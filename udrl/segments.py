@@ -16,8 +16,8 @@ from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
-from udrl.memory import FrameStack
-from udrl.spaces import Observations
+from udrl.memory import FrameStack, Seen
+from udrl.spaces import parts_of
 from udrl.targets import Desired, ReturnInTime
 
 _PAGE = 64
@@ -41,13 +41,13 @@ class Examples(NamedTuple):
     """Inputs and targets of the behavior function, one per row.
 
     Attributes:
-        observation: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape].
+        seen: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape] of each leaf.
         command: what the segment returned, or its label (:meth:`RankedExperience.label`), and in
             how many steps, float64 [n, 2].
         action: a_t1, elements of the action space.
     """
 
-    observation: Observations
+    seen: Seen
     command: Desired
     action: Actions
 
@@ -178,8 +178,9 @@ class RankedExperience:
             :meth:`steps`, float64 [steps]; None: what was obtained.
         expected: (V, D) at every step, in the same order, scaled, float32 [steps, 2]
             (:mod:`udrl.value`); None: unknown.
-        observation_shape: of one, as the networks see it.
-        observation_dtype: likewise.
+        shapes: of observations as the networks see them, for each leaf.
+        dtypes: likewise.
+        action_shape: of one action.
     """
 
     def __init__(self, experience: Experience, slots: Indices) -> None:
@@ -187,8 +188,9 @@ class RankedExperience:
         self._slots = slots
         self.labels: Numbers | None = None
         self.expected: npt.NDArray[np.float32] | None = None
-        self.observation_shape = experience._memory.shape
-        self.observation_dtype: np.dtype[Any] = experience._observations.dtype
+        self.shapes = experience._memory.shapes
+        self.dtypes = tuple(part.dtype for part in parts_of(experience._observations))
+        self.action_shape = experience._actions.shape[1:]
         self.lengths: Indices = experience._lengths[slots]
         self._first_step: Indices = np.cumsum(self.lengths) - self.lengths
 
@@ -218,7 +220,7 @@ class RankedExperience:
         steps: Indices = self._first_step[segments.rank] + segments.t1
         return steps
 
-    def steps(self, at_once: int = 4096) -> Iterator[tuple[Observations, Array]]:
+    def steps(self, at_once: int = 4096) -> Iterator[tuple[Seen, Array]]:
         """Yield what the network sees at every step, and the action, episode by episode."""
         slot, t = self._all_steps()
         actions = self._experience._actions
@@ -258,7 +260,7 @@ class RankedExperience:
         rank = np.repeat(np.arange(len(self.lengths)), self.lengths)
         return self._slots[rank], np.arange(len(rank)) - self._first_step[rank]
 
-    def _observed(self, slot: Indices, t: Indices) -> Observations:
+    def _observed(self, slot: Indices, t: Indices) -> Seen:
         """Return what the network sees at times t: single observations, or stacks of them."""
         held = self._experience
         memory = held._memory

@@ -72,6 +72,21 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     baseline: Literal["none", "value", "action_value"] = "none"
 
 
+class ActionSettings(SettingsGroup, frozen=True, kw_only=True):
+    """How the numbers of ``Box`` actions are chosen (:mod:`udrl.environments.action_conversions`).
+
+    Attributes:
+        action_bins: values that each dimension can take, evenly from the lowest to the highest;
+            None: as many as suit the number of dimensions.
+        action_low: the lowest value of dimensions for which the environment declares none.
+        action_high: the highest, likewise.
+    """
+
+    action_bins: Annotated[int, Meta(ge=2, le=1000)] | None = None
+    action_low: float | None = None
+    action_high: float | None = None
+
+
 class BufferSettings(SettingsGroup, frozen=True, kw_only=True):
     """Which episodes the replay buffer holds (section 2.3.1).
 

@@ -1,9 +1,11 @@
-"""What observations are to the algorithm: plain arrays of a few kinds.
+"""What observations are to the algorithm: plain arrays of a few kinds, and records of them.
 
-What is stored and sent is compact: an index stays an index, a frame a frame. An encoder
-(:mod:`udrl.encoders`, :mod:`udrl.graph`) makes features of each kind.
+What is stored and sent is compact: an index stays an index, a bit a byte, a frame a frame. An
+encoder (:mod:`udrl.encoders`, :mod:`udrl.graph`) makes features of each kind. The elements of a
+record are one structured array, so that whoever only keeps or passes on observations need not know.
 """
 
+import functools
 import math
 from typing import Annotated, Any
 
@@ -15,11 +17,16 @@ from msgspec import Meta
 
 from udrl.streams import Stream
 
-#: float32 of vectors, uint8 of images, int32 of categories.
-Observations = npt.NDArray[np.float32] | npt.NDArray[np.uint8] | npt.NDArray[np.int32]
+#: float32 of vectors, uint8 of images and bits, int32 of categories; structured of records.
+Observations = npt.NDArray[Any]
 
 #: Each has a vector of its own in the network.
 MOST_CATEGORIES = 2**20
+#: Leaves of a record, at most.
+MOST_LEAVES = 256
+
+#: Of a dictionary, or a place in a tuple.
+Key = Annotated[str, Meta(max_length=200)] | Annotated[int, Meta(ge=0, le=MOST_LEAVES)]
 
 Size = Annotated[int, Meta(ge=1, le=2**20)]
 
@@ -59,7 +66,7 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="
 
 
 class Indices(Space, frozen=True):
-    """The whole numbers from 0 on, below ``n``."""
+    """The integers from 0 on, below ``n``."""
 
     n: Annotated[int, Meta(ge=1, le=2**31 - 1)]
 
@@ -80,6 +87,28 @@ class Indices(Space, frozen=True):
         if least >= 0 and greatest < self.n:
             return None
         return f"from {least} to {greatest}, expected 0 to {self.n - 1}"
+
+
+class IndexVectors(Space, frozen=True):
+    """Vectors of integers from 0 on, component i below ``ns[i]``."""
+
+    ns: Annotated[tuple[Annotated[int, Meta(ge=1, le=2**20)], ...], Meta(min_length=1)]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[components]."""
+        return (len(self.ns),)
+
+    @property
+    def gymnasium(self) -> spaces.Space[Any]:
+        """``MultiDiscrete``."""
+        return spaces.MultiDiscrete(np.array(self.ns))
+
+    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+        for k, n in enumerate(self.ns):
+            if found := Indices(n)._impossible(values[:, k]):
+                return f"{found} in component {k}"
+        return None
 
 
 class Vector(Space, frozen=True, tag="vector"):
@@ -104,6 +133,30 @@ class Vector(Space, frozen=True, tag="vector"):
 
     def _impossible(self, values: npt.NDArray[Any]) -> str | None:
         return None if np.isfinite(values).all() else "not all finite numbers"
+
+
+class Bits(Space, frozen=True, tag="bits"):
+    """Zeros and ones, uint8 [size]."""
+
+    size: Size
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[size]."""
+        return (self.size,)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """uint8."""
+        return np.dtype(np.uint8)
+
+    @property
+    def gymnasium(self) -> spaces.Space[Any]:
+        """``MultiBinary``."""
+        return spaces.MultiBinary(self.size)
+
+    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+        return None if (values <= 1).all() else "not all 0 or 1"
 
 
 class Image(Space, frozen=True, tag="image"):
@@ -140,22 +193,118 @@ class Category(Indices, frozen=True, tag="category"):
         return np.dtype(np.int32)
 
 
-ObservationSpace = Vector | Image | Category
+class Categories(IndexVectors, frozen=True, tag="categories"):
+    """Several of these at once, int32 [components]."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """int32."""
+        return np.dtype(np.int32)
 
 
-def observation_space(space: spaces.Space[Any]) -> ObservationSpace:
-    """Return what the algorithm calls an environment's observations, once they are plain."""
-    if isinstance(space, spaces.Discrete):
-        return Category(n=int(space.n))
-    assert isinstance(space, spaces.Box)
-    if len(space.shape) == 1:
-        return Vector(size=space.shape[0])
-    channels, height, width = space.shape
-    return Image(channels=channels, height=height, width=width)
+#: What is encoded by itself.
+LeafSpace = Vector | Bits | Image | Category | Categories
 
 
-def noise(stream: Stream, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Observations:
-    """Return observations made of the next numbers of a stream.
+class Leaf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A part of a record.
+
+    Attributes:
+        path: keys of dictionaries and indices of tuples on the way to it, from the outside.
+        space: what it is.
+    """
+
+    path: Annotated[tuple[Key, ...], Meta(max_length=16)]
+    space: LeafSpace
+
+    @property
+    def name(self) -> str:
+        """How Python finds it in what the environment shows, e.g. ``['inventory'][2]``."""
+        return "".join(f"[{key!r}]" for key in self.path)
+
+    def find(self, observation: Any) -> Any:
+        """Return it in what the environment shows.
+
+        Raises:
+            LookupError: it is not there.
+        """
+        for key in self.path:
+            try:
+                observation = observation[key]
+            except (TypeError, ValueError) as error:  # of what has no such keys
+                raise LookupError(key) from error
+        return observation
+
+
+class Record(Space, frozen=True, tag="record"):
+    """Several observations at once: what Gymnasium calls ``Dict`` and ``Tuple``, however deep.
+
+    An element is a structure of its leaves, one after another without padding.
+    """
+
+    leaves: Annotated[tuple[Leaf, ...], Meta(min_length=1, max_length=MOST_LEAVES)]
+
+    def __post_init__(self) -> None:
+        if len({leaf.name for leaf in self.leaves}) < len(self.leaves):
+            raise ValueError("two leaves have the same name")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """[]."""
+        return ()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """A field for each leaf, of its name, dtype and shape."""
+        return _structure(self.leaves)
+
+    @property
+    def gymnasium(self) -> spaces.Space[Any]:
+        """Dictionaries and tuples with the leaves where they were."""
+        return _nested([(leaf.path, leaf.space.gymnasium) for leaf in self.leaves])
+
+    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+        for leaf in self.leaves:
+            if found := leaf.space._impossible(values[leaf.name]):
+                return f"{found} in {leaf.name}"
+        return None
+
+
+@functools.lru_cache
+def _structure(leaves: tuple[Leaf, ...]) -> np.dtype[Any]:
+    return np.dtype([(leaf.name, leaf.space.dtype, leaf.space.shape) for leaf in leaves])
+
+
+def _nested(leaves: list[tuple[tuple[Key, ...], spaces.Space[Any]]]) -> spaces.Space[Any]:
+    """Return the space in which some spaces have these paths."""
+    if len(leaves) == 1 and not leaves[0][0]:
+        return leaves[0][1]
+    inner: dict[Key, list[tuple[tuple[Key, ...], spaces.Space[Any]]]] = {}
+    for (key, *path), space in leaves:
+        inner.setdefault(key, []).append((tuple(path), space))
+    parts = [(key, _nested(below)) for key, below in inner.items()]
+    if all(isinstance(key, int) for key in inner):
+        return spaces.Tuple([space for _, space in parts])
+    return spaces.Dict([(str(key), space) for key, space in parts])
+
+
+ObservationSpace = LeafSpace | Record
+
+
+def leaves_of(space: ObservationSpace) -> tuple[Leaf, ...]:
+    """Return the leaves of a record; of any other space itself, with an empty name."""
+    return space.leaves if isinstance(space, Record) else (Leaf((), space),)
+
+
+def parts_of(values: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], ...]:
+    """Return views of elements' leaves, [..., *leaf_shape] each."""
+    if values.dtype.names is None:
+        return (values,)
+    return tuple(values[name] for name in values.dtype.names)
+
+
+def noise(stream: Stream, dtype: np.dtype[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """Return observations of a leaf made of the next numbers of a stream.
 
     float32 in [-2, 2), bytes, or index 0, which every category has.
     """

@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -165,8 +166,8 @@ def _update(
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
     step = _Stepper(state)
-    for observation, command, action in batches.gather(segments):
-        loss = state.behavior.loss(state.behavior.obey(observation, command), action)
+    for seen, command, action in batches.gather(segments):
+        loss = state.behavior.loss(state.behavior.obey(seen, command), action)
         step(loss)
         losses += loss.detach()
     return float(losses)
@@ -190,11 +191,11 @@ def _learn_value(
     experience.expected = None
     experience.label(_at_all_steps(value, experience, device)[:, 0] / scale, lam)
     if state.critic is not None:
-        for observation, command, action in batches.gather(segments):
-            step((state.critic(observation, action) - command[:, 0]).square().mean())
+        for seen, command, action in batches.gather(segments):
+            step((state.critic(seen, action) - command[:, 0]).square().mean())
         experience.labels = _at_all_steps(state.critic, experience, device) / np.float64(scale)
-    for observation, command, _ in batches.gather(segments):
-        step(value_loss(value(observation), command[:, 0]))
+    for seen, command, _ in batches.gather(segments):
+        step(value_loss(value(seen), command[:, 0]))
     experience.expected = _at_all_steps(value, experience, device)
     if state.critic is None:
         experience.label(experience.expected[:, 0] / scale, lam)
@@ -206,15 +207,20 @@ def _at_all_steps(
     """Return what a network expects at every step of the buffer, float32 [steps, ...]."""
     parts = []
     with torch.inference_mode():
-        for observations, actions in experience.steps():
-            observed = torch.from_numpy(observations).clone().to(device)
+        for arrays, actions in experience.steps():
+            seen = tuple(_own(one).to(device) for one in arrays)
             if isinstance(network, Critic):
                 acted = torch.from_numpy(actions.astype(np.int64)).to(device)
-                parts.append(network(observed, acted).cpu().numpy())
+                parts.append(network(seen, acted).cpu().numpy())
             else:
-                parts.append(network(observed).cpu().numpy())
+                parts.append(network(seen).cpu().numpy())
     expected: npt.NDArray[np.float32] = np.concatenate(parts)
     return expected
+
+
+def _own(array: npt.NDArray[Any]) -> Tensor:
+    """Return an array as a tensor in torch's own memory; a leaf of a record has odd strides."""
+    return torch.from_numpy(np.ascontiguousarray(array)).clone()
 
 
 class _Stepper:
@@ -258,20 +264,18 @@ class _Batches:
     def __init__(self, config: Config, experience: RankedExperience) -> None:
         self._experience = experience
         training = config.training
-        shape, dtype = experience.observation_shape, experience.observation_dtype
-        bytes_each = training.batch_size * math.prod(shape) * dtype.itemsize
+        kinds = list(zip(experience.shapes, experience.dtypes, strict=True))
+        bytes_each = training.batch_size * sum(math.prod(s) * d.itemsize for s, d in kinds)
         self._at_once = max(1, min(training.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
         n = self._at_once, training.batch_size
-        self._tensors = (
-            torch.empty(*n, *shape, dtype=getattr(torch, dtype.name)),
-            torch.empty(*n, ReturnInTime.size),
-            torch.empty(n, dtype=torch.int64),
-        )
+        self._seen = [torch.empty(*n, *s, dtype=getattr(torch, d.name)) for s, d in kinds]
+        self._commands = torch.empty(*n, ReturnInTime.size)
+        self._actions = torch.empty(*n, *experience.action_shape, dtype=torch.int64)
         self._device = config.arithmetic.device
         self._scales = np.array(ReturnInTime(config.network).scales)
 
-    def gather(self, segments: Segments) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield observations, scaled commands and actions of each update, where the network is.
+    def gather(self, segments: Segments) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Tensor]]:
+        """Yield what is seen, scaled commands and actions of each update, where the network is.
 
         Commands are relative to what is expected, once that is known.
         """
@@ -279,15 +283,16 @@ class _Batches:
         for first in range(0, n_updates, self._at_once):
             part = Segments(*(s[first : first + self._at_once] for s in segments))
             n = len(part.rank)
-            observation, command, action = (t[:n].numpy() for t in self._tensors)
+            command, action = self._commands[:n].numpy(), self._actions[:n].numpy()
             flat = Segments(*(s.reshape(-1) for s in part))
             examples = self._experience.examples(flat)
-            observation[:] = examples.observation.reshape(observation.shape)
+            for gathered, one in zip(self._seen, examples.seen, strict=True):
+                gathered[:n].numpy()[:] = one.reshape(gathered[:n].shape)
             command[:] = (examples.command * self._scales).reshape(command.shape)
             if (expected := self._experience.expected_at(flat)) is not None:
-                commands = self._tensors[1][:n]
+                commands = self._commands[:n]
                 commands[:] = relative(commands, torch.from_numpy(expected).view(commands.shape))
             action[:] = examples.action.reshape(action.shape)
             for k in range(n):
-                observed, commanded, acted = (t[k].to(self._device) for t in self._tensors)
-                yield observed, commanded, acted
+                seen = tuple(one[k].to(self._device) for one in self._seen)
+                yield seen, self._commands[k].to(self._device), self._actions[k].to(self._device)

@@ -1,5 +1,7 @@
 """The numerics class of training: machines of one class make the same weights, bit for bit."""
 
+import math
+
 import msgspec
 import numpy as np
 
@@ -9,7 +11,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.repeating import PROBE_STEPS
 from udrl.segments import Experience
-from udrl.spaces import noise
+from udrl.spaces import noise, parts_of
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 
@@ -23,10 +25,15 @@ def training_class(config: Config, spec: EnvironmentSpec) -> str:
     stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
     length = min(PROBE_STEPS, spec.max_episode_steps)
     seen, acted = spec.observation_space, spec.action_space
+    observations = np.empty((length, *seen.shape), seen.dtype)
+    for part in parts_of(observations):
+        part[:] = noise(stream, part.dtype, part.shape)
+    shape = (length, *acted.shape)
+    numbers = stream.uniforms(math.prod(shape)).reshape(shape)
     episode = Episode(
         command_id=0,
-        observations=noise(stream, seen.dtype, (length, *seen.shape)),
-        actions=acted.uniform(stream.uniforms(length)).astype(acted.dtype),
+        observations=observations,
+        actions=acted.uniform(numbers).astype(acted.dtype),
         rewards=stream.uniforms(length).astype(np.float32),
         terminated=True,
         truncated=False,

@@ -20,6 +20,7 @@ function reads in training is (Q(s, a) - V(s)) / D(s).
 import torch
 from torch import Tensor, nn
 
+from udrl.action_losses import of_action
 from udrl.architecture import DEVIATIONS, LEAST_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
@@ -47,9 +48,9 @@ class _Expectation(nn.Module):
         )
         self.expected = fully_connected(VALUE_WIDTH, n)
 
-    def expect(self, observation: Tensor) -> Tensor:
-        """Return float32 [batch, n] for s, as the networks see it, [batch, *shape]."""
-        features = torch.tanh_(apply(self.hidden, self.encoder(observation)))
+    def expect(self, seen: tuple[Tensor, ...]) -> Tensor:
+        """Return float32 [batch, n] for s, as the networks see it, [batch, *shape] each."""
+        features = torch.tanh_(apply(self.hidden, self.encoder(*seen)))
         return apply(self.expected, features).float()
 
 
@@ -67,13 +68,13 @@ class ValueFunction(_Expectation):
     ) -> None:
         super().__init__(spec, network, precision, 2)
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def forward(self, seen: tuple[Tensor, ...]) -> Tensor:
         """Return (V(s), D(s)), float32 [batch, 2].
 
         Args:
-            observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
         """
-        value, d = self.expect(observation).unbind(1)
+        value, d = self.expect(seen).unbind(1)
         deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
         return torch.stack([value, deviation], dim=1)
 
@@ -91,15 +92,16 @@ class Critic(_Expectation):
         self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
     ) -> None:
         super().__init__(spec, network, precision, spec.action_space.n_parameters)
+        self._actions = spec.action_space
 
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+    def forward(self, seen: tuple[Tensor, ...], action: Tensor) -> Tensor:
         """Return Q(s, a), float32 [batch].
 
         Args:
-            observation: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape].
-            action: a, int64 [batch].
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
+            action: a, int64 [batch], or [batch, components].
         """
-        return self.expect(observation).gather(1, action[:, None])[:, 0]
+        return of_action(self._actions, self.expect(seen), action)
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:

@@ -139,7 +139,7 @@ def run(
         policies.explore_for(model, state.exploration_steps)
         generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.evaluation.eval_episodes))
         opened.callback(generator.close)
-        shape = FrameStack(generator.spec.observation_space, config.network.frame_stack).shape
+        (shape,) = FrameStack(generator.spec.observation_space, config.network.frame_stack).shapes
         every = config.evaluation.eval_every
         while (env_steps := model.num_timesteps) < max_env_steps:
             due = (env_steps // every + 1) * every

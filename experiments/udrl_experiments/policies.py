@@ -22,7 +22,7 @@ from udrl.commands import TRAINING_SEEDS
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
 from udrl.inference import Call
-from udrl.spaces import Observations
+from udrl.memory import Seen
 from udrl.streams import Purpose, Stream, stream_key
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -181,7 +181,7 @@ class _Rows:
     def __init__(self, behavior: InPlaceOfBehavior, n: int) -> None:
         self._model = behavior.model
         space = behavior.model.observation_space
-        self.observation: Observations = np.zeros((n, *behavior.shape), space.dtype)
+        self.seen: Seen = (np.zeros((n, *behavior.shape), space.dtype),)
         self.command = np.zeros((n, 2))
         assert isinstance(behavior.model.action_space, spaces.Discrete)
         self.logits = np.zeros((n, int(behavior.model.action_space.n)), np.float32)
@@ -192,7 +192,7 @@ class _Rows:
         shape = model.observation_space.shape
         assert shape is not None
         with torch.inference_mode():
-            seen = torch.from_numpy(self.observation).reshape(-1, *shape).to(model.device)
+            seen = torch.from_numpy(self.seen[0]).reshape(-1, *shape).to(model.device)
             if isinstance(model, DQN):
                 logits: Tensor = model.q_net(seen)
             else:

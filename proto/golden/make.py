@@ -390,8 +390,8 @@ def probe() -> dict[str, Any]:
     """Return the probe of the graph: digests of its weights and rows, and the logits."""
     weights = probe_weights(GRAPH)
     function = ActingFunction(GRAPH, weights)
-    observation, command = probe_rows(function, PROBE_ROWS)
-    logits = function.logits(observation, command)
+    seen, command = probe_rows(function, PROBE_ROWS)
+    logits = function.logits(seen, command)
     actions = [
         choose(logits[k % PROBE_ROWS].tolist(), u)
         for k, u in enumerate(Stream(stream_key(0, Purpose.PROBE, 3, 0)).uniforms(64).tolist())
@@ -402,7 +402,7 @@ def probe() -> dict[str, Any]:
     }
     return {
         "weights": arrays_digest(weights).hex(),
-        "rows": arrays_digest({"command": command, "observation": observation}).hex(),
+        "rows": arrays_digest({"command": command, "observation": seen[0]}).hex(),
         "logits": logits.tolist(),
         "actions": actions,
         "class": arrays_digest(arrays).hex()[:16],

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from udrl.episode import Episode
 from udrl.errors import ConfigError, InvalidMessage
+from udrl.spaces import ObservationSpace
 from udrl_proto.messages import Array, EpisodeMessage, Message
 from udrl_proto.text import printable
 
@@ -74,7 +75,7 @@ def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     return unique
 
 
-def encode_array(array: npt.NDArray[np.generic]) -> Array:
+def encode_array(array: npt.NDArray[Any]) -> Array:
     """Return an array as a message."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     return Array(dtype=little.dtype.str, shape=array.shape, data=little.tobytes())
@@ -111,15 +112,22 @@ def encode_episode(episode: Episode, actor: str) -> bytes:
     )
 
 
-def decode_episode(message: EpisodeMessage) -> Episode:
+def decode_episode(message: EpisodeMessage, space: ObservationSpace) -> Episode:
     """Return the episode in a message; its arrays fit their shapes, and that is all that is known.
+
+    Args:
+        message: from outside.
+        space: of its observations: what the structures of a record hold is not in the message.
 
     Raises:
         InvalidMessage: an array's bytes do not fill its shape.
     """
+    observations = decode_array(message.observations)
+    if observations.dtype.kind == "V" and observations.dtype.itemsize == space.dtype.itemsize:
+        observations = observations.view(space.dtype.newbyteorder("<"))
     return Episode(
         command_id=message.command_id,
-        observations=decode_array(message.observations),
+        observations=observations,
         actions=decode_array(message.actions),
         rewards=decode_array(message.rewards),
         terminated=message.terminated,

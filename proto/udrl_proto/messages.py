@@ -30,12 +30,13 @@ class Array(Message, frozen=True, kw_only=True):
     """An array: C order, little-endian.
 
     Attributes:
-        dtype: numpy's name of it, e.g. ``<f4``.
+        dtype: numpy's name of it: ``<f4``, ``|u1``, ``<i4``; or ``|V`` and a number of bytes, of
+            the structures of a record.
         shape: its dimensions, none of them 0.
         data: its bytes.
     """
 
-    dtype: Literal["<f4", "|u1", "<i4"]
+    dtype: Annotated[str, Meta(pattern=r"^(<f4|\|u1|<i4|\|V[1-9][0-9]{0,8})$")]
     shape: Annotated[tuple[Positive, ...], Meta(max_length=4)]
     data: bytes
 

@@ -29,8 +29,8 @@ from udrl.episode import Episode
 from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
+from udrl.memory import Seen
 from udrl.replay import Entry, ReplayBuffer
-from udrl.spaces import Observations
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import weights_of
 
@@ -85,10 +85,10 @@ def algorithm2(
             dr = min(dr, command.cap)
         # 4: compute P(a_t | s_t, c_t) = B(s_t, c_t; theta)
         if behavior is None:
-            logits = [0.0] * spec.action_space.n
+            logits = [0.0] * spec.action_space.n_parameters
         else:
             logits = behavior.logits(
-                s.reshape(1, *(shape or (1,))), np.array([[dr, dh]], np.float64)
+                (s.reshape(1, *(shape or (1,))),), np.array([[dr, dh]], np.float64)
             )[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
         number = float(stream.uniforms(1)[0])
@@ -97,7 +97,7 @@ def algorithm2(
         if not is_random or since % command.random_hold == 0:
             u = number  # else the same number again
         if is_random:
-            a = int(u * spec.action_space.n)
+            a = int(u * spec.action_space.n_parameters)
         elif command.temperature == 0:
             a = logits.index(max(logits))
         else:
@@ -219,7 +219,7 @@ class World:
 
     def make(self, config: Config) -> Environment:
         spec = EnvSpec("Scripted-v0", entry_point=self._instance, max_episode_steps=5000)
-        return adapt(gym.make(spec, disable_env_checker=True), "Scripted-v0")
+        return adapt(gym.make(spec, disable_env_checker=True), "Scripted-v0", config.actions)
 
     def _instance(self, **_: Any) -> "Scripted":
         self.instances.append(Scripted(self))
@@ -292,7 +292,7 @@ class Spy:
 
 class _SpiedOn:
     def __init__(self, spy: Spy, n: int) -> None:
-        self.observation: Observations = np.zeros((n, *spy.shape), np.float32)
+        self.seen: Seen = (np.zeros((n, *spy.shape), np.float32),)
         self.command = np.zeros((n, 2))
         self.logits = np.tile(np.array(spy.logits, np.float32), (n, 1))
         self._spy = spy

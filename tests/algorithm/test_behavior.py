@@ -78,9 +78,9 @@ def test_logits_are_those_of_section_3_2(hidden: tuple[int, ...], activation: st
     behavior = initialise(config, LANDER)
     observation, command = rows(5)
     with torch.inference_mode():
-        logits = behavior(observation, command)
+        logits = behavior((observation,), command)
     assert logits.dtype == torch.float32
-    assert logits.shape == (5, LANDER.action_space.n)
+    assert logits.shape == (5, LANDER.action_space.n_parameters)
     expected = section_3_2(
         behavior,
         observation.numpy().astype(np.float64),

@@ -222,43 +222,19 @@ def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register)
 
 
 @pytest.mark.parametrize(
-    "space",
+    ("observations", "actions", "says"),
     [
-        spaces.Box(0, 1, (84, 84), np.float32),
-        spaces.Box(0, 255, (84, 84, 3), np.int32),
-        spaces.Box(0, 255, (2, 84, 84, 3), np.uint8),
-        spaces.Box(-1, 1, (), np.float32),
-        spaces.Dict({"position": VECTOR}),
-        spaces.Tuple((VECTOR,)),
-        spaces.MultiBinary(4),
-        spaces.MultiDiscrete([2, 2]),
+        (spaces.Text(4), spaces.Discrete(2), "its observation is Text"),
+        (VECTOR, spaces.Box(-np.inf, np.inf, (2,)), "has no bounds"),
+        (spaces.Text(4), spaces.Text(4), "its observation is Text.*besides, its action is Text"),
     ],
     ids=str,
 )
-def test_other_observations_are_refused_with_what_is_supported(
-    register: Register, space: spaces.Space[Any]
+def test_other_spaces_are_refused_and_the_environment_closed(
+    register: Register, observations: spaces.Space[Any], actions: spaces.Space[Any], says: str
 ) -> None:
-    blank = Blank(space, spaces.Discrete(2))
-    with pytest.raises(UnsupportedEnvironment, match=r"supported are Box vectors .* and Discrete"):
-        make(register(lambda: blank))
-    assert blank.closed
-
-
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Box(-1, 1, (2,), np.float32),
-        spaces.MultiDiscrete([2, 2]),
-        spaces.MultiBinary(2),
-        spaces.Dict({"throttle": spaces.Discrete(2)}),
-    ],
-    ids=str,
-)
-def test_other_actions_are_refused_with_what_is_supported(
-    register: Register, space: spaces.Space[Any]
-) -> None:
-    blank = Blank(VECTOR, space)
-    with pytest.raises(UnsupportedEnvironment, match="supported is Discrete"):
+    blank = Blank(observations, actions)
+    with pytest.raises(UnsupportedEnvironment, match=says):
         make(register(lambda: blank))
     assert blank.closed
 

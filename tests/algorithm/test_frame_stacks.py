@@ -86,12 +86,12 @@ class Watching(ActingFunction):
 
 class _Noting:
     def __init__(self, call: Call, seen: list[npt.NDArray[Any]]) -> None:
-        self.observation, self.command, self.logits = call.observation, call.command, call.logits
+        self.seen, self.command, self.logits = call.seen, call.command, call.logits
         self._call = call
-        self._seen = seen
+        self._noted = seen
 
     def run(self) -> None:
-        self._seen.extend(self.observation.copy())
+        self._noted.extend(self.seen[0].copy())
         self._call.run()
 
 
@@ -132,10 +132,10 @@ def test_observations_are_joined_along_the_first_dimension(
     space: ObservationSpace, shape: tuple[int, ...]
 ) -> None:
     memory = FrameStack(space, 4)
-    assert memory.shape == shape
+    assert memory.shapes == (shape,)
     n = math.prod(space.shape)
     each = np.arange(2 * 4 * n).astype(space.dtype).reshape(2, 4, *space.shape)
-    joined = memory.join(each)
+    (joined,) = memory.join(each)
     assert joined.shape == (2, *shape)
     assert joined.ravel().tolist() == each.ravel().tolist()
 
@@ -158,11 +158,11 @@ def test_acting_sees_what_training_sees(
     for rank, episode in enumerate(episodes):
         t = np.arange(episode.length)
         examples = ranked.examples(Segments(np.full_like(t, rank), t, np.full_like(t, len(t))))
-        assert (
-            examples.observation.shape[1:]
-            == FrameStack(spec.observation_space, config.network.frame_stack).shape
-        )
-        for i, stack in enumerate(examples.observation):
+        (seen,) = examples.seen
+        assert (seen.shape[1:],) == FrameStack(
+            spec.observation_space, config.network.frame_stack
+        ).shapes
+        for i, stack in enumerate(seen):
             frames = [episode.observations[max(0, i - k)] for k in range(STACK)[::-1]]
             assert np.array_equal(stack, np.concatenate(frames)), f"step {i}"
             trained_on.add(stack.tobytes())

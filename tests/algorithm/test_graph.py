@@ -11,14 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udrl import inference as module
-from udrl.actions import Categorical
+from udrl.actions import Categorical, Product
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.graph import acting_graph, weight_shapes
-from udrl.inference import ActingFunction, is_exact_together, probe_rows, probe_weights
-from udrl.spaces import Category, Image, Vector
+from udrl.inference import ActingFunction, Call, is_exact_together, probe_rows, probe_weights
+from udrl.memory import Seen
+from udrl.spaces import (
+    Bits,
+    Categories,
+    Category,
+    Image,
+    Leaf,
+    Record,
+    Vector,
+    leaves_of,
+)
 from udrl.training import weights_of
 
 VECTOR = EnvironmentSpec(
@@ -27,6 +37,19 @@ VECTOR = EnvironmentSpec(
 IMAGE = EnvironmentSpec(
     observation_space=Image(channels=1, height=16, width=16),
     action_space=Categorical(n=3),
+    max_episode_steps=500,
+)
+RECORD = EnvironmentSpec(
+    observation_space=Record(
+        (
+            Leaf(("bag", 0), Vector(size=3)),
+            Leaf(("bag", 1), Bits(size=5)),
+            Leaf(("here",), Category(n=7)),
+            Leaf(("map",), Image(channels=3, height=9, width=8)),
+            Leaf(("tools",), Categories(ns=(2, 5))),
+        )
+    ),
+    action_space=Product(ns=(3, 2, 4)),
     max_episode_steps=500,
 )
 CATEGORY = EnvironmentSpec(
@@ -45,6 +68,9 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (IMAGE, {}),
     (IMAGE, {"frame_stack": 4, "activation": "tanh"}),
     (IMAGE, {"frame_stack": 4, "baseline": "value"}),
+    (RECORD, {}),
+    (RECORD, {"frame_stack": 3, "baseline": "value", "activation": "tanh"}),
+    (RECORD, {"baseline": "action_value"}),
 ]
 each_kind = pytest.mark.parametrize(("spec", "values"), KINDS)
 
@@ -75,6 +101,16 @@ def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.array(rows, np.float32)
 
 
+def picked(seen: Seen, rows: Any) -> Seen:
+    return tuple(one[rows] for one in seen)
+
+
+def fill(call: Call, seen: Seen, command: np.ndarray[Any, Any]) -> None:
+    for asked, one in zip(call.seen, seen, strict=True):
+        asked[:] = one
+    call.command[:] = command
+
+
 @pytest.mark.parametrize("weights", ["initial", "far from it"])
 @each_kind
 def test_it_is_the_function_that_is_trained(
@@ -90,10 +126,11 @@ def test_it_is_the_function_that_is_trained(
     function = acting(config, behavior, spec)
     seen, command = probe_rows(function, 64)
     if isinstance(spec.observation_space, Category):
-        seen = np.arange(seen.size, dtype=np.int32).reshape(seen.shape) % 7
+        seen = (np.arange(seen[0].size, dtype=np.int32).reshape(seen[0].shape) % 7,)
     found = function.logits(seen, command)
     with torch.inference_mode():
-        expected = behavior(torch.tensor(seen), torch.tensor(read(config, command))).numpy()
+        shown = tuple(map(torch.tensor, seen))
+        expected = behavior(shown, torch.tensor(read(config, command))).numpy()
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert np.ptp(found, axis=0).min() > 0.01, "rows that are all alike prove little"
@@ -118,8 +155,9 @@ def test_the_model_is_valid_and_says_the_same_elsewhere(
     onnx.checker.check_model(model, full_check=True)
     assert (model.ir_version, model.opset_import[0].version) == (7, 13)
     seen, command = probe_rows(function, 5)
+    names = [f"observation{leaf.name}" for leaf in leaves_of(spec.observation_space)]
     (found,) = onnxruntime.InferenceSession(function.model).run(
-        None, {"observation": seen, "command": command}
+        None, {**dict(zip(names, seen, strict=True)), "command": command}
     )
     np.testing.assert_allclose(found, function.logits(seen, command), rtol=1e-5, atol=1e-6)
 
@@ -136,7 +174,7 @@ def test_a_row_has_the_same_bits_in_any_company(
     for n in (1, 2, 3, 7, 16, 33, 40):
         rows = rng.permutation(40)[:n]
         call = function.call(n)
-        call.observation[:], call.command[:] = seen[rows], command[rows]
+        fill(call, picked(seen, rows), command[rows])
         call.run()
         assert np.array_equal(call.logits, alone[rows]), n
 
@@ -156,9 +194,9 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
     call = function.call(6)
     assert isinstance(call, module._OneByOne)
     for rows in ([0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0]):
-        call.observation[:], call.command[:] = seen[rows], command[rows]
+        fill(call, picked(seen, rows), command[rows])
         call.run()
-        assert np.array_equal(call.logits, function.logits(seen[rows], command[rows]))
+        assert np.array_equal(call.logits, function.logits(picked(seen, rows), command[rows]))
     assert asked == [6]
 
 

@@ -112,7 +112,7 @@ def test_the_training_class_sees_a_change_of_the_last_bit(
     assert training_class(config, LANDER) == expected
     obey = BehaviorFunction.obey
 
-    def rounds_otherwise(self: BehaviorFunction, s: Tensor, c: Tensor) -> Tensor:
+    def rounds_otherwise(self: BehaviorFunction, s: tuple[Tensor, ...], c: Tensor) -> Tensor:
         return obey(self, s, c) * (1 + 2**-23)
 
     monkeypatch.setattr(BehaviorFunction, "obey", rounds_otherwise)

@@ -28,7 +28,7 @@ SEEN = [0.1, -0.2, 0.03, 0.4]
 
 def test_logits_are_those_of_the_behavior_function() -> None:
     agent = policy(return_scale=0.02, horizon_scale=0.01)
-    expected = agent.behavior.logits(np.array([SEEN], np.float32), np.array([[100.0, 50.0]]))
+    expected = agent.behavior.logits((np.array([SEEN], np.float32),), np.array([[100.0, 50.0]]))
     assert agent.logits(SEEN, 100.0, 50).tolist() == expected[0].tolist()
 
 
@@ -77,7 +77,7 @@ def test_a_policy_repeats_itself_under_a_seed() -> None:
         (SEEN[:3], (1.0, 1.0), r"an observation of shape \(3,\): expected \(4,\).*CartPole-v1"),
         (SEEN, (math.nan, 1.0), "desired return nan.*finite"),
         (SEEN, (1.0, math.inf), "desired horizon inf.*finite"),
-        ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation must be finite"),
+        ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation.*expected finite numbers"),
     ],
 )
 def test_what_it_cannot_be_asked(seen: Any, desired: tuple[float, float], says: str) -> None:

@@ -108,7 +108,9 @@ def test_an_example_has_the_types_that_training_reads() -> None:
     held = experience(replay_size=1, max_steps=4)
     held.add(random_episode(0, 4))
     examples = held.by_rank([0]).examples(Segments(*np.array([[0], [1], [4]])))
-    assert [array.dtype for array in examples] == [np.float32, np.float64, np.uint8]
+    assert [seen.dtype for seen in examples.seen] == [np.float32]
+    assert examples.command.dtype == np.float64
+    assert examples.action.dtype == np.uint8
 
 
 def draw_one(u: tuple[float, float, float], lengths: list[int], kind: Kind) -> tuple[int, int, int]:

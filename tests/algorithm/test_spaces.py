@@ -8,26 +8,49 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.actions import Categorical
+from udrl.actions import ActionSpace, Categorical, Product
+from udrl.environments.action_conversions import action_conversion
+from udrl.environments.conversions import observation_conversion
+from udrl.setting_groups import ActionSettings
 from udrl.spaces import (
+    Bits,
+    Categories,
     Category,
     Image,
+    Leaf,
     ObservationSpace,
+    Record,
     Space,
     Vector,
+    leaves_of,
     noise,
-    observation_space,
+    parts_of,
 )
 from udrl.streams import Purpose, Stream, stream_key
 
-SPACES: list[Space] = [
+OBSERVATIONS: list[ObservationSpace] = [
     Vector(size=3),
+    Bits(size=5),
     Image(channels=2, height=4, width=5),
     Category(n=7),
+    Categories(ns=(2, 5)),
+]
+RECORD = Record(
+    (
+        Leaf(("bag", 0), Vector(size=3)),
+        Leaf(("bag", 1, "deep"), Bits(size=5)),
+        Leaf(("here",), Category(n=7)),
+        Leaf(("map",), Image(channels=1, height=4, width=5)),
+    )
+)
+ACTIONS: list[ActionSpace] = [
     Categorical(n=2),
     Categorical(n=256),
     Categorical(n=257),
+    Product(ns=(2, 256)),
+    Product(ns=(2, 257)),
 ]
+SPACES: list[Space] = [*OBSERVATIONS, *ACTIONS]
 
 
 def elements(space: Space, n: int) -> Any:
@@ -59,18 +82,65 @@ def test_indices_outside_are_named(space: Space) -> None:
     assert space.fault(np.array([0, 7], space.dtype), 2) == "from 0 to 7, expected 0 to 6"
 
 
+@pytest.mark.parametrize("space", [Categories(ns=(9, 3)), Product(ns=(9, 3))], ids=str)
+def test_indices_outside_are_named_with_their_component(space: Space) -> None:
+    found = space.fault(np.array([[8, 2], [0, 3]], space.dtype), 2)
+    assert found == "from 2 to 3, expected 0 to 2 in component 1"
+
+
+def test_bits_are_0_or_1() -> None:
+    assert Bits(size=2).fault(np.array([[1, 2]], np.uint8), 1) == "not all 0 or 1"
+
+
+def test_elements_of_a_record_are_structures_without_padding() -> None:
+    values = np.zeros(3, RECORD.dtype)
+    assert RECORD.fault(values, 3) is None
+    assert RECORD.n_bytes == values.nbytes // 3 == sum(leaf.space.n_bytes for leaf in RECORD.leaves)
+    assert [leaf.name for leaf in RECORD.leaves] == [
+        "['bag'][0]", "['bag'][1]['deep']", "['here']", "['map']",
+    ]  # fmt: skip
+    assert [part.shape for part in parts_of(values)] == [(3, 3), (3, 5), (3,), (3, 1, 4, 5)]
+    assert leaves_of(Vector(size=2)) == (Leaf((), Vector(size=2)),)
+
+
+@pytest.mark.parametrize(
+    ("leaf", "value", "says"),
+    [
+        ("['bag'][0]", np.nan, "not all finite numbers in ['bag'][0]"),
+        ("['bag'][1]['deep']", 2, "not all 0 or 1 in ['bag'][1]['deep']"),
+        ("['here']", 7, "from 0 to 7, expected 0 to 6 in ['here']"),
+    ],
+)
+def test_what_is_impossible_in_a_record_is_named(leaf: str, value: Any, says: str) -> None:
+    values = np.zeros(3, RECORD.dtype)
+    values[leaf][1] = value
+    assert RECORD.fault(values, 3) == says
+    assert "expected" in str(RECORD.fault(values["['bag'][0]"], 3))
+
+
+def test_leaves_have_names_of_their_own() -> None:
+    twice = [msgspec.to_builtins(Leaf(("a",), Bits(size=1)))] * 2
+    with pytest.raises(msgspec.ValidationError, match="two leaves have the same name"):
+        msgspec.convert({"kind": "record", "leaves": twice}, ObservationSpace)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_vectors_are_finite(value: float) -> None:
     assert Vector(size=1).fault(np.array([[value]], np.float32), 1) == "not all finite numbers"
 
 
-@pytest.mark.parametrize(
-    "space", [Vector(size=3), Image(channels=2, height=4, width=5), Category(n=7)], ids=str
-)
-def test_kinds_survive_the_wire_and_gymnasium(space: ObservationSpace) -> None:
+@pytest.mark.parametrize("space", [*OBSERVATIONS, RECORD], ids=str)
+def test_observations_survive_the_wire_and_gymnasium(space: ObservationSpace) -> None:
     encoded = msgspec.msgpack.encode(space)
     assert msgspec.msgpack.decode(encoded, type=ObservationSpace) == space
-    assert observation_space(space.gymnasium) == space
+    assert observation_conversion(space.gymnasium).plain == space
+
+
+@pytest.mark.parametrize("space", ACTIONS, ids=str)
+def test_actions_survive_the_wire_and_gymnasium(space: ActionSpace) -> None:
+    encoded = msgspec.msgpack.encode(space)
+    assert msgspec.msgpack.decode(encoded, type=ActionSpace) == space
+    assert action_conversion(space.gymnasium, ActionSettings()).plain == space
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8, np.int32])

@@ -58,7 +58,7 @@ def episode(
     return Episode(
         command_id=number,
         observations=observations,
-        actions=rng.integers(spec.action_space.n, size=len(rewards)).astype(np.uint8),
+        actions=rng.integers(spec.action_space.n_parameters, size=len(rewards)).astype(np.uint8),
         rewards=np.array(rewards, np.float32),
         terminated=not truncated,
         truncated=truncated,

@@ -154,7 +154,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     model, config = made(wanted), wanted.config
     spec = specify(make_environment(config), config)
     behavior = BehaviorFunction(spec, config)
-    seen = FrameStack(spec.observation_space, config.network.frame_stack).shape
+    (seen,) = FrameStack(spec.observation_space, config.network.frame_stack).shapes
     if isinstance(model, DQN):
         parts: list[nn.Module] = [model.q_net]
     else:
@@ -178,9 +178,9 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     with torch.no_grad():
         for mine, their in zip(ours, theirs, strict=True):
             mine.copy_(their)
-        expected = behavior(observation, torch.zeros(5, 2))
+        expected = behavior((observation,), torch.zeros(5, 2))
         call = policies.InPlaceOfBehavior(model, seen).call(5)
-        call.observation[:] = observation.numpy()
+        call.seen[0][:] = observation.numpy()
         call.run()
         logits = torch.from_numpy(call.logits)
     if algorithm == "A2C":

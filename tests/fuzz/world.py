@@ -141,7 +141,7 @@ class World:
             assert len(values) == np.prod(array["shape"])
             assert np.isfinite(values).all()
         actions = np.frombuffer(fields["actions"]["data"], "|u1")
-        assert actions.max() < self.spec.action_space.n
+        assert actions.max() < self.spec.action_space.n_parameters
         assert fields["terminated"] or fields["truncated"]
 
 
@@ -221,7 +221,7 @@ def _train(world: World, version: int, states: list[TrainingState]) -> TrainingS
     experience = Experience(CONFIG, world.spec)
     ids = [p.entry.id for p in world._store.buffer(version - 1)]
     for body in world._store.episode_bodies(ids, 1 << 30):
-        experience.add(decode_episode(decode(body, EpisodeMessage)))
+        experience.add(decode_episode(decode(body, EpisodeMessage), world.spec.observation_space))
     state = deepcopy(states[-1])
     train(state, experience.by_rank(ids), CONFIG)
     return state

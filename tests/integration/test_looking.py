@@ -75,7 +75,7 @@ def test_a_seed_decides_every_action_wherever_it_stands(ended_run: Path) -> None
     third = with_seeds(commands)[2]
     (alone,) = with_seeds(commands[:1], third.environment_seed)
 
-    def actions(command: Command) -> list[int | None]:
+    def actions(command: Command) -> list[int | list[int] | None]:
         with closing(make_environment(agent.config)) as env:
             rollout, taken = Rollout(agent.policy, env, command), []
             while not rollout.over:

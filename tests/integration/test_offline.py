@@ -55,7 +55,7 @@ def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Ep
         Episode(
             command_id=i,
             observations=observations(n),
-            actions=rng.integers(0, spec.action_space.n, n).astype(np.uint8),
+            actions=rng.integers(0, spec.action_space.n_parameters, n).astype(np.uint8),
             rewards=rng.normal(size=n).astype(np.float32),
             terminated=i % 2 == 0,
             truncated=i % 2 == 1,

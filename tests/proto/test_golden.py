@@ -17,7 +17,7 @@ from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
 from udrl.inference import Commands, Logits
-from udrl.spaces import Observations
+from udrl.memory import Seen
 from udrl.streams import Stream
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Message
@@ -140,7 +140,7 @@ class Fixed:
         self._logits = np.array([logits], np.float32)
         # The one observation that is stacked.
         shape, dtype = spec.observation_space.shape or (1,), spec.observation_space.dtype
-        self.observation: Observations = np.zeros((1, *shape), dtype)
+        self.seen: Seen = (np.zeros((1, *shape), dtype),)
         self.command: Commands = np.zeros((1, 2))
         self.logits: Logits = np.zeros_like(self._logits)
 

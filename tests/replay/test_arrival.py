@@ -44,7 +44,7 @@ def test_good_episode_arrives_with_its_return_length_and_digest() -> None:
     assert arrival.actor == "actor-1"
     assert arrival.entry == Entry(1.5, 7, 3)
     assert arrival.digest == episode_digest(episode())
-    stored = decode_episode(decode(arrival.body, EpisodeMessage))
+    stored = decode_episode(decode(arrival.body, EpisodeMessage), SPEC.observation_space)
     assert episode_digest(stored) == arrival.digest
 
 

@@ -90,7 +90,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         try:
             return self.observations.one(observation)
         except InvalidData as error:
-            raise EnvironmentFault(f"{where}() returned as observation {error}") from error
+            raise EnvironmentFault(f"{where}() returned as {error}") from error
 
 
 def close(env: gym.Env[Any, Any]) -> None:

@@ -14,15 +14,16 @@ from typing import Annotated, Any
 
 import gymnasium as gym
 import msgspec
-from gymnasium import spaces
 from msgspec import Meta
 
-from udrl.actions import ActionSpace, Categorical
+from udrl.actions import ActionSpace
 from udrl.config import Config
+from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
-from udrl.environments.conversions import action_conversion, observation_conversion
+from udrl.environments.conversions import observation_conversion
 from udrl.errors import UnsupportedEnvironment
-from udrl.spaces import MOST_CATEGORIES, ObservationSpace, observation_space
+from udrl.setting_groups import ActionSettings
+from udrl.spaces import ObservationSpace
 
 Environment = gym.Env[Any, Any]
 
@@ -94,27 +95,31 @@ def make_environment(config: Config) -> Adapter:
             f"environment {name!r} cannot be made: {type(error).__name__}: {error}; "
             f"{_remedy(error, config)}"
         ) from error
-    return adapt(env, name)
+    return adapt(env, name, config.actions)
 
 
-def adapt(env: Environment, name: str) -> Adapter:
+def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
     """Return an environment with observations and actions as the algorithm sees them, and checked.
 
     Args:
         env: has a step limit.
         name: what messages call it.
+        settings: how its actions are read.
 
     Raises:
         UnsupportedEnvironment: it has no time limit, or spaces that are not supported; all that is
             wrong is said at once, and the environment is closed.
     """
-    observations = observation_conversion(env.observation_space)
-    actions = action_conversion(env.action_space)
+    observations = actions = None
     problems = []
-    if observations is None:
-        problems.append(_unsupported_observations(env.observation_space))
-    if actions is None:
-        problems.append(f"its actions are {env.action_space}; supported is Discrete")
+    try:
+        observations = observation_conversion(env.observation_space)
+    except UnsupportedEnvironment as error:
+        problems.append(str(error))
+    try:
+        actions = action_conversion(env.action_space, settings)
+    except UnsupportedEnvironment as error:
+        problems.append(str(error))
     if env.spec is None or env.spec.max_episode_steps is None:
         problems.append(
             "it has no step limit, so an episode might never end; set one, e.g. "
@@ -166,30 +171,15 @@ def _is_of_threads(text: str) -> bool:
     return any(word in text.lower() for word in ("main thread", "event loop", "signal"))
 
 
-def _unsupported_observations(space: spaces.Space[Any]) -> str:
-    if isinstance(space, spaces.Discrete):
-        return (
-            f"it has {space.n:,} states, and the network would learn a vector for each; at most "
-            f"{MOST_CATEGORIES:,} are supported; wrap it, so that it shows numbers that describe a "
-            f"state"
-        )
-    return (
-        f"its observations are {space}; supported are Box vectors (one dimension), Box images of "
-        f"uint8 (two or three dimensions) and Discrete; wrap it, e.g. in "
-        f"gymnasium.wrappers.FlattenObservation"
-    )
-
-
 def specify(env: Environment, config: Config) -> EnvironmentSpec:
     """Return the spec of an environment that :func:`make_environment` made."""
-    assert isinstance(env.action_space, spaces.Discrete)
     assert env.spec is not None
     assert env.spec.max_episode_steps is not None
     declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
     max_return = config.max_return if config.max_return is not None else declared
     return EnvironmentSpec(
-        observation_space=observation_space(env.observation_space),
-        action_space=Categorical(n=int(env.action_space.n)),
+        observation_space=env.get_wrapper_attr("observations").plain,
+        action_space=env.get_wrapper_attr("actions").plain,
         max_episode_steps=env.spec.max_episode_steps,
         max_return=None if max_return is None else float(max_return),
     )

@@ -104,7 +104,7 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
     temperature: float
     step: int
     obtained: float
-    action: int | None
+    action: int | list[int] | None
     probabilities: list[float]
     over: bool
     truncated: bool

@@ -140,12 +140,13 @@ def export_buffer(run_dir: Path, name: str) -> int:
         ids = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
         if not ids:
             raise StoreError(f"{run_dir}: the replay buffer is empty; wait for the warm-up's end")
-        messages = (
-            decode(body, EpisodeMessage, LARGEST)
+        space = hello.environment.observation_space
+        episodes = (
+            decode_episode(decode(body, EpisodeMessage, LARGEST), space)
             for i in ids
             for body in store.episode_bodies([i], LARGEST)
         )
-        write_dataset(name, map(decode_episode, messages), hello.config, hello.environment)
+        write_dataset(name, episodes, hello.config, hello.environment)
     return len(ids)
 
 

@@ -249,7 +249,8 @@ class LearnerService:
         while left := missing[len(episodes) :]:
             request = EpisodesRequest(ids=tuple(left[:_ASK_FOR]))
             page = self._asker.ask(verbs.EPISODES, request)
-            episodes += [decode_episode(decode(b, EpisodeMessage, LARGEST)) for b in page.episodes]
+            messages = [decode(body, EpisodeMessage, LARGEST) for body in page.episodes]
+            episodes += [decode_episode(m, self._spec.observation_space) for m in messages]
         return episodes
 
     def _deliver(self, message: VersionMessage) -> None:

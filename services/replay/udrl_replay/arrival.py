@@ -42,7 +42,7 @@ def inspect(message: EpisodeMessage, spec: EnvironmentSpec) -> Arrival:
     Raises:
         InvalidMessage: a shape, dtype, length or value is impossible in this environment.
     """
-    episode = decode_episode(message)
+    episode = decode_episode(message, spec.observation_space)
     if found := fault(episode, spec):
         raise InvalidMessage(f"episode {episode.command_id}: {found}")
     return Arrival(

@@ -99,7 +99,7 @@ def _changed(store: Store, hello: Hello) -> str | None:
         if time.monotonic() - began > _PATIENCE_S:
             break
         (body,) = store.episode_bodies([episode_id], 1)
-        episode = decode_episode(decode(body, EpisodeMessage, LARGEST))
+        episode = decode_episode(decode(body, EpisodeMessage, LARGEST), spec.observation_space)
         command = sampler.training_command(episode_id)
         try:
             found = difference(config, episode, command.environment_seed, command.max_steps)

@@ -1,0 +1,265 @@
+"""Between an environment's spaces and the algorithm's: nothing is lost, and faults are named."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udrl.actions import Categorical, Product
+from udrl.environments.action_conversions import action_conversion, default_bins
+from udrl.environments.conversions import observation_conversion
+from udrl.errors import InvalidData, UnsupportedEnvironment
+from udrl.setting_groups import ActionSettings
+from udrl.spaces import Bits, Categories, Category, Image, Record, Vector, leaves_of
+
+AnySpace = spaces.Space[Any]
+
+shapes = st.lists(st.integers(1, 3), max_size=3).map(tuple)
+discretes = st.builds(
+    lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 5), st.integers(-3, 3)
+)
+multi_discretes = st.lists(st.integers(1, 4), min_size=1, max_size=4).map(
+    lambda ns: spaces.MultiDiscrete(np.array(ns), start=np.arange(len(ns)) - 1)
+)
+
+
+def boxes(*dtypes: Any) -> st.SearchStrategy[AnySpace]:
+    return st.builds(
+        lambda shape, dtype: spaces.Box(-3, 4, shape, dtype), shapes, st.sampled_from(dtypes)
+    )
+
+
+images = st.lists(st.integers(1, 4), min_size=2, max_size=3).map(
+    lambda shape: spaces.Box(0, 255, tuple(shape), np.uint8)
+)
+bits = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(spaces.MultiBinary)
+
+
+def nested(leaves: st.SearchStrategy[Any]) -> st.SearchStrategy[AnySpace]:
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(
+            st.lists(inner, min_size=1, max_size=3).map(spaces.Tuple),
+            st.dictionaries(st.text(max_size=3), inner, min_size=1, max_size=3).map(spaces.Dict),
+        ),
+        max_leaves=5,
+    )
+
+
+# float64 is rounded to float32, so it does not come back.
+numbers = boxes(np.float32, np.int16, np.int64)
+observed = nested(st.one_of(discretes, multi_discretes, numbers, images, bits))
+numbers_64 = boxes(np.float32, np.float64, np.int16, np.int64)
+done = nested(st.one_of(discretes, multi_discretes, numbers_64, bits))
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two elements are equal, with the types that an environment may rely on."""
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return np.asarray(one).dtype == np.asarray(other).dtype and np.array_equal(one, other)
+
+
+def stacked(samples: list[Any]) -> Any:
+    """Many elements as datasets have them: arrays where the leaves are."""
+    first = samples[0]
+    if isinstance(first, dict):
+        return {k: stacked([s[k] for s in samples]) for k in first}
+    if isinstance(first, tuple):
+        return tuple(stacked([s[k] for s in samples]) for k in range(len(first)))
+    return np.stack([np.asarray(s) for s in samples])
+
+
+@given(observed, st.integers(0, 100))
+def test_observations_go_there_and_back(space: AnySpace, seed: int) -> None:
+    space.seed(seed)
+    samples = [space.sample() for _ in range(3)]
+    conversion = observation_conversion(space)
+    plain = conversion.convert(stacked(samples), (3,))
+    assert conversion.plain.fault(plain, 3) is None
+    assert same(conversion.back(plain), stacked(samples))
+    for k, sample in enumerate(samples):
+        one = conversion.one(sample)
+        assert np.array_equal(one, plain[k])
+        assert same(conversion.back_one(one), sample)
+
+
+@given(done, st.integers(0, 100))
+def test_every_action_is_the_environments_and_comes_back(space: AnySpace, seed: int) -> None:
+    conversion = action_conversion(space, ActionSettings())
+    rng = np.random.default_rng(seed)
+    plain = conversion.plain.uniform(rng.random((4, *conversion.plain.shape)))
+    own = [conversion.back_one(action) for action in plain.tolist()]
+    assert all(map(space.contains, own)), own
+    assert same(conversion.back(plain), stacked(own))
+    again = conversion.convert(stacked(own), (4,))
+    assert again.dtype == conversion.plain.dtype
+    # Bins of whole numbers may hold the same one twice.
+    assert same(conversion.back(again), stacked(own))
+
+
+def test_kinds_of_observations() -> None:
+    kinds = [leaf.space for leaf in leaves_of(observation_conversion(spaces.Dict(
+        a=spaces.Box(-1, 1, (2, 3)),
+        b=spaces.Box(-1, 1, ()),
+        c=spaces.Box(0, 255, (8, 9, 3), np.uint8),
+        d=spaces.Box(0, 255, (5,), np.uint8),
+        e=spaces.Discrete(4, start=2),
+        f=spaces.MultiDiscrete(np.array([[2, 3], [4, 5]])),
+        g=spaces.MultiBinary((2, 3)),
+    )).plain)]  # fmt: skip
+    assert kinds == [
+        Vector(size=6), Vector(size=1), Image(channels=3, height=8, width=9), Vector(size=5),
+        Category(n=4), Categories(ns=(2, 3, 4, 5)), Bits(size=6),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("space", "plain"),
+    [
+        (spaces.Discrete(3, start=5), Categorical(n=3)),
+        (spaces.MultiDiscrete([3, 5]), Product(ns=(3, 5))),
+        (spaces.MultiBinary(3), Product(ns=(2, 2, 2))),
+        (spaces.Box(-1, 1, (2,)), Product(ns=(11, 11))),
+        (spaces.Box(-1, 1, (3,)), Product(ns=(7, 7, 7))),
+        (spaces.Box(0, 3, (2,), np.int64), Product(ns=(4, 4))),
+        (spaces.Dict(a=spaces.Discrete(2), b=spaces.Box(-1, 1, (1,))), Product(ns=(2, 11))),
+        (spaces.Tuple((spaces.Discrete(2),)), Product(ns=(2,))),
+    ],
+    ids=str,
+)
+def test_kinds_of_actions(space: AnySpace, plain: Any) -> None:
+    assert action_conversion(space, ActionSettings()).plain == plain
+
+
+def test_a_dimension_has_its_bounds_its_middle_and_as_many_values_as_are_wanted() -> None:
+    space = spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
+    conversion = action_conversion(space, ActionSettings(action_bins=5))
+    found = [conversion.back_one([k, k]).tolist() for k in range(5)]
+    assert found == [[-2, 0], [-1, 0.25], [0, 0.5], [1, 0.75], [2, 1]]
+    assert all(default_bins(n) % 2 for n in range(1, 20))
+
+
+@given(st.lists(st.floats(-9, 9), min_size=1, max_size=5))
+def test_an_action_of_a_dataset_becomes_the_nearest(values: list[float]) -> None:
+    conversion = action_conversion(spaces.Box(-2, 2, (1,), np.float64), ActionSettings())
+    (known,) = conversion._values  # type: ignore[attr-defined]
+    plain = conversion.convert(np.array(values)[:, None], (len(values),))
+    for value, (chosen,) in zip(values, plain.tolist(), strict=True):
+        assert abs(known[chosen] - value) == min(abs(k - value) for k in known)
+
+
+def test_bounds_that_are_not_declared_can_be_given() -> None:
+    space = spaces.Box(np.array([-np.inf, 0], np.float32), np.array([1, np.inf], np.float32))
+    given_ = ActionSettings(action_low=-5, action_high=7, action_bins=3)
+    conversion = action_conversion(space, given_)
+    assert [conversion.back_one([k, k]).tolist() for k in range(3)] == [[-5, 0], [-2, 3.5], [1, 7]]
+
+
+DICT = spaces.Dict(
+    inventory=spaces.Tuple((spaces.Discrete(3), spaces.Box(-1, 1, (2,)), spaces.MultiBinary(2))),
+    map=spaces.Box(0, 255, (4, 4), np.uint8),
+)
+
+
+def good() -> Any:
+    return {
+        "inventory": (1, np.zeros(2, np.float32), np.zeros(2, np.int8)),
+        "map": np.zeros((4, 4), np.uint8),
+    }
+
+
+def spoil(where: Callable[[Any], Any]) -> Any:
+    value = good()
+    return where(value)
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (spoil(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
+         r"observation\['map'\] an array of uint8, shape \(4, 5\), declared is Box"),
+        (spoil(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
+         r"observation\['inventory'\]\[0\] 3 \(int.*\), declared is Discrete\(3\)"),
+        (spoil(lambda v: v | {"inventory": v["inventory"][:2]}),
+         r"a dict of 'inventory', 'map', without observation\['inventory'\]\[2\]"),
+        (spoil(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
+        (np.zeros(3, np.float32), r"an array of float32, shape \(3,\), without observation"),
+        (None, r"None \(NoneType\), without observation\['inventory'\]\[0\]"),
+    ],
+)  # fmt: skip
+def test_a_fault_names_the_leaf(value: Any, says: str) -> None:
+    with pytest.raises(InvalidData, match=says):
+        observation_conversion(DICT).one(value)
+
+
+def test_components_outside_are_faults() -> None:
+    conversion = observation_conversion(spaces.MultiDiscrete([2, 3]))
+    with pytest.raises(InvalidData, match=r"observation \[1, 3\], declared is MultiDiscrete"):
+        conversion.one(np.array([1, 3]))
+    with pytest.raises(InvalidData, match="declared is MultiDiscrete"):
+        conversion.one(np.array([0.5, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("space", "says"),
+    [
+        (spaces.Text(4), "its observation is Text.*Box, Discrete.*differ.*TransformObservation"),
+        (
+            spaces.Dict(
+                a=spaces.Discrete(2),
+                b=spaces.Tuple((spaces.Text(4), spaces.Sequence(spaces.Discrete(2)))),
+            ),
+            r"its observation\['b'\]\[0\] is Text.*besides.*\['b'\]\[1\] is Sequence",
+        ),
+        (spaces.Box(-1, 1, (0, 3)), "supported are Box"),
+        (spaces.Discrete(2**20 + 1), "1,048,577 states.*at most 1,048,576"),
+        (spaces.Dict({}), "0 parts; supported are 1 to 256"),
+    ],
+    ids=str,
+)
+def test_observations_that_are_not_supported_are_refused_by_name(
+    space: AnySpace, says: str
+) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=says):
+        observation_conversion(space)
+
+
+@pytest.mark.parametrize(
+    ("space", "says", "bins"),
+    [
+        (spaces.Text(4), "its action is Text.*Discrete, MultiDiscrete.*TransformAction", None),
+        (
+            spaces.Box(-np.inf, np.inf, (2,)),
+            r"its action\[0\] has no bounds.*--set action_low=-1 --set action_high=1",
+            None,
+        ),
+        (
+            spaces.Dict(a=spaces.Box(1, 1, (2,))),
+            r"its action\['a'\]\[0\] is from 1 to 1; expected",
+            None,
+        ),
+        (spaces.Dict({}), "only one", None),
+        (spaces.Box(-1, 1, (99,)), "99,000 outputs; at most 65,536", 1000),
+    ],
+    ids=str,
+)
+def test_actions_that_are_not_supported_are_refused_by_name(
+    space: AnySpace, says: str, bins: int | None
+) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=says):
+        action_conversion(space, ActionSettings(action_bins=bins))
+
+
+def test_a_record_is_what_the_leaves_are() -> None:
+    plain = observation_conversion(DICT).plain
+    assert isinstance(plain, Record)
+    assert [leaf.name for leaf in plain.leaves] == [
+        "['inventory'][0]", "['inventory'][1]", "['inventory'][2]", "['map']",
+    ]  # fmt: skip

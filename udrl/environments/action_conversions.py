@@ -1,0 +1,205 @@
+"""Between an environment's own actions and the algorithm's indices (:mod:`udrl.actions`).
+
+A ``Box`` is cut into bins: dimension by dimension so many values, evenly from the lowest to the
+highest. What an environment is given is always one of these values; an action of a dataset becomes
+the nearest.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from udrl.actions import Categorical, Product
+from udrl.environments.conversions import (
+    Array,
+    Conversion,
+    Indexed,
+    MultiIndexed,
+    as_array,
+    leaves_within,
+    nested,
+)
+from udrl.errors import UnsupportedEnvironment
+from udrl.setting_groups import ActionSettings
+
+#: Outputs of the network for one action, at most.
+_MOST_PARAMETERS = 2**16
+
+
+class _Bits(MultiIndexed):
+    """Zeros and ones of a ``MultiBinary``."""
+
+    def __init__(self, name: str, declared: spaces.MultiBinary, plain: Product) -> None:
+        super().__init__(name, spaces.MultiDiscrete(np.full(declared.shape, 2)), plain)
+        self.declared = declared
+
+
+class _Bins(Conversion):
+    """Values of a ``Box``.
+
+    Args:
+        name: what messages call them.
+        declared: the space.
+        values: those of each dimension, in increasing order.
+    """
+
+    def __init__(self, name: str, declared: spaces.Box, values: Sequence[Array]) -> None:
+        super().__init__(name, declared, Product(ns=tuple(len(v) for v in values)))
+        self._values = values
+        # One row a dimension; what is missing is never looked at.
+        self._table = np.zeros((len(values), max(self.plain.ns)), declared.dtype)
+        for row, known in zip(self._table, values, strict=True):
+            row[: len(known)] = known
+        self._dimensions = np.arange(len(values))
+
+    def back(self, values: Array) -> Any:
+        return self._table[self._dimensions, values].reshape(-1, *self.declared.shape)
+
+    def back_one(self, value: Any) -> Any:
+        return self._table[self._dimensions, value].reshape(self.declared.shape)
+
+    def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
+        array = as_array(self.name, value)
+        shape = leading + self.declared.shape
+        if array.dtype.kind not in "biuf" or array.shape != shape or not np.isfinite(array).all():
+            raise self._fault(value)
+        flat = array.reshape(*leading, -1)
+        nearest = [
+            np.searchsorted((known[1:] + known[:-1]) / 2.0, flat[..., k])
+            for k, known in enumerate(np.asarray(v, np.float64) for v in self._values)
+        ]
+        return np.stack(nearest, axis=-1).astype(self.plain.dtype)
+
+
+class _Joined(Conversion):
+    """The components of all leaves of a ``Dict`` or ``Tuple``, one after another."""
+
+    def __init__(
+        self, name: str, declared: spaces.Space[Any], parts: Sequence[tuple[Any, Conversion]]
+    ) -> None:
+        ns = tuple(n for _, c in parts for n in _ns(c))
+        super().__init__(name, declared, Product(ns=ns))
+        self._parts = parts
+        ends = np.cumsum([len(_ns(c)) for _, c in parts])
+        self._where = [
+            slice(int(end) - len(_ns(c)), int(end)) for end, (_, c) in zip(ends, parts, strict=True)
+        ]
+
+    def back(self, values: Array) -> Any:
+        return nested(self.declared, iter([c.back(v) for c, v in self._split(values)]))
+
+    def back_one(self, value: Any) -> Any:
+        split = self._split(np.asarray(value))
+        return nested(self.declared, iter([c.back_one(v) for c, v in split]))
+
+    def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
+        converted: Array = np.empty((*leading, *self.plain.shape), self.plain.dtype)
+        for (path, conversion), where in zip(self._parts, self._where, strict=True):
+            found = value
+            for key in path:
+                try:
+                    found = found[key]
+                except (LookupError, TypeError) as error:
+                    raise self._fault(value) from error
+            part = conversion.convert(found, leading)
+            converted[..., where] = part.reshape(*leading, -1)
+        return converted
+
+    def _split(self, values: Array) -> list[tuple[Conversion, Array]]:
+        """Return the part of each leaf, as its own conversion knows it."""
+        return [
+            (c, values[..., where] if isinstance(c.plain, Product) else values[..., where.start])
+            for (_, c), where in zip(self._parts, self._where, strict=True)
+        ]
+
+
+def _ns(conversion: Conversion) -> tuple[int, ...]:
+    plain = conversion.plain
+    return plain.ns if isinstance(plain, Product) else (plain.n,)
+
+
+def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Conversion:
+    """Return how actions of a space become plain, and back.
+
+    Args:
+        space: of the environment's own.
+        settings: ``action_bins``, ``action_low``, ``action_high``.
+
+    Raises:
+        UnsupportedEnvironment: they are not supported; the message names what is not, and why.
+    """
+    leaves = list(leaves_within(space))
+    dimensions = sum(int(np.prod(s.shape)) for _, s in leaves if isinstance(s, spaces.Box))
+    bins = settings.action_bins or default_bins(dimensions)
+    parts: list[tuple[Any, Conversion]] = []
+    problems = []
+    for path, inner in leaves:
+        name = "action" + "".join(f"[{key!r}]" for key in path)
+        try:
+            parts.append((path, _of_leaf(name, inner, settings, bins)))
+        except UnsupportedEnvironment as error:
+            problems.append(str(error))
+    if not leaves:
+        problems.append(f"its actions are {space}, of which there is only one")
+    elif not problems and (n := sum(n for _, c in parts for n in _ns(c))) > _MOST_PARAMETERS:
+        problems.append(f"its actions are {space}, for which the network would have {n:,} outputs; "
+                        f"at most {_MOST_PARAMETERS:,} are supported")  # fmt: skip
+    if problems:
+        raise UnsupportedEnvironment("; besides, ".join(problems))
+    if [path for path, _ in leaves] == [()]:
+        return parts[0][1]
+    return _Joined("action", space, parts)
+
+
+def default_bins(dimensions: int) -> int:
+    """Return how many values a dimension has, if nothing else is said: fewer if there are many.
+
+    An odd number, so that the middle is one of them.
+    """
+    return 11 if dimensions <= 2 else 7
+
+
+def _of_leaf(
+    name: str, space: spaces.Space[Any], settings: ActionSettings, bins: int
+) -> Conversion:
+    match space:
+        case spaces.Discrete(n=n):
+            return Indexed(name, space, Categorical(n=int(n)))
+        case spaces.MultiDiscrete() if space.nvec.size:
+            return MultiIndexed(name, space, Product(ns=tuple(space.nvec.reshape(-1).tolist())))
+        case spaces.MultiBinary() if np.prod(space.shape) > 0:
+            return _Bits(name, space, Product(ns=(2,) * int(np.prod(space.shape))))
+        case spaces.Box() if np.prod(space.shape) > 0:
+            return _of_box(name, space, settings, bins)
+    raise UnsupportedEnvironment(
+        f"its {name} is {space}; supported are Discrete, MultiDiscrete, MultiBinary, Box, and Dict "
+        f"and Tuple of these; wrap it in gymnasium.wrappers.TransformAction"
+    )
+
+
+def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -> Conversion:
+    low, high = (
+        np.where(np.isfinite(bound), bound, np.nan if given is None else given).astype(np.float64)
+        for bound, given in ((space.low, settings.action_low), (space.high, settings.action_high))
+    )
+    missing = np.isnan(low) | np.isnan(high)
+    if missing.any():
+        place = np.argwhere(missing)[0].tolist()
+        raise UnsupportedEnvironment(
+            f"its {name}{place} has no bounds ({space}), and values are chosen between two; say "
+            f"between which, e.g. --set action_low=-1 --set action_high=1"
+        )
+    if (low >= high).any():
+        place = np.argwhere(low >= high)[0].tolist()
+        raise UnsupportedEnvironment(
+            f"its {name}{place} is from {low[tuple(place)]:g} to {high[tuple(place)]:g}; "
+            f"expected a lower bound below the higher one"
+        )
+    whole = np.issubdtype(space.dtype, np.integer)
+    values = [
+        np.unique(np.rint(v)) if whole else v
+        for v in np.linspace(low.reshape(-1), high.reshape(-1), bins, axis=1)
+    ]
+    return _Bins(name, space, [v.astype(space.dtype) for v in values])
