@@ -105,10 +105,10 @@ def test_logits_are_those_of_appendix_b_2(size: tuple[int, ...], initialisation:
         convolutions=(3, 4, 5, 6), hidden=(8, 7), frame_stack=2, initialisation=initialisation
     )
     behavior = initialise(config, spec)
-    given = images(4, spec, stack=2), commands(4)
+    seen, given = images(4, spec, stack=2), commands(4)
     with torch.inference_mode():
-        logits = behavior(*given)
-    expected = [appendix_b_2(behavior, *row) for row in zip(*given, strict=True)]
+        logits = behavior((seen,), given)
+    expected = [appendix_b_2(behavior, *row) for row in zip(seen, given, strict=True)]
     np.testing.assert_allclose(logits.numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
@@ -131,7 +131,7 @@ def test_layers_have_the_sizes_of_appendix_b_2(
 
 
 def test_bfloat16_is_near_float32() -> None:
-    given = images(32), commands(32)
+    given = (images(32),), commands(32)
     logits = {}
     for precision in PRECISIONS:
         with torch.inference_mode():

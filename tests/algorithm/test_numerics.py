@@ -12,6 +12,7 @@ from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction
 from udrl.config import Config, build
 from udrl.environments import Environment, EnvironmentSpec
+from udrl.environments.making import adapt
 from udrl.environments.obedience import Obedience
 from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
@@ -61,7 +62,11 @@ class Failing(Obedience):
 
 def generator_of(env: Callable[..., Environment]) -> EpisodeGenerator:
     spec = EnvSpec("Made-v0", entry_point=env, max_episode_steps=16)
-    return EpisodeGenerator(settings(), 2, lambda _: gym.make(spec, disable_env_checker=True))
+
+    def make(config: Config) -> Environment:
+        return adapt(gym.make(spec, disable_env_checker=True), "Made-v0", config.actions)
+
+    return EpisodeGenerator(settings(), 2, make)
 
 
 def test_an_environment_that_remembers_other_episodes_does_not_replay() -> None:

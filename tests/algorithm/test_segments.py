@@ -68,9 +68,10 @@ def all_times(length: int) -> list[tuple[int, int]]:
 def gathered(held: Experience, ids: list[int], wanted: list[tuple[int, int, int]]) -> list[Any]:
     """The examples for (rank, t1, t2), row by row."""
     segments = Segments(*np.array(wanted, np.int64).reshape(-1, 3).T)
+    (seen,), command, action = held.by_rank(ids).examples(segments)
     return [
         (s.tolist(), float(r), int(h), int(a))
-        for s, (r, h), a in zip(*held.by_rank(ids).examples(segments), strict=True)
+        for s, (r, h), a in zip(seen, command, action, strict=True)
     ]
 
 

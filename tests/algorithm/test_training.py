@@ -94,7 +94,9 @@ def train_one_by_one(state: TrainingState, episodes: list[Episode], config: Conf
                 ]
             )
             actions.append(int(episode.actions[t1]))
-        logits = state.behavior(torch.tensor(states), torch.tensor(commands, dtype=torch.float32))
+        logits = state.behavior(
+            (torch.tensor(states),), torch.tensor(commands, dtype=torch.float32)
+        )
         loss = functional.cross_entropy(logits, torch.tensor(actions))
         state.optimizer.zero_grad()
         loss.backward()
@@ -208,7 +210,7 @@ def test_table_1(seed: int) -> None:
     observation = torch.tensor([[row[0]] for row in table], dtype=torch.int32)
     command = torch.tensor([row[1:3] for row in table])
     with torch.inference_mode():
-        probability = state.behavior(observation, command).softmax(dim=1)
+        probability = state.behavior((observation,), command).softmax(dim=1)
     assert probability.argmax(dim=1).tolist() == [row[3] for row in table]
     assert probability.max(dim=1).values.min() > 0.9
 

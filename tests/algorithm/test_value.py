@@ -123,7 +123,7 @@ def test_with_lambda_1_labels_are_what_was_obtained() -> None:
 
 def test_steps_come_one_after_another_in_parts() -> None:
     episodes = [episode(0, [0.0] * 70), episode(1, [0.0] * 3)]
-    parts = list(ranked(episodes).steps(at_once=50))
+    parts = [(seen, done) for (seen,), done in ranked(episodes).steps(at_once=50)]
     assert [(len(seen), len(done)) for seen, done in parts] == [(50, 50), (23, 23)]
     for k, name in enumerate(["observations", "actions"]):
         expected = np.concatenate([getattr(e, name) for e in episodes])
@@ -150,7 +150,7 @@ def test_the_value_function_learns_what_follows() -> None:
     assert value is not None
     observation = torch.zeros(3, 3)
     observation[:, 0] = torch.tensor([1.0, 0.5, 0.1])
-    expected, deviation = (value(observation) / config.network.return_scale).unbind(1)
+    expected, deviation = (value((observation,)) / config.network.return_scale).unbind(1)
     torch.testing.assert_close(expected, torch.tensor([40.0, 20.0, 4.0]), atol=3.0, rtol=0)
     assert (deviation < 3.0).all()
 
@@ -171,7 +171,7 @@ def test_the_critic_learns_what_actions_bring_on_average() -> None:
         train(state, experience, config)
     assert state.critic is not None
     observation, actions = torch.zeros(4, 3), torch.arange(4)
-    expected = state.critic(observation, actions) / config.network.return_scale
+    expected = state.critic((observation,), actions) / config.network.return_scale
     torch.testing.assert_close(expected, torch.tensor([0.0, 0.5, 1.0, 1.5]), atol=0.3, rtol=0)
     # The examples say the same, whatever these episodes obtained.
     labels = experience.labels

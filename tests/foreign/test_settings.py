@@ -82,7 +82,7 @@ class OldStyle(Plain):
 
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
-        self.observation_space = spaces.Tuple((spaces.Discrete(2),))
+        self.observation_space = spaces.Tuple((spaces.Discrete(2), spaces.Text(5)))
         self.action_space = spaces.Text(5)
 
 
@@ -90,7 +90,7 @@ def test_all_that_is_not_supported_is_said_at_once() -> None:
     config = build(Config, {"environment": register(OldStyle, max_steps=None)})
     with pytest.raises(UnsupportedEnvironment) as refusal:
         make_environment(config)
-    for part in ("observations are Tuple", "actions are Text", "no step limit"):
+    for part in ("observation[1] is Text", "action is Text", "no step limit"):
         assert part in str(refusal.value)
 
 

@@ -10,6 +10,7 @@ from msgspec import inspect
 import udrl_proto.reports  # noqa: F401 - its messages are found too
 from udrl.config import Config, FlatSettings, build, flat
 from udrl.setting_groups import SettingsGroup
+from udrl.spaces import Leaf
 from udrl_proto.messages import Message
 
 MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
@@ -55,10 +56,15 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
             return st.one_of(*map(_any, types))
         case inspect.LiteralType(values=literals):
             return st.sampled_from(literals)
+        case inspect.VarTupleType(item_type=inspect.StructType(cls=cls) as item) if cls is Leaf:
+            leaves = st.lists(_any(item), min_size=1, max_size=4, unique_by=lambda one: one.name)
+            return leaves.map(tuple)
         case inspect.VarTupleType(item_type=item, min_length=least, max_length=most):
             return st.lists(_any(item), min_size=least or 0, max_size=min(most or 4, 4)).map(tuple)
         case inspect.DictType(key_type=key, value_type=value):
             return st.dictionaries(_any(key), _any(value), max_size=3)
+        case inspect.StrType(pattern=str(pattern)) if "f4" in pattern:
+            return st.from_regex(pattern.replace("$", r"\Z"))
         case inspect.StrType(pattern=str()):
             return st.from_regex(r"[A-Za-z0-9._-]{1,100}", fullmatch=True)
         case inspect.StrType(min_length=least, max_length=most):

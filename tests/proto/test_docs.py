@@ -11,16 +11,19 @@ import pytest
 from msgspec import inspect
 
 from tests.proto.strategies import MESSAGES, setting_fields
+from udrl.actions import Categorical, Product
 from udrl.commands import Command
 from udrl.config import Config, FlatSettings, Keywords
 from udrl.environments import EnvironmentSpec
+from udrl.spaces import Bits, Categories, Category, Image, Leaf, Record, Vector
 from udrl_proto import PROTOCOL, keys, verbs
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
 REASONS = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
 
-STRUCTS = [*MESSAGES, Command, Config, EnvironmentSpec]
+SPACES = [Vector, Bits, Image, Category, Categories, Record, Leaf, Categorical, Product]
+STRUCTS = [*MESSAGES, Command, Config, EnvironmentSpec, *SPACES]
 
 
 def number(value: float) -> str:
@@ -57,6 +60,8 @@ def described(kind: inspect.Type) -> str:
             return "finite number"
         case inspect.FloatType():
             return "number"
+        case inspect.StrType(pattern=str(pattern)) if "f4" in pattern:
+            return "`<f4`, `<i4`, `\\|u1`, or `\\|V` and a number"
         case inspect.StrType(pattern=str()):
             return "name"
         case inspect.StrType(max_length=None):
