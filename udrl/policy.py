@@ -64,7 +64,11 @@ class Policy:
             msgspec.structs.replace(self.config, environment_kwargs=known | kwargs)
         )
         if isinstance(self.spec.observation_space, Record):
-            env = gym.wrappers.TransformObservation(env, self._unpacked, env.observation_space)
+            space = env.observation_space
+            # A function, since Gymnasium copies what it is given, and a method has its policy.
+            env = gym.wrappers.TransformObservation(
+                env, lambda record: nested(space, iter(parts_of(record))), space
+            )
         if self.config.network.frame_stack == 1:
             return env
         return gym.wrappers.FrameStackObservation(env, self.config.network.frame_stack)
@@ -99,10 +103,6 @@ class Policy:
         row = self.behavior.logits(seen, desired)[0]
         logits: npt.NDArray[np.float64] = row.astype(np.float64)
         return logits
-
-    def _unpacked(self, record: Observations) -> Any:
-        """Return the leaves of a record in dictionaries and tuples, as its environment has them."""
-        return nested(self.spec.observation_space.gymnasium, iter(parts_of(record)))
 
     def _plain(self, observation: Any) -> Observations:
         """Return what the environment showed as an array, [frame_stack, *observation_shape]."""

@@ -1,0 +1,92 @@
+"""Environments of every kind of space, importable as ``kinds_of_spaces:Nested-v0`` and so on.
+
+Each has a goal that is learned quickly: a reward for every component of the action that equals what
+the observation says.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+STEPS = 8
+
+
+class Nested(gym.Env[Any, Any]):
+    """Dictionaries and tuples of everything, as observation and as action."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        self.observation_space = spaces.Dict(
+            bag=spaces.Tuple((spaces.MultiBinary(2), spaces.MultiDiscrete([2, 3]))),
+            map=spaces.Box(0, 255, (6, 6, 3), np.uint8),
+            room=spaces.Discrete(3, start=1),
+            speed=spaces.Box(-1, 1, (2, 2), np.float64),
+        )
+        self.action_space = spaces.Dict(
+            door=spaces.Discrete(3, start=1),
+            hands=spaces.MultiBinary(2),
+            legs=spaces.Box(-1, 1, (2,), np.float32),
+        )
+
+    def _seen(self) -> Any:
+        draw = self.np_random
+        self._door, self._hands = int(draw.integers(1, 4)), draw.integers(0, 2, 2, np.int8)
+        return {
+            "bag": (self._hands, draw.integers([2, 3])),
+            "map": draw.integers(0, 256, (6, 6, 3), np.uint8),
+            "room": self._door,
+            "speed": draw.uniform(-1, 1, (2, 2)),
+        }
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action), action
+        reward = float(action["door"] == self._door) + float((action["hands"] == self._hands).sum())
+        self._step += 1
+        return (
+            self._seen(),
+            reward - float(abs(action["legs"]).sum()),
+            self._step == STEPS,
+            False,
+            {},
+        )
+
+    def render(self) -> Any:
+        return np.zeros((32, 32, 3), np.uint8)
+
+
+class Reach(gym.Env[Any, Any]):
+    """One number to match with one number."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-1, 1, (), np.float32)
+        self.action_space = spaces.Box(-1, 1, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        self._goal = self.np_random.uniform(-1, 1)
+        return np.array(self._goal, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action), action
+        reward = -abs(float(action[0]) - self._goal)
+        self._step += 1
+        self._goal = self.np_random.uniform(-1, 1)
+        return np.array(self._goal, np.float32), reward, self._step == STEPS, False, {}
+
+
+for environment in (Nested, Reach):
+    name = f"{environment.__name__}-v0"
+    if name not in gym.registry:
+        gym.register(
+            name, entry_point=f"kinds_of_spaces:{environment.__name__}", max_episode_steps=100
+        )
