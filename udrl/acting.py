@@ -36,9 +36,6 @@ from udrl.targets import ReturnInTime
 #: Failures under the same command after which it is hopeless.
 MAX_FAILURES = 3
 
-#: A round that does not come.
-_NEVER = np.iinfo(np.int64).max
-
 
 class Failure(NamedTuple):
     """An episode that could not be finished, through the environment's fault."""
@@ -94,9 +91,7 @@ class EpisodeGenerator:
         self._n_capped = 0
         self._parameters = np.zeros((n_environments, self.spec.action_space.n_parameters))
         self._temperature = np.ones((n_environments, 1))
-        # The rounds from and before which its actions are random, and how many rows have such.
-        self._random_from = np.full(n_environments, _NEVER)
-        self._random_until = np.full(n_environments, _NEVER)
+        # How many rows have random actions.
         self._n_random = 0
 
     @property
@@ -135,10 +130,7 @@ class EpisodeGenerator:
             self._target.bound(self._desired, self._cap)
         self._parameters[row] = 0.0
         self._temperature[row] = command.temperature or 1.0
-        if command.random_steps:
-            self._random_from[row] = self._recording.round + command.random_from
-            self._random_until[row] = self._random_from[row] + command.random_steps
-            self._n_random += 1
+        self._n_random += command.is_ever_random
         return None
 
     def step(self) -> list[Episode | Failure]:
@@ -146,9 +138,9 @@ class EpisodeGenerator:
         rows, recording = self._rows, self._recording
         if not self._planned:
             self._plan()
-        uniforms = recording.begin_round(rows.observation)
+        decisions = recording.begin_round(rows.observation)
         self._evaluate()
-        actions = self._choose(uniforms)
+        actions = self._choose(*decisions)
         over, broken = rows.step(self._active, actions)
         recording.end_round(actions, rows.reward)
         # Lines 8, 9 and 11 of Algorithm 2; nobody reads the rows of idle environments.
@@ -188,16 +180,14 @@ class EpisodeGenerator:
             call.run()
             self._parameters[rows] = call.logits
 
-    def _choose(self, uniforms: npt.NDArray[np.float64]) -> Actions:
+    def _choose(self, numbers: npt.NDArray[np.float64], random: npt.NDArray[np.bool_]) -> Actions:
         """Choose a_t in every row: sampled, the mode, or random, as its command says."""
         space = self.spec.action_space
-        actions = space.sample(self._parameters, self._temperature, uniforms)
+        actions = space.sample(self._parameters, self._temperature, numbers)
         if self._greedy:
             actions[self._greedy] = space.mode(self._parameters[self._greedy])
         if self._n_random:
-            now = self._recording.round
-            random = (self._random_from <= now) & (now < self._random_until)
-            actions[random] = space.uniform(uniforms[random])
+            actions[random] = space.uniform(numbers[random])
         return actions
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
@@ -218,9 +208,7 @@ class EpisodeGenerator:
         command = self._command_of(row)
         self._commands[row] = self._behaviors[row] = None
         self._planned = False
-        if command.random_steps:
-            self._random_from[row] = _NEVER
-            self._n_random -= 1
+        self._n_random -= command.is_ever_random
         if command.cap is not None:
             self._cap[row] = np.inf
             self._n_capped -= 1

@@ -4,9 +4,10 @@ An episode is a pure function of its command. Sections 2.3.4 (exploratory comman
 (evaluation commands) are here, and so are the warm-up's, which say "act at random".
 """
 
+import hashlib
 import math
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,6 +34,19 @@ EVALUATION_SEEDS = (1, 500_000)
 CLOSING = 500_000
 
 
+class Decisions(NamedTuple):
+    """What decides the actions of an episode's first steps.
+
+    Attributes:
+        numbers: uniform in [0, 1), float64 [n, *action_shape].
+        random: whether the action is uniformly random, whatever the behavior function says,
+            bool [n].
+    """
+
+    numbers: npt.NDArray[np.float64]
+    random: npt.NDArray[np.bool_]
+
+
 class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An order to an actor.
 
@@ -51,6 +65,9 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             behavior function says.
         random_steps: how many there are of them, one after another.
         random_hold: for how many of them each of their actions is held.
+        random_rate: where it is not 0, there are other random actions instead: at each step that
+            holds none, one begins with this probability. It is held for ``random_hold`` times k
+            steps, where k is at least n with probability 1 / n.
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
@@ -66,6 +83,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     random_from: Annotated[int, Meta(ge=0, le=2**31)] = 0
     random_steps: Annotated[int, Meta(ge=0, le=2**31)] = 0
     random_hold: Annotated[int, Meta(ge=1, le=2**31)] = 1
+    random_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
 
     @property
     def iteration(self) -> int:
@@ -77,19 +95,36 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """The command's number within its iteration."""
         return self.id % COMMANDS_PER_ITERATION
 
-    def is_random(self, t: int) -> bool:
-        """Whether the action at step ``t`` is uniformly random."""
-        return 0 <= t - self.random_from < self.random_steps
+    @property
+    def is_ever_random(self) -> bool:
+        """Whether there may be random actions."""
+        return self.random_steps > 0 or self.random_rate > 0
 
-    def decisive(self, t: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return which number of the command's stream decides each step's action, int64 [n].
+    def decisions(self, n: int, shape: tuple[int, ...]) -> Decisions:
+        """Return what decides the first ``n`` actions of a shape."""
+        numbers = Stream(self.stream_key).uniforms(n * math.prod(shape)).reshape(n, *shape)
+        steps = np.arange(n)
+        if self.random_rate:
+            begun = self._begun(n)
+        else:
+            since = steps - self.random_from
+            random = (since >= 0) & (since < self.random_steps)
+            begun = np.where(random, steps - since % self.random_hold, -1)
+        random = begun >= 0
+        return Decisions(numbers[np.where(random, begun, steps)], random)
 
-        It is number ``t``; where an action is held, the one that it was chosen by.
-        """
-        since = t - self.random_from
-        held = (since >= 0) & (since < self.random_steps)
-        numbers: npt.NDArray[np.int64] = np.where(held, t - since % self.random_hold, t)
-        return numbers
+    def _begun(self, n: int) -> npt.NDArray[np.int64]:
+        """Return where the random action of each step began, int64 [n]; -1: it has none."""
+        begun = np.full(n, -1)
+        key = hashlib.sha256(self.stream_key).digest()[:16]
+        numbers = Stream(key).uniforms(n)
+        free = 0
+        for step in np.flatnonzero(numbers < self.random_rate).tolist():
+            if step >= free:
+                multiple = math.floor(1 / (1 - numbers[step] / self.random_rate))
+                free = step + self.random_hold * multiple
+                begun[step:free] = step
+        return begun
 
 
 class CommandSampler:
@@ -125,8 +160,9 @@ class CommandSampler:
 
         What they ask for is the strategy's choice (:mod:`udrl.strategies`): in the paper the mean
         length of the ``last_few`` best episodes, and a return that is uniform in [M, M + S]. Not in
-        the paper: in a share of the episodes, ``held_actions``, one random action is held for
-        ``hold_steps`` steps, from a step within the desired horizon on.
+        the paper: in a share of the episodes, ``held_actions``, random actions are held, one for
+        ``hold_steps`` steps from a step within the desired horizon on, or with a ``held_rate``
+        again and again.
 
         Raises:
             ConfigError: the strategy cannot be imported, or asks for what cannot be.
@@ -137,16 +173,21 @@ class CommandSampler:
         desired = [self._target.settle(*ask(self._strategy, best, number)) for number in u]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
-            msgspec.structs.replace(
-                c,
-                random_from=math.floor(x[k] * min(c.max_steps, c.desired_horizon)),
-                random_steps=self._settings.hold_steps,
-                random_hold=self._settings.hold_steps,
-            )
-            if w[k] < self._settings.held_actions
-            else c
+            self._explored(c, x[k]) if w[k] < self._settings.held_actions else c
             for k, c in enumerate(commands)
         ]
+
+    def _explored(self, command: Command, x: float) -> Command:
+        """Return a command with random actions that are held."""
+        rate, hold = self._settings.held_rate, self._settings.hold_steps
+        if rate:
+            return msgspec.structs.replace(command, random_rate=rate, random_hold=hold)
+        return msgspec.structs.replace(
+            command,
+            random_from=math.floor(x * min(command.max_steps, command.desired_horizon)),
+            random_steps=hold,
+            random_hold=hold,
+        )
 
     def training_command(self, episode_id: int) -> Command:
         """Return a warm-up or exploratory command again, apart from what it asked for."""

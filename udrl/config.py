@@ -121,6 +121,7 @@ OPEN: Mapping[str, Any] = {
     "return_scale": 1.0,
     "horizon_scale": 1.0,
     "baseline": "value",
+    "return_lambda": 0.95,
     "n_warm_up_episodes": 1,
     "warm_up_hold": 1,
     "held_actions": 1.0,
@@ -134,6 +135,7 @@ OPEN: Mapping[str, Any] = {
 #: What some settings need to have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
+    "held_rate": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),

@@ -35,6 +35,8 @@ _FEWEST_EPISODES = 10
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000
 #: Best episodes that commands are drawn from, as a share of an iteration.
 _BEST = 0.3
+#: Lambda of the lambda-returns: they reach over a quarter of a random episode, at the least.
+_LEAST_LAMBDA, _REACH = 0.95, 4.0
 #: Iterations that each half of the replay buffer holds.
 _HALF = 6
 
@@ -86,6 +88,7 @@ def fit(
         # How long an episode lasts is luck too, and one that is asked to be short would gamble.
         "horizon_scale": 0.0 if sample.by_chance else _rounded(1 / length),
         "baseline": baseline,
+        "return_lambda": max(_LEAST_LAMBDA, round(1 - _REACH / length, 3)),
         "n_warm_up_episodes": n_warm_up,
         "warm_up_hold": hold,
         # Averages need all actions to be tried again and again.

@@ -1,17 +1,15 @@
 """The steps of running episodes, in rings that grow with the longest of them."""
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
-from udrl.commands import Command
+from udrl.commands import Command, Decisions
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.memory import FrameStack, Seen
 from udrl.spaces import Observations
-from udrl.streams import Stream
 
+_KEPT = ("observations", "actions", "rewards")
 _FIRST_CAPACITY = 1024
 _FIRST_BYTES = 64 << 20
 
@@ -41,7 +39,8 @@ class Recording:
             "observations": np.zeros((*shape, *seen.shape), seen.dtype),
             "actions": np.zeros((*shape, *acted.shape), acted.dtype),
             "rewards": np.zeros(shape, np.float32),
-            "uniforms": np.zeros((*shape, *acted.shape)),
+            "numbers": np.zeros((*shape, *acted.shape)),
+            "random": np.zeros(shape, np.bool_),
         }
         self._commands: dict[int, Command] = {}
 
@@ -51,17 +50,12 @@ class Recording:
         self._commands[row] = command
         self._lay_out(row, command)
 
-    def begin_round(self, observation: Observations) -> npt.NDArray[np.float64]:
-        """Keep what is observed, [n, *observation_shape].
-
-        Returns:
-            The numbers that decide, float64 [n, *action_shape].
-        """
+    def begin_round(self, observation: Observations) -> Decisions:
+        """Keep what is observed, [n, *observation_shape]; return what decides each row's action."""
         self._make_room()
         at = self.round % self._capacity
         self._rings["observations"][at] = observation
-        uniforms: npt.NDArray[np.float64] = self._rings["uniforms"][at]
-        return uniforms
+        return Decisions(self._rings["numbers"][at], self._rings["random"][at])
 
     def end_round(self, actions: npt.NDArray[np.integer], rewards: npt.NDArray[np.float32]) -> None:
         """Keep what was done and what it brought, and go on to the next round."""
@@ -80,7 +74,7 @@ class Recording:
         """Return a row's episode, whose last step was that of the last round."""
         began = int(self.began[row])
         places = self._places(began, self.round - began)
-        kept = {name: self._rings[name][places, row] for name in self._rings if name != "uniforms"}
+        kept = {name: self._rings[name][places, row] for name in _KEPT}
         command = self._commands.pop(row)
         return Episode(command_id=command.id, terminated=terminated, truncated=truncated, **kept)
 
@@ -93,13 +87,11 @@ class Recording:
         return np.arange(first, first + count) % self._capacity
 
     def _lay_out(self, row: int, command: Command) -> None:
-        ring = self._rings["uniforms"]
-        shape = (self._capacity, *ring.shape[2:])
-        numbers = Stream(command.stream_key).uniforms(math.prod(shape)).reshape(shape)
-        if command.random_steps and command.random_hold > 1:
-            numbers = numbers[command.decisive(np.arange(self._capacity))]
+        numbers, random = self._rings["numbers"], self._rings["random"]
         places = self._places(int(self.began[row]), self._capacity)
-        ring[places, row] = numbers
+        numbers[places, row], random[places, row] = command.decisions(
+            self._capacity, numbers.shape[2:]
+        )
 
     def _make_room(self) -> None:
         """Make the ring twice as long if an episode would overwrite its own beginning."""

@@ -16,7 +16,6 @@ from udrl.commands import Command
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.policy import Policy
-from udrl.streams import Stream
 from udrl.targets import ReturnInTime
 
 Result = TypeVar("Result")
@@ -56,7 +55,7 @@ class Rollout:
         self._env = env
         self._target = ReturnInTime(policy.config.network)
         self._cap = np.array([math.inf if command.cap is None else command.cap])
-        self._numbers = np.empty((0, *policy.spec.action_space.shape))
+        self._decisions = command.decisions(0, policy.spec.action_space.shape)
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.network.frame_stack
@@ -97,11 +96,11 @@ class Rollout:
             EnvironmentFault: the environment raised an exception.
         """
         assert not self.over
-        space, uniform = self._policy.spec.action_space, self._uniform()
-        if self.command.is_random(self.steps):
-            action: Any = space.uniform(uniform[None])[0]
+        space, (number, is_random) = self._policy.spec.action_space, self._decision()
+        if is_random:
+            action: Any = space.uniform(number[None])[0]
         else:
-            action = space.choose(self._logits(), self.temperature, uniform)
+            action = space.choose(self._logits(), self.temperature, number)
         self.action = action = np.asarray(action).tolist()
         observation, reward, self.terminated, self.truncated, _ = self._carefully(
             "step", lambda: self._env.step(action)
@@ -135,14 +134,13 @@ class Rollout:
             )
         return picture
 
-    def _uniform(self) -> Any:
-        """Return the number, or numbers, that decide this step's action, float64."""
+    def _decision(self) -> tuple[Any, bool]:
+        """Return the number, or numbers, that decide this step's action, and if it is random."""
         t = self.steps
-        if t == len(self._numbers):
-            longer = (t + _AT_A_TIME, *self._numbers.shape[1:])
-            numbers = Stream(self.command.stream_key).uniforms(math.prod(longer)).reshape(longer)
-            self._numbers = numbers[self.command.decisive(np.arange(len(numbers)))]
-        return self._numbers[t]
+        if t == len(self._decisions.random):
+            shape = self._policy.spec.action_space.shape
+            self._decisions = self.command.decisions(t + _AT_A_TIME, shape)
+        return self._decisions.numbers[t], bool(self._decisions.random[t])
 
     def _logits(self) -> npt.NDArray[np.float64]:
         return self._policy.logits(

@@ -111,9 +111,12 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
             (:mod:`udrl.strategies`).
         last_few: number of best episodes that exploratory commands are drawn from (2.3.4).
         n_episodes_per_iter: exploratory episodes in an iteration.
-        held_actions: share of exploratory episodes in which one random action is held for
-            ``hold_steps`` steps, whatever the network says; 0 is the paper's.
-        hold_steps: steps that such an action is held for.
+        held_actions: share of exploratory episodes in which random actions are held for some
+            steps, whatever the network says; 0 is the paper's.
+        held_rate: with what probability one begins at each step of such an episode; 0: there is
+            one in an episode.
+        hold_steps: steps that such an action is held for; with a ``held_rate`` at least n times as
+            many with probability 1 / n.
         n_warm_up_episodes: episodes of random actions before the first iteration; with a
             ``dataset`` as many as it has.
         warm_up_hold: steps that a random action of the warm-up is held for; 1 is the paper's.
@@ -125,6 +128,7 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
     last_few: PositiveInt = 75
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20
     held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    held_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
     hold_steps: PositiveInt = 30
     n_warm_up_episodes: Annotated[int, Meta(ge=1, le=100_000)] = 50
     warm_up_hold: PositiveInt = 1

@@ -31,7 +31,7 @@ from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
 from udrl.memory import Seen
 from udrl.replay import Entry, ReplayBuffer
-from udrl.streams import Purpose, Stream, stream_key
+from udrl.streams import Purpose, stream_key
 from udrl.training import weights_of
 
 Make = Callable[[Config], Environment]
@@ -72,7 +72,6 @@ def algorithm2(
     env = make(config)
     spec = specify(env, config)
     limit_steps(env, command.max_steps)
-    stream = Stream(command.stream_key)
     dr, dh = command.desired_return, command.desired_horizon
     s, _ = env.reset(seed=command.environment_seed)
     dtype, shape = spec.observation_space.dtype, spec.observation_space.shape
@@ -91,11 +90,8 @@ def algorithm2(
                 (s.reshape(1, *(shape or (1,))),), np.array([[dr, dh]], np.float64)
             )[0].tolist()
         # 5: execute a_t ~ P(a_t | s_t, c_t)
-        number = float(stream.uniforms(1)[0])
-        since = len(episode) - command.random_from
-        is_random = 0 <= since < command.random_steps
-        if not is_random or since % command.random_hold == 0:
-            u = number  # else the same number again
+        numbers, random = command.decisions(len(episode) + 1, ())
+        u, is_random = float(numbers[-1]), random[-1]
         if is_random:
             a = int(u * spec.action_space.n_parameters)
         elif command.temperature == 0:

@@ -1,5 +1,6 @@
 from collections.abc import Sequence
-from math import sqrt
+from hashlib import sha256
+from math import floor, prod, sqrt
 from typing import Any
 
 import msgspec
@@ -247,17 +248,60 @@ def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
 @pytest.mark.parametrize("hold", [1, 3])
 def test_warm_up_acts_at_random_from_the_first_step_to_the_last(hold: int) -> None:
     for command in sampler(warm_up_hold=hold, max_train_steps=60).warm_up():
-        assert all(command.is_random(t) for t in range(60))
-        assert command.decisive(np.arange(7)).tolist() == [t - t % hold for t in range(7)]
+        numbers, random = command.decisions(60, ())
+        assert random.all()
+        assert numbers.tolist() == [numbers[t - t % hold] for t in range(60)]
 
 
-def test_held_action_is_decided_by_the_number_of_its_first_step() -> None:
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_held_action_is_decided_by_the_numbers_of_its_first_step(shape: tuple[int, ...]) -> None:
     (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
-    assert not any(command.is_random(t) for t in range(20))
-    assert command.decisive(np.arange(9)).tolist() == list(range(9))
+    usual = Stream(command.stream_key).uniforms(9 * prod(shape)).reshape(9, *shape)
+    numbers, random = command.decisions(9, shape)
+    assert not random.any()
+    assert numbers.tolist() == usual.tolist()
     held = msgspec.structs.replace(command, random_from=2, random_steps=4, random_hold=4)
-    assert [t for t in range(9) if held.is_random(t)] == [2, 3, 4, 5]
-    assert held.decisive(np.arange(9)).tolist() == [0, 1, 2, 2, 2, 2, 6, 7, 8]
+    numbers, random = held.decisions(9, shape)
+    assert np.flatnonzero(random).tolist() == [2, 3, 4, 5]
+    assert numbers.tolist() == usual[[0, 1, 2, 2, 2, 2, 6, 7, 8]].tolist()
+
+
+@given(st.binary(min_size=16, max_size=16), st.floats(0.01, 1), st.integers(1, 4))
+def test_with_a_rate_actions_of_any_length_are_held(key: bytes, rate: float, hold: int) -> None:
+    (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
+    command = msgspec.structs.replace(command, stream_key=key, random_rate=rate, random_hold=hold)
+    usual = Stream(key).uniforms(300)
+    begins = Stream(sha256(key).digest()[:16]).uniforms(300)
+    expected, held_until = [], 0
+    for t in range(300):
+        if t >= held_until:
+            since = t
+            if begins[t] < rate:
+                held_until = t + hold * floor(1 / (1 - begins[t] / rate))
+        expected.append((usual[since], held_until > t))
+        if held_until <= t + 1:
+            since = t + 1
+    numbers, random = command.decisions(300, ())
+    assert list(zip(numbers, random, strict=True)) == expected
+    fewer = command.decisions(70, ())
+    assert fewer.numbers.tolist() == numbers[:70].tolist()
+    assert fewer.random.tolist() == random[:70].tolist()
+
+
+def test_lengths_are_at_least_n_times_as_often_as_one_in_n() -> None:
+    (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
+    command = msgspec.structs.replace(command, random_rate=0.2)
+    numbers, random = command.decisions(200_000, ())
+    begun = np.flatnonzero(np.diff(numbers, prepend=-1.0) != 0)
+    lengths = np.diff(begun)[random[begun[:-1]]]
+    for n in (2, 5, 10):
+        assert (lengths >= n).mean() == pytest.approx(1 / n, rel=0.1)
+
+
+def test_a_rate_takes_the_place_of_one_held_action() -> None:
+    config = {"held_actions": 1.0, "held_rate": 0.25, "hold_steps": 5}
+    for command in sampler(**config).explore(1, buffer_of([1.0])):
+        assert (command.random_rate, command.random_hold, command.random_steps) == (0.25, 5, 0)
 
 
 @pytest.mark.parametrize("max_return", [None, 12.0])

@@ -52,6 +52,7 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
         ({"temperature": 0.4, "cap": 20.0}, {}),
         ({"max_steps": 12}, {"frame_stack": 4}),
         ({"random_from": 5, "random_steps": 4, "random_hold": 4}, {}),
+        ({"random_rate": 0.3, "random_hold": 2}, {}),
         ({"random_steps": 1000, "random_hold": 7, "temperature": 0.0}, {}),
         ({"desired_return": 40.7}, {"desired_horizon": "return"}),
         ({"desired_return": 500.0}, {"max_return": 20.0}),

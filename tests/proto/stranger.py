@@ -107,6 +107,8 @@ def run_episode(
     limited = {"max_episode_steps": command["max_steps"]} | config["environment_kwargs"]
     env = gym.make(config["environment"], **limited)
     u = numbers(command["stream_key"], command["max_steps"])
+    begins = numbers(hashlib.sha256(command["stream_key"]).digest()[:16], command["max_steps"])
+    begun = held_until = 0
     desired, horizon = command["desired_return"], float(command["desired_horizon"])
     observation, _ = env.reset(seed=command["environment_seed"])
     observations: list[npt.NDArray[Any]] = []
@@ -119,7 +121,13 @@ def run_episode(
         observations.append(as_promised(observation, spec))
         t = len(actions)
         since = t - command["random_from"]
-        if 0 <= since < command["random_steps"]:
+        if command["random_rate"] and t >= held_until and begins[t] < command["random_rate"]:
+            begun = t
+            multiple = math.floor(1 / (1 - begins[t] / command["random_rate"]))
+            held_until = t + command["random_hold"] * multiple
+        if t < held_until:
+            action = int(u[begun] * n_actions)
+        elif not command["random_rate"] and 0 <= since < command["random_steps"]:
             action = int(u[t - since % command["random_hold"]] * n_actions)
         else:
             assert network is not None
@@ -216,6 +224,7 @@ def environment_digest(hello: dict[str, Any]) -> str:
         "random_from": 0,
         "random_steps": n,
         "random_hold": 1,
+        "random_rate": 0.0,
     }
     return episode_digest(0, run_episode(command, hello, None)).hex()[:16]
 

@@ -144,6 +144,7 @@ def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None
     [
         (0, {"random_steps": 25}), (0, {"random_steps": 25, "random_hold": 4}), (1, {}),
         (1, {"random_from": 4, "random_steps": 3, "random_hold": 3}), (1, {"cap": 9.0}),
+        (1, {"random_rate": 0.4}), (1, {"random_rate": 0.3, "random_hold": 2}),
         (1, {"temperature": 0.3}), (1, {"temperature": 0.0}),
     ],
 )  # fmt: skip
