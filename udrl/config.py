@@ -125,6 +125,7 @@ OPEN: Mapping[str, Any] = {
     "n_warm_up_episodes": 1,
     "warm_up_hold": 1,
     "held_actions": 1.0,
+    "held_rate": 0.0,
     "hold_steps": 1,
     "n_episodes_per_iter": 1,
     "last_few": 1,

@@ -18,12 +18,13 @@ from udrl.episode import Episode
 
 #: Random episodes that are looked at: so many, and more until there are enough env steps; fewer if
 #: they are long.
-_EPISODES, _MOST_EPISODES, _STEPS, _PLENTY = 20, 500, 1_000, 10_000
+_EPISODES, _MOST_EPISODES, _STEPS, _PLENTY = 40, 500, 1_000, 10_000
 #: Steps of an episode that are looked at.
 _LONGEST = 2_000
-#: Steps for which a random action may be held, episodes that are played with each, and how many of
-#: the best count.
-_HOLDS, _TRIED, _COUNT = (2, 8, 32), 40, 3
+#: Steps for which a random action may be held, and how many of the best episodes count.
+_HOLDS, _COUNT = (2, 8, 32), 3
+#: With what probability a random action begins at a step: where chance decides, and elsewhere.
+_RATE_BY_CHANCE, _RATE = 0.15, 0.05
 #: What the network reads well.
 _LEAST, _MOST = 0.1, 10.0
 #: Env steps in an iteration: if its episodes are like random ones, and at most.
@@ -63,14 +64,14 @@ def fit(
     if not left_open:
         return config
     hold, n_warm_up = config.commands.warm_up_hold, config.commands.n_warm_up_episodes
-    if episodes is None:
-        if not {"warm_up_hold", "hold_steps"}.isdisjoint(left_open):
-            hold = _best_hold(config, generator)
-        sample = _play(config, generator, hold, _EPISODES, _MOST_EPISODES)
-    else:
+    if episodes is not None:
         sample = Sample()
         for episode in episodes:
             sample.add(episode)
+    elif {"warm_up_hold", "hold_steps"}.isdisjoint(left_open):
+        sample = _play(config, generator, hold)
+    else:
+        hold, sample = _best_hold(config, generator)
     returns, length = sample.returns, sum(sample.lengths) / len(sample.lengths)
     reach = max(*map(abs, returns), max(returns) - min(returns), 0.0)
     n_episodes = config.commands.n_episodes_per_iter
@@ -93,6 +94,7 @@ def fit(
         "warm_up_hold": hold,
         # Averages need all actions to be tried again and again.
         "held_actions": 0.5 if sample.by_chance else 0.25,
+        "held_rate": _RATE_BY_CHANCE if sample.by_chance else _RATE,
         "hold_steps": hold,
         "n_episodes_per_iter": n_episodes,
         "last_few": max(1, round(_BEST * n_episodes)),
@@ -119,6 +121,10 @@ class Sample:
         self.by_chance = False
         self._consequences: dict[bytes, bytes] = {}
 
+    def best(self) -> list[float]:
+        """Return the returns of the best few, the least first."""
+        return sorted(self.returns)[-_COUNT:]
+
     def add(self, episode: Episode) -> None:
         """Look at an episode."""
         self.returns.append(episode.episode_return)
@@ -131,42 +137,32 @@ class Sample:
             self.by_chance |= self._consequences.setdefault(done, follows) != follows
 
 
-def _best_hold(config: Config, generator: EpisodeGenerator) -> int:
-    """Return for how many steps random actions should be held.
+def _best_hold(config: Config, generator: EpisodeGenerator) -> tuple[int, Sample]:
+    """Return for how many steps random actions should be held, and episodes in which they are.
 
     Where one step moves little, actions that change at every step cancel each other, and hardly any
     random episode obtains more than the usual. Only there they are held: for as many steps as let
     the best few of some episodes obtain most, and all of these few more than the usual. If in
     doubt, 1; and where chance decides, which might do the same.
     """
-    sample = _play(config, generator, 1, _TRIED, _TRIED)
+    sample = _play(config, generator, 1)
     ordered = sorted(sample.returns)
     usual = ordered[len(ordered) // 2]
-    if ordered[-_COUNT] > usual or sample.by_chance:
-        return 1
-    found = {
-        hold: sorted(_play(config, generator, hold, _TRIED, _TRIED).returns)[-_COUNT:]
-        for hold in _HOLDS
-    }
-    found = {hold: few for hold, few in found.items() if few[0] > usual}
-    return max(found, key=lambda hold: sum(found[hold]), default=1)
+    found = {1: sample}
+    if ordered[-_COUNT] <= usual and not sample.by_chance:
+        held = {hold: _play(config, generator, hold) for hold in _HOLDS}
+        found |= {hold: one for hold, one in held.items() if one.best()[0] > usual}
+    best = max(found, key=lambda hold: sum(found[hold].best()))
+    return best, found[best]
 
 
-def _play(config: Config, generator: EpisodeGenerator, hold: int, fewest: int, most: int) -> Sample:
-    """Play the first commands of the warm-up, with random actions held for ``hold`` steps.
-
-    Args:
-        config: the settings.
-        generator: plays.
-        hold: in steps.
-        fewest: episodes, unless they have plenty of env steps before.
-        most: episodes, unless they have enough env steps before.
-    """
-    sampler = CommandSampler(change(config, n_warm_up_episodes=most), generator.spec)
+def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
+    """Play the first commands of the warm-up, with random actions held for ``hold`` steps."""
+    sampler = CommandSampler(change(config, n_warm_up_episodes=_MOST_EPISODES), generator.spec)
     sample = Sample()
     for n, command in enumerate(sampler.warm_up()):
         steps = sum(sample.lengths)
-        if steps >= (_PLENTY if n < fewest else _STEPS):
+        if steps >= (_PLENTY if n < _EPISODES else _STEPS):
             break
         played = msgspec.structs.replace(
             command, random_hold=hold, max_steps=min(command.max_steps, _LONGEST)

@@ -33,6 +33,11 @@ class ReturnInTime:
         self._network = network
 
     @property
+    def has_horizon(self) -> bool:
+        """Whether it makes a difference which horizon is desired."""
+        return not self.horizon_follows and self._network.horizon_scale > 0
+
+    @property
     def scales(self) -> tuple[float, float]:
         """Factors on return and horizon at the networks' input (section 3.2)."""
         return self._network.return_scale, self._network.horizon_scale

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-from udrl import recording
+from udrl import commands
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
 from udrl.behavior import initialise
 from udrl.commands import Command, CommandSampler
@@ -368,7 +368,7 @@ class Edges:
 def test_an_action_of_probability_zero_is_never_taken(
     logits: list[float], actions: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "Stream", Edges)
+    monkeypatch.setattr(commands, "Stream", Edges)
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 3).make)
     (episode,) = generate_episodes(generator, [order(1)], Spy(generator, logits))

@@ -165,11 +165,14 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
     )
     fitted = fit(
-        settings, ("baseline", "horizon_scale", "held_actions"), EpisodeGenerator(settings, 1)
+        settings,
+        ("baseline", "horizon_scale", "held_actions", "held_rate"),
+        EpisodeGenerator(settings, 1),
     )
     assert fitted.network.baseline == expected
     assert (fitted.network.horizon_scale == 0) is slippery
     assert fitted.commands.held_actions == (0.5 if slippery else 0.25)
+    assert fitted.commands.held_rate == (0.15 if slippery else 0.05)
     everything = change(settings, segments="all")
     assert (
         fit(everything, ("baseline",), EpisodeGenerator(everything, 1)).network.baseline == "none"
@@ -190,6 +193,14 @@ def test_actions_are_held_where_one_step_moves_little(environment: str, expected
     fitted = fit(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
     assert fitted.warm_up_hold == expected
     assert fitted.hold_steps == settings.commands.hold_steps
+
+
+@pytest.mark.parametrize(("length", "expected"), [(9, 0.95), (80, 0.95), (200, 0.98), (500, 0.992)])
+def test_lambda_follows_the_length_of_episodes(length: int, expected: float) -> None:
+    settings = config()
+    generator = EpisodeGenerator(settings, 1)
+    fitted = fit(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
+    assert fitted.training.return_lambda == expected
 
 
 def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:

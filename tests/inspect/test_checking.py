@@ -71,7 +71,8 @@ def test_command_prints_lines_or_json() -> None:
     told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(told.stdout)["max_episode_steps"] == 500
     told = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
-    assert "settings      baseline = value, held_actions = 0.25, hold_steps = 32" in told.stdout
+    chosen = "baseline = value, held_actions = 0.25, held_rate = 0.05, hold_steps = 32"
+    assert f"settings      {chosen}" in told.stdout
     assert "All random episodes return" not in told.stdout  # held for 32 steps, some succeed
 
 

@@ -146,6 +146,14 @@ def test_where_horizons_follow_from_returns_they_are_not_varied(ended_run: Path)
     assert plan.by_horizon == []
 
 
+def test_horizons_that_are_not_read_are_neither_varied_nor_commanded(ended_run: Path) -> None:
+    agent = load_agent(ended_run)
+    agent = agent._replace(config=change(agent.config, horizon_scale=0))
+    assert plan_commands(agent, points=3, episodes=2).by_horizon == []
+    with pytest.raises(ConfigError, match=r"desired horizon 9.*do not read it"):
+        evaluation_commands(agent, episodes=2, desired_horizon=9)
+
+
 def test_a_buffer_of_equal_returns_leaves_nothing_to_compare(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     best = ReplayBuffer(agent.config.buffer, [e._replace(episode_return=9.0) for e in agent.buffer])

@@ -151,8 +151,14 @@ def evaluation_commands(
     """Return the commands of an evaluation; what is None is as in the run's closing one (2.3.6).
 
     Raises:
-        ConfigError: a horizon is given, and the run's horizons follow from the returns.
+        ConfigError: a horizon is given, and the run's horizons follow from the returns, or are not
+            read.
     """
+    if agent.config.network.horizon_scale == 0 and desired_horizon is not None:
+        raise ConfigError(
+            f"desired horizon {desired_horizon}: this run's agents do not read it (horizon_scale "
+            f"= 0); give the return only"
+        )
     if agent.config.network.desired_horizon == "return" and desired_horizon is not None:
         raise ConfigError(
             f"desired horizon {desired_horizon}: in this run it is the desired return, as an "

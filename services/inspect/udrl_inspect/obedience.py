@@ -26,6 +26,7 @@ from udrl.obedience import (
 )
 from udrl.setting_groups import Temperature
 from udrl.strategies import nearest
+from udrl.targets import ReturnInTime
 from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
 from udrl_inspect.tables import put
 
@@ -100,7 +101,7 @@ class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         tolerance: how far a mean may be from its command, in units of the return.
         by_return: commanded returns in increasing order, each with the horizon that belongs to it.
         by_horizon: commanded horizons in increasing order, all with the return that evaluations
-            command; empty where horizons follow from returns, or all episodes have the same length.
+            command; empty where that makes no difference, or all episodes have the same length.
         all_returns: agreement over all of ``by_return``.
         obeyed: agreement over the range in which the agent obeys; None: there is none.
         all_horizons: agreement of commanded horizons and lengths, in steps; None: not measured.
@@ -176,9 +177,9 @@ def plan_commands(
         )  # fmt: skip
 
     common = spread(returns, points)
-    follows = agent.config.network.desired_horizon == "return"
+    has_horizon = ReturnInTime(agent.config.network).has_horizon
     by_return = [
-        commands(value, None if follows else nearest(mean_of_nearest(value, returns, lengths)))
+        commands(value, nearest(mean_of_nearest(value, returns, lengths)) if has_horizon else None)
         for value in (evenly(*desired_returns, points) if desired_returns else common)
     ]
     by_return = list({told[0].desired_return: told for told in by_return}.values())
@@ -188,7 +189,7 @@ def plan_commands(
             f"all returns that could be commanded are {only:g}, as those of the replay buffer are; "
             f"name a range to command: --desired-returns LOW:HIGH"
         )
-    horizons = [] if follows else spread(lengths, points)
+    horizons = spread(lengths, points) if has_horizon else []
     whole = sorted({max(1, nearest(value)) for value in horizons})
     by_horizon = [commands(None, value) for value in whole] if len(whole) > 1 else []
     return Plan(by_return, by_horizon, (common[0], common[-1]))
