@@ -41,7 +41,9 @@ _Outer = KeywordValue | list[_Inner] | dict[str, _Inner]
 #: Keyword arguments for an environment.
 Keywords = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer]]
 #: Settings as they are sent and stored: by name, without their groups.
-FlatSettings = dict[str, KeywordValue | list[int] | Keywords | None]
+FlatSettings = dict[str, KeywordValue | list[int | str] | Keywords | None]
+#: Where a wrapper is found.
+Wrapper = Annotated[str, Meta(min_length=1, max_length=200)]
 
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
@@ -55,6 +57,9 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
     Attributes:
         environment: a Gymnasium id, registered or importable (``package.module:Env-v0``).
         environment_kwargs: keyword arguments for ``gymnasium.make``.
+        wrappers: what the environment is wrapped in, one after another, as
+            ``package.module:Wrapper``.
+        observe_previous: whether the previous action and reward are observed too.
         max_episode_steps: time limit of an episode in steps; None: the environment's own.
         max_train_steps: time limit of warm-up and exploratory episodes only; None: no other.
         max_return: the greatest return that the environment can give, which caps the desired
@@ -72,6 +77,8 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
 
     environment: Annotated[str, Meta(min_length=1, max_length=200)]
     environment_kwargs: Keywords = {}
+    wrappers: Annotated[tuple[Wrapper, ...], Meta(min_length=0, max_length=16)] = ()
+    observe_previous: bool = False
     max_episode_steps: PositiveInt | None = None
     max_train_steps: PositiveInt | None = None
     max_return: float | None = None
@@ -136,6 +143,7 @@ OPEN: Mapping[str, Any] = {
 #: What some settings need to have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
+    "drop_previous": (lambda config: config.observe_previous, "observe_previous"),
     "held_rate": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),

@@ -19,6 +19,7 @@ from udrl.digests import episode_digest, replay_digest
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.conversions import Conversion, observation_conversion
 from udrl.environments.making import EnvironmentSpec, make_environment
+from udrl.environments.previous import observation_space, shown_in_all_steps
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
 
@@ -95,8 +96,13 @@ class _Reader:
         self._spec = spec
         seen, done = dataset.observation_space, dataset.action_space
         try:
-            observations = observation_conversion(seen)
             actions = action_conversion(done, config.actions)
+            observations = observation_conversion(seen)
+            self._adds_previous = config.observe_previous and (
+                observations.plain != spec.observation_space
+            )
+            if self._adds_previous:
+                observations = observation_conversion(observation_space(seen, done))
         except UnsupportedEnvironment as error:
             raise ConfigError(
                 f"dataset {name!r}: {error}; name a dataset of the run's environment"
@@ -109,6 +115,13 @@ class _Reader:
             )
         self._observations, self._actions = observations, actions
 
+    def _shown(self, data: Any) -> Any:
+        """Return the observations of a dataset's episode as those of the run's environment."""
+        if not self._adds_previous:
+            return data.observations
+        done = self._actions.declared
+        return shown_in_all_steps(done, data.observations, data.actions, data.rewards)
+
     def episode(self, number: int, data: Any) -> Episode:
         rewards = np.asarray(data.rewards, np.float32)
         n, terminated = len(rewards), bool(data.terminations[-1])
@@ -116,7 +129,7 @@ class _Reader:
             episode = Episode(
                 command_id=number,
                 # One more than steps: nothing was done after the last.
-                observations=self._observations.convert(data.observations, (n + 1,))[:-1],
+                observations=self._observations.convert(self._shown(data), (n + 1,))[:-1],
                 actions=self._actions.convert(data.actions, (n,)),
                 rewards=rewards,
                 terminated=terminated,

@@ -17,7 +17,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.memory import FrameStack, Seen
-from udrl.spaces import parts_of
+from udrl.spaces import leaves_of
 from udrl.targets import Desired, ReturnInTime
 
 _PAGE = 64
@@ -95,6 +95,7 @@ class Experience:
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
         seen, acted = spec.observation_space, spec.action_space
+        self._leaves = leaves_of(seen)
         self._memory = FrameStack(seen, config.network.frame_stack)
         self._observations = np.empty((0, *seen.shape), seen.dtype)
         self._actions = np.empty((0, *acted.shape), acted.dtype)
@@ -179,7 +180,7 @@ class RankedExperience:
         expected: (V, D) at every step, in the same order, scaled, float32 [steps, 2]
             (:mod:`udrl.value`); None: unknown.
         shapes: of observations as the networks see them, for each leaf.
-        dtypes: likewise.
+        leaves: of the observation space.
         action_shape: of one action.
     """
 
@@ -189,7 +190,7 @@ class RankedExperience:
         self.labels: Numbers | None = None
         self.expected: npt.NDArray[np.float32] | None = None
         self.shapes = experience._memory.shapes
-        self.dtypes = tuple(part.dtype for part in parts_of(experience._observations))
+        self.leaves = experience._leaves
         self.action_shape = experience._actions.shape[1:]
         self.lengths: Indices = experience._lengths[slots]
         self._first_step: Indices = np.cumsum(self.lengths) - self.lengths

@@ -144,6 +144,8 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
         batch_size: examples in one update.
         learning_rate: Adam's.
         n_updates_per_iter: gradient steps in an iteration.
+        drop_previous: with ``observe_previous``, share of the examples without these, so that the
+            agent learns more than to copy itself.
         return_lambda: with a ``baseline``, the lambda of the lambda-returns that examples are
             labelled with: 1 for the observed return, 0 for one reward and the value after it.
     """
@@ -152,6 +154,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     learning_rate: Annotated[float, Meta(gt=0, le=10)] = 3.5e-4
     n_updates_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 100
+    drop_previous: Annotated[float, Meta(ge=0, le=1)] = 0.25
     return_lambda: Annotated[float, Meta(ge=0, le=1)] = 0.95
 
 

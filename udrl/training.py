@@ -17,6 +17,7 @@ from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
 from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
+from udrl.environments.previous import PREVIOUS
 from udrl.graph import Weights
 from udrl.initialisation import draw_weights
 from udrl.segments import RankedExperience, Segments, draw_segments
@@ -24,6 +25,8 @@ from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 from udrl.value import Critic, ValueFunction, relative, value_loss
 
+#: Paths of what was before an observation.
+_PREVIOUS = [(key,) for key in PREVIOUS]
 #: Bytes of observations that are gathered at once for the next updates.
 _GATHERED_BYTES = 16 << 20
 
@@ -151,22 +154,38 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         experience.lengths,
         training.segments,
     )
+    hidden = None
+    if config.observe_previous:
+        numbers = stream.uniforms(segments.rank.size).reshape(segments.rank.shape)
+        hidden = numbers < training.drop_previous
     with _threads(config.arithmetic.training_threads):
-        losses = _update(state, experience, segments, config)
+        losses = _update(state, experience, segments, hidden, config)
     state.version = version
     state.loss = losses / training.n_updates_per_iter
 
 
 def _update(
-    state: TrainingState, experience: RankedExperience, segments: Segments, config: Config
+    state: TrainingState,
+    experience: RankedExperience,
+    segments: Segments,
+    hidden: npt.NDArray[np.bool_] | None,
+    config: Config,
 ) -> float:
-    """Make one Adam update for each row of ``segments``; return the sum of their losses."""
+    """Make one Adam update for each row of ``segments``; return the sum of their losses.
+
+    Args:
+        state: to be advanced.
+        experience: the buffer.
+        segments: int64 [updates, batch_size].
+        hidden: from which examples the previous action and reward are hidden, bool of that shape.
+        config: the settings.
+    """
     batches = _Batches(config, experience)
     losses = torch.zeros((), dtype=torch.float64, device=config.arithmetic.device)
     if state.behavior.value is not None:
         _learn_value(state, state.behavior.value, experience, segments, config, batches)
     step = _Stepper(state)
-    for seen, command, action in batches.gather(segments):
+    for seen, command, action in batches.gather(segments, hidden):
         loss = state.behavior.loss(state.behavior.obey(seen, command), action)
         step(loss)
         losses += loss.detach()
@@ -264,7 +283,9 @@ class _Batches:
     def __init__(self, config: Config, experience: RankedExperience) -> None:
         self._experience = experience
         training = config.training
-        kinds = list(zip(experience.shapes, experience.dtypes, strict=True))
+        leaves = experience.leaves
+        kinds = [(s, leaf.space.dtype) for s, leaf in zip(experience.shapes, leaves, strict=True)]
+        self._previous = [k for k, leaf in enumerate(leaves) if leaf.path[:1] in _PREVIOUS]
         bytes_each = training.batch_size * sum(math.prod(s) * d.itemsize for s, d in kinds)
         self._at_once = max(1, min(training.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
         n = self._at_once, training.batch_size
@@ -274,7 +295,9 @@ class _Batches:
         self._device = config.arithmetic.device
         self._scales = np.array(ReturnInTime(config.network).scales)
 
-    def gather(self, segments: Segments) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Tensor]]:
+    def gather(
+        self, segments: Segments, hidden: npt.NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Tensor]]:
         """Yield what is seen, scaled commands and actions of each update, where the network is.
 
         Commands are relative to what is expected, once that is known.
@@ -288,6 +311,9 @@ class _Batches:
             examples = self._experience.examples(flat)
             for gathered, one in zip(self._seen, examples.seen, strict=True):
                 gathered[:n].numpy()[:] = one.reshape(gathered[:n].shape)
+            if hidden is not None:
+                for k in self._previous:
+                    self._seen[k][:n].numpy()[hidden[first : first + n]] = 0
             command[:] = (examples.command * self._scales).reshape(command.shape)
             if (expected := self._experience.expected_at(flat)) is not None:
                 commands = self._commands[:n]

@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -21,6 +22,7 @@ from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
 from udrl.environments.conversions import observation_conversion
+from udrl.environments.previous import ObservePrevious
 from udrl.errors import UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
 from udrl.spaces import ObservationSpace
@@ -95,7 +97,24 @@ def make_environment(config: Config) -> Adapter:
             f"environment {name!r} cannot be made: {type(error).__name__}: {error}; "
             f"{_remedy(error, config)}"
         ) from error
-    return adapt(env, name, config.actions)
+    for wrapper in config.wrappers:
+        env = _wrapped(env, wrapper)
+    return adapt(ObservePrevious(env) if config.observe_previous else env, name, config.actions)
+
+
+def _wrapped(env: Environment, name: str) -> Environment:
+    module, colon, attribute = name.partition(":")
+    try:
+        if not colon:
+            raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
+        wrapped: Environment = getattr(import_module(module), attribute)(env)
+    except Exception as error:
+        close(env)
+        raise UnsupportedEnvironment(
+            f"wrapper {name!r} cannot be applied: {type(error).__name__}: {error}; name a wrapper "
+            f"that is importable here, as package.module:Wrapper, and takes an environment alone"
+        ) from error
+    return wrapped
 
 
 def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:

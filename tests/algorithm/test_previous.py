@@ -1,0 +1,204 @@
+"""The previous action and reward as a part of what is observed."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.algorithm1 import algorithm1
+from udrl.commands import CommandSampler
+from udrl.config import Budget, Config, build, refuse_idle
+from udrl.digests import arrays_digest
+from udrl.environments import make_environment
+from udrl.environments.making import specify
+from udrl.environments.previous import PREVIOUS, ObservePrevious, nothing
+from udrl.episode import Episode
+from udrl.errors import ConfigError, UnsupportedEnvironment
+from udrl.offline import read_dataset
+from udrl.segments import Experience
+from udrl.spaces import Record
+from udrl.training import train, untrained
+
+NESTED = "kinds_of_spaces:Nested-v0"
+
+
+def config(**values: Any) -> Config:
+    small = {
+        "environment": "CartPole-v1", "observe_previous": True, "hidden": [8, 8],
+        "convolutions": [4], "n_warm_up_episodes": 4, "batch_size": 16, "n_updates_per_iter": 5,
+        "n_episodes_per_iter": 3, "last_few": 2,
+    }  # fmt: skip
+    return build(Config, small | values)
+
+
+def warm_up(settings: Config) -> list[Episode]:
+    generator = EpisodeGenerator(settings, 2)
+    commands = CommandSampler(settings, generator.spec).warm_up()
+    return generate_episodes(generator, commands, None)
+
+
+@pytest.mark.parametrize("environment", ["CartPole-v1", NESTED])
+def test_it_is_what_was_done_and_earned(environment: str) -> None:
+    env = ObservePrevious(gym.make(environment))
+    space = env.env.action_space
+    space.seed(1)
+    shown, _ = env.reset(seed=1)
+    assert env.observation_space.contains(shown)
+    assert not shown["has_previous"].any()
+    assert shown["previous_reward"] == 0
+    assert space.contains(shown["previous_action"]) or environment == "CartPole-v1"
+    for _ in range(5):
+        action = space.sample()
+        shown, reward, *_ = env.step(action)
+        assert env.observation_space.contains(shown)
+        assert shown["previous_action"] is action
+        assert shown["previous_reward"] == np.float32(reward)
+        assert shown["has_previous"].all()
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (spaces.Discrete(3, start=2), 2),
+        (spaces.MultiDiscrete(np.array([3, 2]), start=np.array([1, 0])), [1, 0]),
+        (spaces.MultiBinary(2), [0, 0]),
+        (spaces.Box(-1, 1, (2,)), [0, 0]),
+        (spaces.Tuple((spaces.Discrete(2), spaces.MultiBinary(1))), (0, [0])),
+    ],
+    ids=str,
+)
+def test_at_first_there_is_nothing(space: Any, expected: Any) -> None:
+    found = nothing(space)
+    if isinstance(expected, tuple):
+        assert all(map(np.array_equal, found, expected))
+    else:
+        assert np.array_equal(found, expected)
+
+
+def test_episodes_hold_it() -> None:
+    for episode in warm_up(config()):
+        seen = episode.observations
+        assert seen["['has_previous']"].ravel().tolist() == [0] + [1] * (episode.length - 1)
+        assert seen["['previous_action']"].tolist() == [0, *episode.actions[:-1].tolist()]
+        assert seen["['previous_reward']"].ravel().tolist() == [0, *episode.rewards[:-1].tolist()]
+
+
+def test_training_hides_it_from_a_share_of_the_examples() -> None:
+    always, never, half = (config(drop_previous=share) for share in (1.0, 0.0, 0.5))
+    spec = specify(make_environment(always), always)
+    episodes = warm_up(always)
+    hidden = warm_up(always)
+    for episode in hidden:
+        for key in PREVIOUS:
+            episode.observations[f"['{key}']"] = 0
+
+    def weights(settings: Config, shown: list[Episode]) -> str:
+        experience, state = Experience(settings, spec), untrained(settings, spec)
+        for episode in shown:
+            experience.add(episode)
+        train(state, experience.by_rank([e.command_id for e in shown]), settings)
+        return arrays_digest(state.weights).hex()
+
+    assert weights(always, episodes) == weights(never, hidden)
+    assert len({weights(s, episodes) for s in (always, never, half)}) == 3
+
+
+@pytest.mark.parametrize("baseline", ["none", "value", "action_value"])
+def test_a_run_does_not_depend_on_the_number_of_environments(baseline: str) -> None:
+    settings = config(baseline=baseline, frame_stack=2)
+    budget = Budget(max_env_steps=400)
+    runs = [algorithm1(settings, budget, n) for n in (1, 5)]
+    assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
+
+
+def side_by_side(elements: list[Any]) -> Any:
+    """Return elements as Minari has them: lists where the leaves are."""
+    if isinstance(elements[0], dict):
+        return {k: side_by_side([e[k] for e in elements]) for k in elements[0]}
+    if isinstance(elements[0], tuple):
+        return tuple(side_by_side([e[k] for e in elements]) for k in range(len(elements[0])))
+    return elements
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:minari")
+@pytest.mark.parametrize("environment", ["CartPole-v1", NESTED])
+def test_a_dataset_without_it_is_completed(
+    environment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    raw = gym.make(environment)
+    raw.action_space.seed(3)
+    settings = config(environment=environment)
+    own = make_environment(settings)
+    expected, buffers = [], []
+    for seed in (0, 1):
+        seen, done, earned = [raw.reset(seed=seed)[0]], [], []
+        observation, _ = own.reset(seed=seed)
+        over = False
+        while not over:
+            expected.append(observation.copy())
+            done.append(raw.action_space.sample())
+            shown, reward, terminated, truncated, _ = raw.step(done[-1])
+            seen.append(shown)
+            earned.append(reward)
+            observation, *_ = own.step(own.actions.one(done[-1]).tolist())
+            over = terminated or truncated
+        ends = [False] * (len(done) - 1)
+        buffers.append(
+            EpisodeBuffer(
+                id=seed,
+                observations=side_by_side(seen),
+                actions=side_by_side(done),
+                rewards=earned,
+                terminations=[*ends, terminated],
+                truncations=[*ends, truncated],
+            )
+        )
+    minari.create_dataset_from_buffers("some/raw-v0", buffers, env=raw)
+    episodes = read_dataset("some/raw-v0", settings, specify(own, settings))
+    found = np.concatenate([e.observations for e in episodes])
+    for name in found.dtype.names or ():
+        # A value of a Box is the nearest of its bins to this environment, and not to the other.
+        if not name.startswith("['previous_action']['legs']") and "reward" not in name:
+            assert np.array_equal(found[name], np.array(expected)[name]), name
+
+
+def test_wrappers_are_applied_in_order() -> None:
+    settings = config(
+        observe_previous=False,
+        wrappers=[
+            "gymnasium.wrappers:FlattenObservation",
+            "udrl.environments.previous:ObservePrevious",
+        ],
+    )
+    space = specify(make_environment(settings), settings).observation_space
+    assert isinstance(space, Record)
+    assert [leaf.name for leaf in space.leaves][:2] == ["['observation']", "['previous_action']"]
+    limited = config(wrappers=settings.wrappers[:1], max_episode_steps=5)
+    assert all(e.length <= 5 for e in warm_up(limited))
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "says"),
+    [
+        ("FlattenObservation", "there is no colon"),
+        ("gymnasium.wrappers:NoSuchWrapper", "AttributeError"),
+        ("no_such_package:Wrapper", "ModuleNotFoundError"),
+        ("gymnasium.wrappers:TransformObservation", "TypeError"),
+    ],
+)
+def test_wrappers_that_cannot_be_applied_are_refused(wrapper: str, says: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=f"{wrapper}.*{says}.*package.module:Wrapper"):
+        make_environment(config(wrappers=[wrapper]))
+
+
+def test_to_drop_what_is_not_observed_has_no_effect() -> None:
+    with pytest.raises(ConfigError, match=r"drop_previous = 0.25 .* needs observe_p"):
+        refuse_idle(config(observe_previous=False), ["drop_previous"])
