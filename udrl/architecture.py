@@ -27,6 +27,18 @@ SQUAREPLUS = 2.0
 DEVIATIONS = 2.0
 
 
+#: Normalised observations are kept within so many deviations of their mean.
+NORMAL_BOUND = 10.0
+
+#: In the names of tensors that are set once and not trained.
+NORMALISER = "normaliser"
+
+
+def is_trained(name: str) -> bool:
+    """Say whether training changes a tensor of this name at every update."""
+    return NORMALISER not in name.split(".")
+
+
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:
     """Return the widths of the behavior function: of its encoder, and of the layers that follow.
 

@@ -17,9 +17,10 @@ from udrl.weights import MOMENTS, decode_weights, encode_weights, optimizer_shap
 def encode_optimizer(state: TrainingState) -> bytes:
     """Return Adam's state, and the critic, as safetensors; no moments at version 0."""
     tensors: dict[str, npt.NDArray[np.float32]] = {}
+    if state.critic is not None:
+        for name, tensor in state.critic.state_dict().items():
+            tensors[f"critic.{name}"] = tensor.detach().cpu().numpy()
     for name, parameter in state.parameters().items():
-        if name.startswith("critic."):
-            tensors[name] = parameter.detach().cpu().numpy()
         held = state.optimizer.state.get(parameter)
         if held:
             for key in (*MOMENTS, "step"):

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from udrl.architecture import FILTER, PADDING, STRIDE, n_features
+from udrl.architecture import FILTER, NORMAL_BOUND, PADDING, STRIDE, n_features
 from udrl.memory import FrameStack
 from udrl.setting_groups import NetworkSettings
-from udrl.spaces import Categories, Category, Image, LeafSpace, ObservationSpace, Record
+from udrl.spaces import Categories, Category, Image, LeafSpace, ObservationSpace, Record, Vector
 
 Activation = Callable[[Tensor], Tensor]
 
@@ -55,20 +55,62 @@ class Encoder(nn.Module):
         """Return features, [batch, n_features], of what the networks see (:mod:`udrl.memory`)."""
         raise NotImplementedError
 
+    def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
+        """Set what the numbers of a leaf are relative to, float64 [size]."""
+        raise NotImplementedError
+
+
+class Normaliser(nn.Module):
+    """Numbers relative to their mean in the warm-up, in units of their deviation there.
+
+    Args:
+        size: of the vectors.
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+        self.mean: Tensor
+        self.scale: Tensor
+
+    def set(self, mean: Tensor, deviation: Tensor) -> None:
+        """Set both, float64 [size]; what does not vary keeps its unit."""
+        self.mean.copy_(mean)
+        self.scale.copy_(1 / torch.where(deviation > 0, deviation, 1))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return float32 [batch, size], bounded."""
+        return ((observation - self.mean) * self.scale).clamp(-NORMAL_BOUND, NORMAL_BOUND)
+
 
 class VectorEncoder(Encoder):
-    """One fully connected layer."""
+    """One fully connected layer, of normalised numbers if that is wanted."""
 
     def __init__(
-        self, size: int, width: int, activation: Activation, precision: torch.dtype
+        self,
+        size: int,
+        width: int,
+        activation: Activation,
+        precision: torch.dtype,
+        *,
+        normalised: bool,
     ) -> None:
         super().__init__(activation, precision)
+        self.normaliser = Normaliser(size) if normalised else None
         self.layer = fully_connected(size, width)
 
     def forward(self, *seen: Tensor) -> Tensor:
         """Return features, [batch, width], of numbers, [batch, size]."""
         (observation,) = seen
+        if self.normaliser is not None:
+            observation = self.normaliser(observation)
         return self._activation(apply(self.layer, observation.to(self._precision)))
+
+    def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
+        """Set what the numbers are relative to, float64 [size]."""
+        assert self.normaliser is not None, leaf
+        self.normaliser.set(mean, deviation)
 
 
 class CategoryEncoder(Encoder):
@@ -163,6 +205,12 @@ class RecordEncoder(Encoder):
         features = [leaf(one) for leaf, one in zip(self.leaves, seen, strict=True)]
         return self._activation(apply(self.joined, torch.cat(features, 1)))
 
+    def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
+        """Set what the numbers of a leaf are relative to, float64 [size]."""
+        encoder = self.leaves[leaf]
+        assert isinstance(encoder, Encoder)
+        encoder.normalise(leaf, mean, deviation)
+
 
 def make_encoder(
     space: ObservationSpace,
@@ -204,4 +252,5 @@ def _of_leaf(
             return CategoryEncoder((n,), length, width, activation, precision)
         case Categories(ns=ns):
             return CategoryEncoder(ns, length, width, activation, precision)
-    return VectorEncoder(shape[0], width, activation, precision)
+    normalised = network.normalise_observations and isinstance(space, Vector)
+    return VectorEncoder(shape[0], width, activation, precision, normalised=normalised)

@@ -24,6 +24,8 @@ from udrl.architecture import (
     DEVIATIONS,
     FILTER,
     LEAST_DEVIATION,
+    NORMAL_BOUND,
+    NORMALISER,
     PADDING,
     SQUAREPLUS,
     STRIDE,
@@ -199,8 +201,15 @@ class _Builder:
                 numbers = self._append("Cast", observation, to=TensorProto.FLOAT)
                 features = self._layer(f"{name}.layer", numbers, first, width)
             case _:
+                if self._network.normalise_observations:
+                    observation = self._normalised(observation, f"{name}.{NORMALISER}", first)
                 features = self._layer(f"{name}.layer", observation, first, width)
         return self._append(activation, features)
+
+    def _normalised(self, observation: str, name: str, size: int) -> str:
+        above = self._append("Sub", observation, self._weight(f"{name}.mean", size))
+        scaled = self._append("Mul", above, self._weight(f"{name}.scale", size))
+        return self._append("Clip", scaled, self._number(-NORMAL_BOUND), self._number(NORMAL_BOUND))
 
     def _embedding(self, observation: str, name: str, ns: tuple[int, ...], width: int) -> str:
         sizes = np.array(ns * self._network.frame_stack, np.int32)

@@ -46,6 +46,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     Attributes:
         frame_stack: most recent observations that the network sees at once, one after another
             along the first dimension; before an episode's first there is the first again.
+        normalise_observations: whether numbers are read relative to their mean in the warm-up, in
+            units of their deviation there.
         convolutions: channels of each convolutional layer, for images (3.2, B.2).
         hidden: units of each fully connected layer; for vectors, the first is multiplied with the
             embedded command (3.2).
@@ -62,6 +64,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     """
 
     frame_stack: Annotated[int, Meta(ge=1, le=64)] = 1
+    normalise_observations: bool = False
     convolutions: Widths = (32, 48, 96, 128)
     hidden: Widths = (32, 128, 128, 128)
     activation: Literal["relu", "tanh"] = "relu"

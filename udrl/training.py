@@ -21,6 +21,7 @@ from udrl.environments.previous import PREVIOUS
 from udrl.graph import Weights
 from udrl.initialisation import draw_weights
 from udrl.segments import RankedExperience, Segments, draw_segments
+from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 from udrl.value import Critic, ValueFunction, relative, value_loss
@@ -154,6 +155,8 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         experience.lengths,
         training.segments,
     )
+    if version == 1 and config.network.normalise_observations:
+        _normalise(state, experience)
     hidden = None
     if config.observe_previous:
         numbers = stream.uniforms(segments.rank.size).reshape(segments.rank.shape)
@@ -162,6 +165,19 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
         losses = _update(state, experience, segments, hidden, config)
     state.version = version
     state.loss = losses / training.n_updates_per_iter
+
+
+def _normalise(state: TrainingState, experience: RankedExperience) -> None:
+    """Let all networks read numbers relative to their mean in the buffer."""
+    vectors = [k for k, leaf in enumerate(experience.leaves) if isinstance(leaf.space, Vector)]
+    parts = [[seen[k] for k in vectors] for seen, _ in experience.steps()]
+    networks = [state.behavior, state.behavior.value, state.critic]
+    for k, arrays in zip(vectors, zip(*parts, strict=True), strict=True):
+        values = np.concatenate(arrays).astype(np.float64)
+        mean, deviation = torch.from_numpy(values.mean(0)), torch.from_numpy(values.std(0))
+        for network in networks:
+            if network is not None:
+                network.encoder.normalise(k, mean, deviation)
 
 
 def _update(

@@ -11,6 +11,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from udrl.architecture import is_trained
 from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes
 from udrl.inference import ActingFunction
@@ -79,6 +80,8 @@ def optimizer_shapes(shapes: Shapes, critic: Shapes) -> dict[str, tuple[int, ...
     """
     expected: dict[str, tuple[int, ...]] = dict(critic)
     for name, shape in (*shapes.items(), *critic.items()):
+        if not is_trained(name):
+            continue
         expected |= {f"{moment}.{name}": shape for moment in MOMENTS}
         expected[f"step.{name}"] = ()
     return expected

@@ -70,7 +70,8 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (IMAGE, {"frame_stack": 4, "baseline": "value"}),
     (RECORD, {}),
     (RECORD, {"frame_stack": 3, "baseline": "value", "activation": "tanh"}),
-    (RECORD, {"baseline": "action_value"}),
+    (RECORD, {"baseline": "action_value", "normalise_observations": True}),
+    (VECTOR, {"baseline": "value", "normalise_observations": True, "frame_stack": 2}),
 ]
 each_kind = pytest.mark.parametrize(("spec", "values"), KINDS)
 
