@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.actions import Actions
+from udrl.architecture import state_sizes
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
@@ -89,6 +90,9 @@ class EpisodeGenerator:
         self._desired = np.zeros((n_environments, self._target.size))
         self._cap = np.full(n_environments, np.inf)
         self._n_capped = 0
+        # What is remembered of its episode.
+        remembered = sum(state_sizes(config.network))
+        self._state = np.zeros((n_environments, remembered), np.float32)
         self._parameters = np.zeros((n_environments, self.spec.action_space.n_parameters))
         self._temperature = np.ones((n_environments, 1))
         # How many rows have random actions.
@@ -129,6 +133,7 @@ class EpisodeGenerator:
             self._n_capped += 1
             self._target.bound(self._desired, self._cap)
         self._parameters[row] = 0.0
+        self._state[row] = 0.0
         self._temperature[row] = command.temperature or 1.0
         self._n_random += command.is_ever_random
         return None
@@ -177,8 +182,12 @@ class EpisodeGenerator:
             for all_rows, asked in zip(seen, call.seen, strict=True):
                 all_rows.take(rows, axis=0, out=asked, mode="clip")
             self._desired.take(rows, axis=0, out=call.command, mode="clip")
+            if self._state.shape[1]:
+                self._state.take(rows, axis=0, out=call.state, mode="clip")
             call.run()
             self._parameters[rows] = call.logits
+            if self._state.shape[1]:
+                self._state[rows] = call.next_state
 
     def _choose(self, numbers: npt.NDArray[np.float64], random: npt.NDArray[np.bool_]) -> Actions:
         """Choose a_t in every row: sampled, the mode, or random, as its command says."""

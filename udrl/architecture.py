@@ -40,14 +40,24 @@ def is_trained(name: str) -> bool:
 
 
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:
-    """Return the widths of the behavior function: of its encoder, and of the layers that follow.
+    """Return the widths of the behavior function: of its features, and of the layers that follow.
 
     An image's convolutions stand before all layers of ``hidden``; any other encoder, also the one
-    of a record, is the first.
+    of a record, is the first. Where there is a memory, its state is the features.
     """
     if isinstance(space, Image):
-        return (n_features(space, network.convolutions, 0), *network.hidden)
-    return network.hidden
+        widths = (n_features(space, network.convolutions, 0), *network.hidden)
+    else:
+        widths = network.hidden
+    return widths if network.memory == "none" else (network.memory_size, *widths[1:])
+
+
+def state_sizes(network: NetworkSettings) -> tuple[int, ...]:
+    """Return how many numbers the behavior function and the value function remember."""
+    if network.memory == "none":
+        return ()
+    own = (network.memory_size,)
+    return own if network.baseline == "none" else (*own, VALUE_WIDTH)
 
 
 def n_features(space: ObservationSpace, channels: Sequence[int], width: int) -> int:

@@ -2,7 +2,8 @@
 
 Its architecture is section 3.2's. An encoder makes features of the observation. The command, scaled
 by fixed factors, passes a fully connected sigmoid layer and is multiplied element-wise with them;
-fully connected layers follow.
+fully connected layers follow. With a ``memory`` the features are what is remembered of all
+observations of the episode (:mod:`udrl.recurrence`), for which each network has a state.
 """
 
 from itertools import pairwise
@@ -11,11 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from udrl.action_losses import negative_log_likelihood
-from udrl.architecture import layer_widths
+from udrl.architecture import layer_widths, n_features
 from udrl.config import Config
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.initialisation import draw_weights
+from udrl.recurrence import Memory
 from udrl.targets import ReturnInTime
 from udrl.value import ValueFunction, relative
 
@@ -38,35 +40,57 @@ class BehaviorFunction(nn.Module):
         self._activation = activation = ACTIVATIONS[network.activation]
         self._actions = spec.action_space
         first, *_ = widths = layer_widths(spec.observation_space, network)
-        self.encoder = make_encoder(spec.observation_space, network, first, activation, precision)
+        space, width = spec.observation_space, network.hidden[0]
+        self.encoder = make_encoder(space, network, width, activation, precision)
+        self.memory = None
+        if network.memory != "none":
+            n_in = n_features(space, network.convolutions, width)
+            self.memory = Memory(n_in, network.memory_size)
         self.command = fully_connected(ReturnInTime.size, first)
         self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
         self.action = fully_connected(widths[-1], spec.action_space.n_parameters)
         self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
-    def forward(self, seen: tuple[Tensor, ...], command: Tensor) -> Tensor:
+    def forward(
+        self, seen: tuple[Tensor, ...], command: Tensor, states: tuple[Tensor, ...] = ()
+    ) -> Tensor:
         """Return the parameters of P(a | s, c).
 
         Args:
             seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
             command: (desired return, desired horizon), each scaled, float32 [batch, 2].
+            states: with a memory, of behavior and value function before the first step of each
+                window, float32 [windows, size] each; a batch is then windows of consecutive steps.
 
         Returns:
             float32 [batch, n_parameters].
         """
+        state, *others = states or (None, None)
         if self.value is not None:
             with torch.no_grad():
-                command = relative(command, self.value(seen))
-        return self.obey(seen, command)
+                command = relative(command, self.value(seen, others[0]))
+        return self.obey(seen, command, state)
 
-    def obey(self, seen: tuple[Tensor, ...], command: Tensor) -> Tensor:
+    def obey(
+        self, seen: tuple[Tensor, ...], command: Tensor, state: Tensor | None = None
+    ) -> Tensor:
         """Return the same for commands that are relative already, where there is a value."""
-        features: Tensor = self.encoder(*seen)
+        features = self.remember(seen, state)[0]
         features = features * torch.sigmoid(apply(self.command, command.to(features.dtype)))
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
             features = self._activation(apply(layer, features))
         return apply(self.action, features).float()
+
+    def remember(
+        self, seen: tuple[Tensor, ...], state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the features of observations, and with a memory its state after each window."""
+        features: Tensor = self.encoder(*seen)
+        if self.memory is None:
+            return features, None
+        remembered: tuple[Tensor, Tensor] = self.memory(features, state)
+        return remembered
 
     def loss(self, parameters: Tensor, action: Tensor) -> Tensor:
         """Return the mean of -ln P(a | s, c) over a batch.

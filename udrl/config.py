@@ -101,6 +101,11 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
                 f"segments = {segments!r} with baseline = {baseline!r}: lambda-returns "
                 f"reach to the end of an episode; set segments = 'trailing' or baseline = 'none'"
             )
+        if self.network.memory != "none" and segments != "trailing":
+            raise ConfigError(
+                f"segments = {segments!r} with memory = {self.network.memory!r}: windows of steps "
+                f"are trained on with what followed until the end; set segments = 'trailing'"
+            )
         last_few, replay_size = self.commands.last_few, self.buffer.replay_size
         if last_few > replay_size:
             raise ConfigError(
@@ -145,6 +150,8 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
     "drop_previous": (lambda config: config.observe_previous, "observe_previous"),
     "held_rate": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
+    "memory_size": (lambda config: config.network.memory != "none", "memory = 'gru'"),
+    "memory_window": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),

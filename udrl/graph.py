@@ -7,7 +7,9 @@ the weights of one version it becomes an :class:`udrl.inference.ActingFunction`.
 Inputs: ``observation``, what the networks see ([batch, *shape], :mod:`udrl.memory`); of a record
 one for each leaf, with its name behind, as ``observation['inventory'][2]``; and ``command``,
 desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
-Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters].
+Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters]. Where there is a
+memory, ``state`` is another input, float32 [batch, size], zeros at an episode's first step, and
+``next_state`` another output, which is the state at the next step.
 """
 
 from collections.abc import Mapping
@@ -32,6 +34,7 @@ from udrl.architecture import (
     VALUE_WIDTH,
     layer_widths,
     n_features,
+    state_sizes,
 )
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
@@ -84,6 +87,7 @@ class _Builder:
         self._shapes = FrameStack(self._space, network.frame_stack).shapes
         self._n_parameters = spec.action_space.n_parameters
         self._target = ReturnInTime(network)
+        self._states: list[str] = []  # the next ones
         self._nodes: list[onnx.NodeProto] = []
         self._tensors: list[onnx.TensorProto] = []
 
@@ -96,6 +100,13 @@ class _Builder:
             for (name, leaf), shape in zip(self._leaves, self._shapes, strict=True)
         ]
         self._nodes[-1].output[0] = "logits"
+        outputs, states = [("logits", self._n_parameters)], []
+        if self._states:
+            size = sum(state_sizes(self._network))
+            states = [helper.make_tensor_value_info("state", TensorProto.FLOAT, ["batch", size])]
+            # Behind the logits, which stay the last of their nodes.
+            self._nodes.append(helper.make_node("Concat", self._states, ["next_state"], axis=1))
+            outputs.append(("next_state", size))
         graph = helper.make_graph(
             self._nodes,
             "behavior_function",
@@ -104,11 +115,11 @@ class _Builder:
                 helper.make_tensor_value_info(
                     "command", TensorProto.DOUBLE, ["batch", self._target.size]
                 ),
+                *states,
             ],
             [
-                helper.make_tensor_value_info(
-                    "logits", TensorProto.FLOAT, ["batch", self._n_parameters]
-                )
+                helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+                for name, size in outputs
             ],
             self._tensors,
         )
@@ -125,11 +136,14 @@ class _Builder:
         """Append the network of section 3.2; see :class:`udrl.behavior.BehaviorFunction`."""
         network = self._network
         activation = _OPERATORS[network.activation]
+        first, *_ = widths = layer_widths(self._space, network)
+        features = self._encode("encoder", activation, network.hidden[0])
+        if network.memory != "none":
+            n_in = n_features(self._space, network.convolutions, network.hidden[0])
+            features = self._remember("memory", features, n_in, network.memory_size)
         command = self._command()
         if network.baseline != "none":
             command = self._relative(command)
-        first, *_ = widths = layer_widths(self._space, network)
-        features = self._encode("encoder", activation, first)
         gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
         features = self._append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
@@ -172,8 +186,30 @@ class _Builder:
         """Append a network that expects ``n`` numbers of an observation."""
         features = self._encode(f"{name}.encoder", "Tanh", VALUE_WIDTH)
         width = n_features(self._space, self._network.convolutions, VALUE_WIDTH)
+        if self._network.memory != "none":
+            features = self._remember(f"{name}.memory", features, width, VALUE_WIDTH)
+            width = VALUE_WIDTH
         features = self._append("Tanh", self._layer(f"{name}.hidden", features, width, VALUE_WIDTH))
         return self._layer(f"{name}.expected", features, VALUE_WIDTH, n)
+
+    def _remember(self, name: str, features: str, n_in: int, size: int) -> str:
+        """Append a gated recurrent unit; see :class:`udrl.recurrence.Memory`."""
+        first = sum(state_sizes(self._network)[: len(self._states)])
+        before = self._columns("state", first, first + size)
+        gates = []
+        for given, of, n in ((features, "ih", n_in), (before, "hh", size)):
+            weight = self._weight(f"{name}.cell.weight_{of}_l0", 3 * size, n)
+            bias = self._weight(f"{name}.cell.bias_{of}_l0", 3 * size)
+            all_ = self._append("Gemm", given, weight, bias, transB=1)
+            gates.append([self._columns(all_, k * size, (k + 1) * size) for k in range(3)])
+        (r_in, z_in, n_in_), (r_then, z_then, n_then) = gates
+        r = self._append("Sigmoid", self._append("Add", r_in, r_then))
+        z = self._append("Sigmoid", self._append("Add", z_in, z_then))
+        new = self._append("Tanh", self._append("Add", n_in_, self._append("Mul", r, n_then)))
+        # (1 - z) new + z before
+        kept = self._append("Mul", z, self._append("Sub", before, new))
+        self._states.append(self._append("Add", new, kept))
+        return self._states[-1]
 
     def _encode(self, name: str, activation: str, width: int) -> str:
         """Append an encoder; see :func:`udrl.encoders.make_encoder`."""
@@ -241,8 +277,12 @@ class _Builder:
 
     def _column(self, matrix: str, index: int) -> str:
         """Append the selection of one column, [batch, 1]."""
-        first, last, axis = (self._constant(np.array([n])) for n in (index, index + 1, 1))
-        return self._append("Slice", matrix, first, last, axis)
+        return self._columns(matrix, index, index + 1)
+
+    def _columns(self, matrix: str, first: int, last: int) -> str:
+        """Append the selection of columns, [batch, last - first]."""
+        where = (self._constant(np.array([n])) for n in (first, last, 1))
+        return self._append("Slice", matrix, *where)
 
     def _weight(self, name: str, *shape: int) -> str:
         self._tensors.append(onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT))

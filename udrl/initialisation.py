@@ -29,6 +29,8 @@ def draw_weights(
             nn.init.orthogonal_(layer.weight, 1.0, generator)
             with torch.no_grad():
                 layer.weight.mul_(gain / layer.weight.norm(dim=1, keepdim=True))
+        if isinstance(layer, nn.GRU):
+            _draw_gates(layer, generator)
         if not isinstance(layer, nn.Linear | nn.Conv2d):
             continue
         bound = layer.weight[0].numel() ** -0.5
@@ -40,3 +42,14 @@ def draw_weights(
         else:
             nn.init.uniform_(layer.weight, -bound, bound, generator)
             nn.init.uniform_(layer.bias, -bound, bound, generator)
+
+
+def _draw_gates(layer: nn.GRU, generator: torch.Generator) -> None:
+    """Draw the weights of a gated recurrent unit: each gate's are orthogonal, biases are 0."""
+    for name, tensor in layer.named_parameters():
+        if name.startswith("bias"):
+            nn.init.zeros_(tensor)
+            continue
+        with torch.no_grad():
+            for gate in tensor.chunk(3):
+                nn.init.orthogonal_(gate, 1.0, generator)

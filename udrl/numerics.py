@@ -74,10 +74,11 @@ def acting_class(graph: bytes, space: ActionSpace) -> str:
         space: of the actions.
     """
     function = ActingFunction(graph, probe_weights(graph))
-    logits = function.logits(*probe_rows(function, PROBE_ROWS))
+    logits, state = function.advance(*probe_rows(function, PROBE_ROWS))
     shape = (PROBE_CHOICES, *space.shape)
     stream = Stream(stream_key(0, Purpose.PROBE, 3, 0))
     numbers = stream.uniforms(math.prod(shape)).reshape(shape)
     rows = logits[np.arange(PROBE_CHOICES) % PROBE_ROWS].astype(np.float64)
     actions = space.sample(rows, np.ones((PROBE_CHOICES, 1)), numbers).astype(space.dtype)
-    return arrays_digest({"actions": actions, "logits": logits}).hex()[:16]
+    probed = {"actions": actions, "logits": logits}
+    return arrays_digest(probed | ({"next_state": state} if state.size else {})).hex()[:16]

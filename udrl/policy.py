@@ -12,7 +12,7 @@ from udrl.config import Config
 from udrl.environments.conversions import describe, nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
-from udrl.inference import ActingFunction
+from udrl.inference import ActingFunction, State
 from udrl.memory import FrameStack
 from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
@@ -20,8 +20,9 @@ from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 class Policy:
     """A behavior function with the settings that say how to ask it (section 2.3.2).
 
-    It has no memory: the same arguments give the same distribution, to the bit the one that
-    Algorithm 2 samples from (:mod:`udrl.acting`).
+    The same arguments give the same distribution, to the bit the one that Algorithm 2 samples from
+    (:mod:`udrl.acting`). An agent with a ``memory`` remembers what :meth:`predict` was shown since
+    :meth:`reset`, which has to be called when an episode begins.
 
     Args:
         behavior: B(s, c; theta).
@@ -49,6 +50,11 @@ class Policy:
         self.desired_horizon = desired_horizon
         self._memory = FrameStack(spec.observation_space, config.network.frame_stack)
         self._rng = rng or np.random.default_rng()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode so far."""
+        self._state: State | None = None
 
     def make_environment(self, **kwargs: Any) -> Environment:
         """Return the environment that it was trained in, with observations as it knows them.
@@ -93,6 +99,23 @@ class Policy:
             InvalidData: the observation has another shape than those it was trained on, or
                 something is not finite, or the temperature less than 0.
         """
+        return self.advance(observation, desired_return, desired_horizon, self._state)[0]
+
+    def advance(
+        self,
+        observation: npt.ArrayLike,
+        desired_return: float,
+        desired_horizon: float,
+        state: State | None,
+    ) -> tuple[npt.NDArray[np.float64], State]:
+        """Return the logits, as :meth:`logits`, and what is remembered afterwards.
+
+        Args:
+            observation: see :meth:`logits`.
+            desired_return: likewise.
+            desired_horizon: likewise.
+            state: what is remembered; None: nothing, the episode begins.
+        """
         desired = np.array([[desired_return, desired_horizon]], np.float64)
         if not np.isfinite(desired).all():
             raise InvalidData(
@@ -100,9 +123,8 @@ class Policy:
                 f"finite numbers"
             )
         seen = self._memory.join(self._plain(observation)[None])
-        row = self.behavior.logits(seen, desired)[0]
-        logits: npt.NDArray[np.float64] = row.astype(np.float64)
-        return logits
+        rows, after = self.behavior.advance(seen, desired, state)
+        return rows[0].astype(np.float64), after
 
     def _plain(self, observation: Any) -> Observations:
         """Return what the environment showed as an array, [frame_stack, *observation_shape]."""
@@ -163,7 +185,9 @@ class Policy:
             deterministic: the same as a temperature of 0.
         """
         _check(temperature)
-        logits = self.logits(observation, desired_return, desired_horizon)
+        logits, self._state = self.advance(
+            observation, desired_return, desired_horizon, self._state
+        )
         space = self.spec.action_space
         uniform: Any = self._rng.random(space.shape)
         return space.choose(logits, 0.0 if deterministic else temperature, uniform)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from udrl.commands import Command
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.inference import State
 from udrl.policy import Policy
 from udrl.targets import ReturnInTime
 
@@ -55,6 +56,7 @@ class Rollout:
         self._env = env
         self._target = ReturnInTime(policy.config.network)
         self._cap = np.array([math.inf if command.cap is None else command.cap])
+        self._state: State | None = None
         self._decisions = command.decisions(0, policy.spec.action_space.shape)
         limit_steps(env, command.max_steps)
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
@@ -70,7 +72,7 @@ class Rollout:
     @property
     def probabilities(self) -> npt.NDArray[np.float64]:
         """P(a | s_t, c_t), float64 [n_parameters]: what the next action is sampled from."""
-        return self._policy.spec.action_space.probabilities(self._logits(), self.temperature)
+        return self._policy.spec.action_space.probabilities(self._advance()[0], self.temperature)
 
     def tell(self, desired_return: float, desired_horizon: int) -> None:
         """Give another order from here on."""
@@ -97,10 +99,11 @@ class Rollout:
         """
         assert not self.over
         space, (number, is_random) = self._policy.spec.action_space, self._decision()
+        logits, self._state = self._advance()
         if is_random:
             action: Any = space.uniform(number[None])[0]
         else:
-            action = space.choose(self._logits(), self.temperature, number)
+            action = space.choose(logits, self.temperature, number)
         self.action = action = np.asarray(action).tolist()
         observation, reward, self.terminated, self.truncated, _ = self._carefully(
             "step", lambda: self._env.step(action)
@@ -142,9 +145,9 @@ class Rollout:
             self._decisions = self.command.decisions(t + _AT_A_TIME, shape)
         return self._decisions.numbers[t], bool(self._decisions.random[t])
 
-    def _logits(self) -> npt.NDArray[np.float64]:
-        return self._policy.logits(
-            np.stack(self._recent), self.desired_return, self.desired_horizon
+    def _advance(self) -> tuple[npt.NDArray[np.float64], State]:
+        return self._policy.advance(
+            np.stack(self._recent), self.desired_return, self.desired_horizon, self._state
         )
 
     def _plain(self, observation: Any) -> npt.NDArray[Any]:

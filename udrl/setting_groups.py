@@ -46,6 +46,9 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     Attributes:
         frame_stack: most recent observations that the network sees at once, one after another
             along the first dimension; before an episode's first there is the first again.
+        memory: ``none``, or ``gru``: a gated recurrent unit between encoder and command, which
+            remembers the episode so far (section 6).
+        memory_size: numbers that it remembers.
         normalise_observations: whether numbers are read relative to their mean in the warm-up, in
             units of their deviation there.
         convolutions: channels of each convolutional layer, for images (3.2, B.2).
@@ -64,6 +67,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     """
 
     frame_stack: Annotated[int, Meta(ge=1, le=64)] = 1
+    memory: Literal["none", "gru"] = "none"
+    memory_size: Annotated[int, Meta(ge=1, le=65_536)] = 64
     normalise_observations: bool = False
     convolutions: Widths = (32, 48, 96, 128)
     hidden: Widths = (32, 128, 128, 128)
@@ -147,6 +152,8 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
         batch_size: examples in one update.
         learning_rate: Adam's.
         n_updates_per_iter: gradient steps in an iteration.
+        memory_window: with a ``memory``, consecutive steps of an episode that are trained on
+            together, so that what is remembered is learned over as many.
         drop_previous: with ``observe_previous``, share of the examples without these, so that the
             agent learns more than to copy itself.
         return_lambda: with a ``baseline``, the lambda of the lambda-returns that examples are
@@ -157,6 +164,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
     batch_size: Annotated[int, Meta(ge=1, le=2**20)] = 768
     learning_rate: Annotated[float, Meta(gt=0, le=10)] = 3.5e-4
     n_updates_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 100
+    memory_window: Annotated[int, Meta(ge=1, le=65_536)] = 32
     drop_previous: Annotated[float, Meta(ge=0, le=1)] = 0.25
     return_lambda: Annotated[float, Meta(ge=0, le=1)] = 0.95
 

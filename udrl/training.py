@@ -1,35 +1,28 @@
 """Section 2.3.3: a fixed number of Adam updates turns weights version v-1 into version v."""
 
 import contextlib
-import math
 import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from udrl.architecture import state_sizes
+from udrl.batches import Batch, Batches, Draw, Seen, draw_examples
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
 from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
-from udrl.environments.previous import PREVIOUS
 from udrl.graph import Weights
 from udrl.initialisation import draw_weights
-from udrl.segments import RankedExperience, Segments, draw_segments
+from udrl.segments import RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.targets import ReturnInTime
-from udrl.value import Critic, ValueFunction, relative, value_loss
-
-#: Paths of what was before an observation.
-_PREVIOUS = [(key,) for key in PREVIOUS]
-#: Bytes of observations that are gathered at once for the next updates.
-_GATHERED_BYTES = 16 << 20
+from udrl.value import Critic, ValueFunction, value_loss
+from udrl.whole_buffer import at_all_steps
 
 
 @dataclass
@@ -147,24 +140,15 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
 
     The numbers that choose the examples come from the stream (seed, training, new version).
     """
-    training, version = config.training, state.version + 1
+    version = state.version + 1
     stream = Stream(stream_key(config.seed, Purpose.TRAINING, version))
-    uniforms = stream.uniforms(3 * training.n_updates_per_iter * training.batch_size)
-    segments = draw_segments(
-        uniforms.reshape(3, training.n_updates_per_iter, training.batch_size),
-        experience.lengths,
-        training.segments,
-    )
+    draw = draw_examples(stream, experience, config)
     if version == 1 and config.network.normalise_observations:
         _normalise(state, experience)
-    hidden = None
-    if config.observe_previous:
-        numbers = stream.uniforms(segments.rank.size).reshape(segments.rank.shape)
-        hidden = numbers < training.drop_previous
     with _threads(config.arithmetic.training_threads):
-        losses = _update(state, experience, segments, hidden, config)
+        losses = _update(state, experience, draw, config)
     state.version = version
-    state.loss = losses / training.n_updates_per_iter
+    state.loss = losses / config.training.n_updates_per_iter
 
 
 def _normalise(state: TrainingState, experience: RankedExperience) -> None:
@@ -181,28 +165,24 @@ def _normalise(state: TrainingState, experience: RankedExperience) -> None:
 
 
 def _update(
-    state: TrainingState,
-    experience: RankedExperience,
-    segments: Segments,
-    hidden: npt.NDArray[np.bool_] | None,
-    config: Config,
+    state: TrainingState, experience: RankedExperience, draw: Draw, config: Config
 ) -> float:
-    """Make one Adam update for each row of ``segments``; return the sum of their losses.
-
-    Args:
-        state: to be advanced.
-        experience: the buffer.
-        segments: int64 [updates, batch_size].
-        hidden: from which examples the previous action and reward are hidden, bool of that shape.
-        config: the settings.
-    """
-    batches = _Batches(config, experience)
+    """Make one Adam update for each row of a draw; return the sum of their losses."""
+    batches = Batches(draw, experience, config)
     losses = torch.zeros((), dtype=torch.float64, device=config.arithmetic.device)
-    if state.behavior.value is not None:
-        _learn_value(state, state.behavior.value, experience, segments, config, batches)
+    behavior = state.behavior
+    if behavior.value is not None:
+        _learn_value(state, behavior.value, experience, batches, config)
+    remembered = None
+    if behavior.memory is not None:
+        size = behavior.memory.size
+        remembered = at_all_steps(
+            lambda seen, _, before: behavior.remember(seen, before), size, experience, config
+        ).states
     step = _Stepper(state)
-    for seen, command, action in batches.gather(segments, hidden):
-        loss = state.behavior.loss(state.behavior.obey(seen, command), action)
+    for batch in batches.gather(hide=True):
+        parameters = behavior.obey(batch.seen, batch.command, _remembered(batch, remembered))
+        loss = behavior.loss(batch.counted(parameters), batch.counted(batch.action))
         step(loss)
         losses += loss.detach()
     return float(losses)
@@ -212,9 +192,8 @@ def _learn_value(
     state: TrainingState,
     value: ValueFunction,
     experience: RankedExperience,
-    segments: Segments,
+    batches: Batches,
     config: Config,
-    batches: "_Batches",
 ) -> None:
     """Bring V, and Q before it, to the lambda-returns; then label the examples anew.
 
@@ -222,40 +201,40 @@ def _learn_value(
     carry V and D from here on.
     """
     step, scale, lam = _Stepper(state), config.network.return_scale, config.training.return_lambda
-    device = config.arithmetic.device
+    critic, size = state.critic, sum(state_sizes(config.network)[1:])
+
+    def value_at(seen: Seen, _: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        expected, after = value.expect(seen, before)
+        return value.value_of(expected), after
+
     experience.expected = None
-    experience.label(_at_all_steps(value, experience, device)[:, 0] / scale, lam)
-    if state.critic is not None:
-        for seen, command, action in batches.gather(segments):
-            step((state.critic(seen, action) - command[:, 0]).square().mean())
-        experience.labels = _at_all_steps(state.critic, experience, device) / np.float64(scale)
-    for seen, command, _ in batches.gather(segments):
-        step(value_loss(value(seen), command[:, 0]))
-    experience.expected = _at_all_steps(value, experience, device)
-    if state.critic is None:
+    found = at_all_steps(value_at, size, experience, config)
+    experience.label(found.outputs[:, 0] / scale, lam)
+    if critic is not None:
+
+        def critic_at(
+            seen: Seen, action: Tensor, before: Tensor | None
+        ) -> tuple[Tensor, Tensor | None]:
+            expected, after = critic.expect(seen, before)
+            return critic.value_of(expected, action), after
+
+        remembered = at_all_steps(critic_at, size, experience, config).states if size else None
+        for batch in batches.gather():
+            q = critic(batch.seen, batch.action, _remembered(batch, remembered))
+            step(batch.counted(q - batch.command[:, 0]).square().mean())
+        labels = at_all_steps(critic_at, size, experience, config).outputs
+        experience.labels = labels / np.float64(scale)
+    for batch in batches.gather():
+        expected = value(batch.seen, _remembered(batch, found.states))
+        step(value_loss(batch.counted(expected), batch.counted(batch.command[:, 0])))
+    experience.expected = at_all_steps(value_at, size, experience, config).outputs
+    if critic is None:
         experience.label(experience.expected[:, 0] / scale, lam)
 
 
-def _at_all_steps(
-    network: ValueFunction | Critic, experience: RankedExperience, device: str
-) -> npt.NDArray[np.float32]:
-    """Return what a network expects at every step of the buffer, float32 [steps, ...]."""
-    parts = []
-    with torch.inference_mode():
-        for arrays, actions in experience.steps():
-            seen = tuple(_own(one).to(device) for one in arrays)
-            if isinstance(network, Critic):
-                acted = torch.from_numpy(actions.astype(np.int64)).to(device)
-                parts.append(network(seen, acted).cpu().numpy())
-            else:
-                parts.append(network(seen).cpu().numpy())
-    expected: npt.NDArray[np.float32] = np.concatenate(parts)
-    return expected
-
-
-def _own(array: npt.NDArray[Any]) -> Tensor:
-    """Return an array as a tensor in torch's own memory; a leaf of a record has odd strides."""
-    return torch.from_numpy(np.ascontiguousarray(array)).clone()
+def _remembered(batch: Batch, states: Tensor | None) -> Tensor | None:
+    """Return what is remembered before each window of a batch."""
+    return None if states is None else states[torch.from_numpy(batch.windows).to(states.device)]
 
 
 class _Stepper:
@@ -287,54 +266,3 @@ def _threads(n: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-class _Batches:
-    """The batches of a version's updates, gathered many at a time.
-
-    The tensors are torch's own memory: it is aligned to 64 bytes, which numpy's is not, and the
-    rounding of a matrix product may depend on alignment.
-    """
-
-    def __init__(self, config: Config, experience: RankedExperience) -> None:
-        self._experience = experience
-        training = config.training
-        leaves = experience.leaves
-        kinds = [(s, leaf.space.dtype) for s, leaf in zip(experience.shapes, leaves, strict=True)]
-        self._previous = [k for k, leaf in enumerate(leaves) if leaf.path[:1] in _PREVIOUS]
-        bytes_each = training.batch_size * sum(math.prod(s) * d.itemsize for s, d in kinds)
-        self._at_once = max(1, min(training.n_updates_per_iter, _GATHERED_BYTES // bytes_each))
-        n = self._at_once, training.batch_size
-        self._seen = [torch.empty(*n, *s, dtype=getattr(torch, d.name)) for s, d in kinds]
-        self._commands = torch.empty(*n, ReturnInTime.size)
-        self._actions = torch.empty(*n, *experience.action_shape, dtype=torch.int64)
-        self._device = config.arithmetic.device
-        self._scales = np.array(ReturnInTime(config.network).scales)
-
-    def gather(
-        self, segments: Segments, hidden: npt.NDArray[np.bool_] | None = None
-    ) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Tensor]]:
-        """Yield what is seen, scaled commands and actions of each update, where the network is.
-
-        Commands are relative to what is expected, once that is known.
-        """
-        n_updates = len(segments.rank)
-        for first in range(0, n_updates, self._at_once):
-            part = Segments(*(s[first : first + self._at_once] for s in segments))
-            n = len(part.rank)
-            command, action = self._commands[:n].numpy(), self._actions[:n].numpy()
-            flat = Segments(*(s.reshape(-1) for s in part))
-            examples = self._experience.examples(flat)
-            for gathered, one in zip(self._seen, examples.seen, strict=True):
-                gathered[:n].numpy()[:] = one.reshape(gathered[:n].shape)
-            if hidden is not None:
-                for k in self._previous:
-                    self._seen[k][:n].numpy()[hidden[first : first + n]] = 0
-            command[:] = (examples.command * self._scales).reshape(command.shape)
-            if (expected := self._experience.expected_at(flat)) is not None:
-                commands = self._commands[:n]
-                commands[:] = relative(commands, torch.from_numpy(expected).view(commands.shape))
-            action[:] = examples.action.reshape(action.shape)
-            for k in range(n):
-                seen = tuple(one[k].to(self._device) for one in self._seen)
-                yield seen, self._commands[k].to(self._device), self._actions[k].to(self._device)

@@ -24,6 +24,7 @@ from udrl.action_losses import of_action
 from udrl.architecture import DEVIATIONS, LEAST_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
+from udrl.recurrence import Memory
 from udrl.setting_groups import NetworkSettings
 
 
@@ -43,15 +44,28 @@ class _Expectation(nn.Module):
         super().__init__()
         space = spec.observation_space
         self.encoder = make_encoder(space, network, VALUE_WIDTH, torch.tanh_, precision)
-        self.hidden = fully_connected(
-            n_features(space, network.convolutions, VALUE_WIDTH), VALUE_WIDTH
-        )
+        width = n_features(space, network.convolutions, VALUE_WIDTH)
+        self.memory = None if network.memory == "none" else Memory(width, VALUE_WIDTH)
+        self.hidden = fully_connected(width if self.memory is None else VALUE_WIDTH, VALUE_WIDTH)
         self.expected = fully_connected(VALUE_WIDTH, n)
 
-    def expect(self, seen: tuple[Tensor, ...]) -> Tensor:
-        """Return float32 [batch, n] for s, as the networks see it, [batch, *shape] each."""
-        features = torch.tanh_(apply(self.hidden, self.encoder(*seen)))
-        return apply(self.expected, features).float()
+    def expect(
+        self, seen: tuple[Tensor, ...], state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return what is expected, and with a memory its state after each window.
+
+        Args:
+            seen: s, as the networks see it, [batch, *shape] each.
+            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
+
+        Returns:
+            float32 [batch, n], float32 [windows, VALUE_WIDTH].
+        """
+        features = self.encoder(*seen)
+        if self.memory is not None:
+            features, state = self.memory(features, state)
+        features = torch.tanh_(apply(self.hidden, features))
+        return apply(self.expected, features).float(), state
 
 
 class ValueFunction(_Expectation):
@@ -68,13 +82,18 @@ class ValueFunction(_Expectation):
     ) -> None:
         super().__init__(spec, network, precision, 2)
 
-    def forward(self, seen: tuple[Tensor, ...]) -> Tensor:
+    def forward(self, seen: tuple[Tensor, ...], state: Tensor | None = None) -> Tensor:
         """Return (V(s), D(s)), float32 [batch, 2].
 
         Args:
             seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
+            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
         """
-        value, d = self.expect(seen).unbind(1)
+        return self.value_of(self.expect(seen, state)[0])
+
+    def value_of(self, expected: Tensor) -> Tensor:
+        """Return (V, D), float32 [batch, 2], from what is expected."""
+        value, d = expected.unbind(1)
         deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
         return torch.stack([value, deviation], dim=1)
 
@@ -94,14 +113,21 @@ class Critic(_Expectation):
         super().__init__(spec, network, precision, spec.action_space.n_parameters)
         self._actions = spec.action_space
 
-    def forward(self, seen: tuple[Tensor, ...], action: Tensor) -> Tensor:
+    def forward(
+        self, seen: tuple[Tensor, ...], action: Tensor, state: Tensor | None = None
+    ) -> Tensor:
         """Return Q(s, a), float32 [batch].
 
         Args:
             seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
             action: a, int64 [batch], or [batch, components].
+            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
         """
-        return of_action(self._actions, self.expect(seen), action)
+        return self.value_of(self.expect(seen, state)[0], action)
+
+    def value_of(self, expected: Tensor, action: Tensor) -> Tensor:
+        """Return Q, float32 [batch], from what is expected of each action."""
+        return of_action(self._actions, expected, action)
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:

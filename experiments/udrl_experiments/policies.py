@@ -182,6 +182,7 @@ class _Rows:
         self._model = behavior.model
         space = behavior.model.observation_space
         self.seen: Seen = (np.zeros((n, *behavior.shape), space.dtype),)
+        self.state = self.next_state = np.zeros((n, 0), np.float32)
         self.command = np.zeros((n, 2))
         assert isinstance(behavior.model.action_space, spaces.Discrete)
         self.logits = np.zeros((n, int(behavior.model.action_space.n)), np.float32)

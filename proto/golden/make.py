@@ -390,7 +390,7 @@ def probe() -> dict[str, Any]:
     """Return the probe of the graph: digests of its weights and rows, and the logits."""
     weights = probe_weights(GRAPH)
     function = ActingFunction(GRAPH, weights)
-    seen, command = probe_rows(function, PROBE_ROWS)
+    seen, command, _ = probe_rows(function, PROBE_ROWS)
     logits = function.logits(seen, command)
     actions = [
         choose(logits[k % PROBE_ROWS].tolist(), u)

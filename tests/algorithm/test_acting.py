@@ -289,6 +289,7 @@ class Spy:
 class _SpiedOn:
     def __init__(self, spy: Spy, n: int) -> None:
         self.seen: Seen = (np.zeros((n, *spy.shape), np.float32),)
+        self.state = self.next_state = np.zeros((n, 0), np.float32)
         self.command = np.zeros((n, 2))
         self.logits = np.tile(np.array(spy.logits, np.float32), (n, 1))
         self._spy = spy

@@ -87,6 +87,7 @@ class Watching(ActingFunction):
 class _Noting:
     def __init__(self, call: Call, seen: list[npt.NDArray[Any]]) -> None:
         self.seen, self.command, self.logits = call.seen, call.command, call.logits
+        self.state, self.next_state = call.state, call.next_state
         self._call = call
         self._noted = seen
 

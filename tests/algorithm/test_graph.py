@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from udrl import inference as module
 from udrl.actions import Categorical, Product
+from udrl.architecture import state_sizes
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
@@ -70,6 +71,10 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (IMAGE, {"frame_stack": 4, "baseline": "value"}),
     (RECORD, {}),
     (RECORD, {"frame_stack": 3, "baseline": "value", "activation": "tanh"}),
+    (VECTOR, {"memory": "gru", "memory_size": 12}),
+    (VECTOR, {"memory": "gru", "baseline": "value", "frame_stack": 2}),
+    (IMAGE, {"memory": "gru", "baseline": "action_value"}),
+    (RECORD, {"memory": "gru", "baseline": "value", "observe_previous": True}),
     (RECORD, {"baseline": "action_value", "normalise_observations": True}),
     (VECTOR, {"baseline": "value", "normalise_observations": True, "frame_stack": 2}),
 ]
@@ -125,13 +130,14 @@ def test_it_is_the_function_that_is_trained(
             for parameter in behavior.parameters():
                 parameter.add_(0.3 * torch.randn_like(parameter))
     function = acting(config, behavior, spec)
-    seen, command = probe_rows(function, 64)
+    seen, command, state = probe_rows(function, 64)
     if isinstance(spec.observation_space, Category):
         seen = (np.arange(seen[0].size, dtype=np.int32).reshape(seen[0].shape) % 7,)
-    found = function.logits(seen, command)
+    found = function.logits(seen, command, state)
     with torch.inference_mode():
         shown = tuple(map(torch.tensor, seen))
-        expected = behavior(shown, torch.tensor(read(config, command))).numpy()
+        states = torch.tensor(state).split(state_sizes(config.network), dim=1)
+        expected = behavior(shown, torch.tensor(read(config, command)), states).numpy()
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert np.ptp(found, axis=0).min() > 0.01, "rows that are all alike prove little"
@@ -155,12 +161,17 @@ def test_the_model_is_valid_and_says_the_same_elsewhere(
     model = onnx.load_from_string(function.model)
     onnx.checker.check_model(model, full_check=True)
     assert (model.ir_version, model.opset_import[0].version) == (7, 13)
-    seen, command = probe_rows(function, 5)
+    seen, command, state = probe_rows(function, 5)
     names = [f"observation{leaf.name}" for leaf in leaves_of(spec.observation_space)]
-    (found,) = onnxruntime.InferenceSession(function.model).run(
-        None, {**dict(zip(names, seen, strict=True)), "command": command}
-    )
-    np.testing.assert_allclose(found, function.logits(seen, command), rtol=1e-5, atol=1e-6)
+    given = {**dict(zip(names, seen, strict=True)), "command": command}
+    if state.size:
+        given["state"] = state
+    found, *after = onnxruntime.InferenceSession(function.model).run(None, given)
+    logits, next_state = function.advance(seen, command, state)
+    np.testing.assert_allclose(found, logits, rtol=1e-5, atol=1e-6)
+    for one in after:
+        np.testing.assert_allclose(one, next_state, rtol=1e-5, atol=1e-6)
+    assert bool(after) == bool(state.size)
 
 
 @each_kind
@@ -169,15 +180,17 @@ def test_a_row_has_the_same_bits_in_any_company(
 ) -> None:
     config = settings(**values)
     function = acting(config, initialise(config, spec), spec)
-    seen, command = probe_rows(function, 40)
-    alone = function.logits(seen, command)
+    seen, command, state = probe_rows(function, 40)
+    alone, after = function.advance(seen, command, state)
     rng = np.random.default_rng(1)
     for n in (1, 2, 3, 7, 16, 33, 40):
         rows = rng.permutation(40)[:n]
         call = function.call(n)
         fill(call, picked(seen, rows), command[rows])
+        call.state[:] = state[rows]
         call.run()
         assert np.array_equal(call.logits, alone[rows]), n
+        assert np.array_equal(call.next_state, after[rows]), n
 
 
 def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,7 +204,7 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(module, "is_exact_together", never)
     function = ActingFunction(graph, probe_weights(graph))
-    seen, command = probe_rows(function, 6)
+    seen, command, _ = probe_rows(function, 6)
     call = function.call(6)
     assert isinstance(call, module._OneByOne)
     for rows in ([0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0]):

@@ -297,7 +297,7 @@ def test_gathering_a_few_updates_at_a_time_changes_nothing(
     config = settings(n_updates_per_iter=7)
     digests = set()
     for gathered in (1, 2000, 1 << 20):  # bytes: one update, some, all
-        monkeypatch.setattr("udrl.training._GATHERED_BYTES", gathered)
+        monkeypatch.setattr("udrl.batches._GATHERED_BYTES", gathered)
         state = untrained(config, SPEC)
         train(state, ranked(config, EPISODES), config)
         digests.add(digest(state))

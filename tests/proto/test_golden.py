@@ -141,6 +141,7 @@ class Fixed:
         # The one observation that is stacked.
         shape, dtype = spec.observation_space.shape or (1,), spec.observation_space.dtype
         self.seen: Seen = (np.zeros((1, *shape), dtype),)
+        self.state = self.next_state = np.zeros((1, 0), np.float32)
         self.command: Commands = np.zeros((1, 2))
         self.logits: Logits = np.zeros_like(self._logits)
 

@@ -83,6 +83,7 @@ import udrl
 policy = udrl.load("{folder}")
 env = policy.make_environment()
 observation, _ = env.reset(seed=1)
+policy.reset()
 desired_return, desired_horizon, over = policy.desired_return, policy.desired_horizon, False
 while not over:
     action = policy.predict(observation, desired_return, desired_horizon)
