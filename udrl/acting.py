@@ -32,6 +32,7 @@ from udrl.inference import Acting, Call
 from udrl.memory import FrameStack
 from udrl.recording import Recording
 from udrl.rows import Rows
+from udrl.spaces import parts_of
 from udrl.targets import ReturnInTime
 
 #: Failures under the same command after which it is hopeless.
@@ -196,8 +197,15 @@ class EpisodeGenerator:
         if self._greedy:
             actions[self._greedy] = space.mode(self._parameters[self._greedy])
         if self._n_random:
-            actions[random] = space.uniform(numbers[random])
+            actions[random] = self._random(numbers[random], random)
         return actions
+
+    def _random(self, numbers: npt.NDArray[np.float64], rows: npt.NDArray[np.bool_]) -> Actions:
+        """Return random actions of some rows, of those that are allowed."""
+        space, mask = self.spec.action_space, self.spec.action_mask
+        if mask is None:
+            return space.uniform(numbers)
+        return space.uniform_among(parts_of(self._rows.observation)[mask][rows], numbers)
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
         episode = self._recording.end(row, terminated=terminated, truncated=truncated)

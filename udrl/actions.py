@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from udrl.architecture import FORBIDDEN
 from udrl.spaces import IndexVectors, Indices
 
 Actions = npt.NDArray[np.integer[Any]]
@@ -62,6 +63,15 @@ class Categorical(Indices, frozen=True, tag="categorical"):
     def uniform(self, uniforms: Numbers) -> Actions:
         """Return actions that are all as likely, int64 [rows], for float64 [rows] in [0, 1)."""
         return (uniforms * self.n).astype(np.int64)
+
+    def uniform_among(self, mask: npt.NDArray[Any], uniforms: Numbers) -> Actions:
+        """Return actions that are all as likely, of those that masks, [rows, n], allow."""
+        return self.sample(_logits_of(mask), np.ones((len(mask), 1)), uniforms)
+
+    def allowed(self, mask: npt.NDArray[Any], actions: Actions) -> npt.NDArray[np.bool_]:
+        """Return whether masks, [rows, n], allow actions, [rows]; bool of the actions' shape."""
+        ones: npt.NDArray[np.bool_] = mask[np.arange(len(mask)), actions] > 0
+        return ones
 
     def probabilities(self, logits: Numbers, temperature: float) -> Numbers:
         """Return the distribution over actions, float64 [n], for logits of the same shape.
@@ -141,6 +151,16 @@ class Product(IndexVectors, frozen=True, tag="product"):
         actions: Actions = (uniforms * np.array(self.ns)).astype(np.int64)
         return actions
 
+    def uniform_among(self, mask: npt.NDArray[Any], uniforms: Numbers) -> Actions:
+        """Return actions that are all as likely, of those that masks allow."""
+        return self.sample(_logits_of(mask), np.ones((len(mask), 1)), uniforms)
+
+    def allowed(self, mask: npt.NDArray[Any], actions: Actions) -> npt.NDArray[np.bool_]:
+        """Return whether masks, [rows, n_parameters], allow actions, [rows, components]; bool."""
+        places = actions.astype(np.int64) + np.array(self.ends) - np.array(self.ns)
+        ones: npt.NDArray[np.bool_] = mask[np.arange(len(mask))[:, None], places] > 0
+        return ones
+
     def probabilities(self, logits: Numbers, temperature: float) -> Numbers:
         """Return the distributions of all components, one after another, float64 [n_parameters].
 
@@ -186,6 +206,11 @@ class Product(IndexVectors, frozen=True, tag="product"):
         padded: Numbers = logits[:, places]
         padded[:, impossible] = -np.inf
         return padded
+
+
+def _logits_of(mask: npt.NDArray[Any]) -> Numbers:
+    """Return logits that are 0 for what is allowed, and far too little for all else."""
+    return (1.0 - mask) * FORBIDDEN
 
 
 @lru_cache

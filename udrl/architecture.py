@@ -30,6 +30,9 @@ DEVIATIONS = 2.0
 #: Normalised observations are kept within so many deviations of their mean.
 NORMAL_BOUND = 10.0
 
+#: Added to the logits of actions that are not allowed.
+FORBIDDEN = -1e9
+
 #: In the names of tensors that are set once and not trained.
 NORMALISER = "normaliser"
 

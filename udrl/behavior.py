@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from udrl.action_losses import negative_log_likelihood
-from udrl.architecture import layer_widths, n_features
+from udrl.architecture import FORBIDDEN, layer_widths, n_features
 from udrl.config import Config
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
@@ -39,6 +39,7 @@ class BehaviorFunction(nn.Module):
         network, precision = config.network, PRECISIONS[config.arithmetic.precision]
         self._activation = activation = ACTIVATIONS[network.activation]
         self._actions = spec.action_space
+        self._mask = spec.action_mask
         first, *_ = widths = layer_widths(spec.observation_space, network)
         space, width = spec.observation_space, network.hidden[0]
         self.encoder = make_encoder(space, network, width, activation, precision)
@@ -80,7 +81,11 @@ class BehaviorFunction(nn.Module):
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
             features = self._activation(apply(layer, features))
-        return apply(self.action, features).float()
+        parameters = apply(self.action, features).float()
+        if self._mask is None:
+            return parameters
+        allowed = seen[self._mask][:, -self._actions.n_parameters :].float()
+        return parameters - (allowed - 1.0) * FORBIDDEN
 
     def remember(
         self, seen: tuple[Tensor, ...], state: Tensor | None

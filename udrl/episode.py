@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from udrl.actions import Actions
 from udrl.environments.making import EnvironmentSpec
-from udrl.spaces import Observations
+from udrl.spaces import Observations, parts_of
 
 Rewards = npt.NDArray[np.float32]
 
@@ -72,6 +72,10 @@ def fault(episode: Episode, spec: EnvironmentSpec) -> str | None:
         return f"observations are {found}"
     if found := spec.action_space.fault(episode.actions, n):
         return f"actions are {found}"
+    if spec.action_mask is not None:
+        mask = parts_of(episode.observations)[spec.action_mask]
+        if not spec.action_space.allowed(mask, episode.actions).all():
+            return "an action was taken that action_mask does not allow"
     if not (episode.terminated or episode.truncated):
         return "it neither terminated nor was truncated"
     return None

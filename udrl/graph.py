@@ -25,6 +25,7 @@ from onnx import TensorProto, helper, numpy_helper
 from udrl.architecture import (
     DEVIATIONS,
     FILTER,
+    FORBIDDEN,
     LEAST_DEVIATION,
     NORMAL_BOUND,
     NORMALISER,
@@ -85,6 +86,7 @@ class _Builder:
         self._space = spec.observation_space
         self._leaves = [(f"observation{leaf.name}", leaf.space) for leaf in leaves_of(self._space)]
         self._shapes = FrameStack(self._space, network.frame_stack).shapes
+        self._mask = spec.action_mask
         self._n_parameters = spec.action_space.n_parameters
         self._target = ReturnInTime(network)
         self._states: list[str] = []  # the next ones
@@ -148,7 +150,17 @@ class _Builder:
         features = self._append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self._append(activation, self._layer(f"layers.{k}", features, n_in, n_out))
-        return self._layer("action", features, widths[-1], self._n_parameters)
+        logits = self._layer("action", features, widths[-1], self._n_parameters)
+        return logits if self._mask is None else self._allowed(logits)
+
+    def _allowed(self, logits: str) -> str:
+        """Append what the last mask of the stack says of the logits: 0, or far too little."""
+        n = self._n_parameters
+        length = self._network.frame_stack
+        mask = self._columns(self._leaves[self._mask or 0][0], (length - 1) * n, length * n)
+        allowed = self._append("Cast", mask, to=TensorProto.FLOAT)
+        forbidden = self._append("Sub", allowed, self._number(1.0))
+        return self._append("Sub", logits, self._append("Mul", forbidden, self._number(FORBIDDEN)))
 
     def action_values(self) -> str:
         """Append the critic; see :class:`udrl.value.Critic`."""

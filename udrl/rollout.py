@@ -17,6 +17,7 @@ from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.inference import State
 from udrl.policy import Policy
+from udrl.spaces import parts_of
 from udrl.targets import ReturnInTime
 
 Result = TypeVar("Result")
@@ -101,7 +102,7 @@ class Rollout:
         space, (number, is_random) = self._policy.spec.action_space, self._decision()
         logits, self._state = self._advance()
         if is_random:
-            action: Any = space.uniform(number[None])[0]
+            action: Any = self._random(number[None])[0]
         else:
             action = space.choose(logits, self.temperature, number)
         self.action = action = np.asarray(action).tolist()
@@ -136,6 +137,14 @@ class Rollout:
                 f"support that"
             )
         return picture
+
+    def _random(self, number: Any) -> Any:
+        """Return random actions, of those that are allowed."""
+        spec = self._policy.spec
+        if spec.action_mask is None:
+            return spec.action_space.uniform(number)
+        mask = parts_of(self._recent[-1][None])[spec.action_mask]
+        return spec.action_space.uniform_among(mask, number)
 
     def _decision(self) -> tuple[Any, bool]:
         """Return the number, or numbers, that decide this step's action, and if it is random."""

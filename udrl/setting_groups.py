@@ -81,15 +81,18 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class ActionSettings(SettingsGroup, frozen=True, kw_only=True):
-    """How the numbers of ``Box`` actions are chosen (:mod:`udrl.environments.action_conversions`).
+    """How actions are read (:mod:`udrl.environments.action_conversions`).
 
     Attributes:
+        action_mask: where it says which actions are allowed: ``info``, in ``info["action_mask"]``;
+            or the name of an entry of a ``Dict`` observation; None: all are, always.
         action_bins: values that each dimension can take, evenly from the lowest to the highest;
             None: as many as suit the number of dimensions.
         action_low: the lowest value of dimensions for which the environment declares none.
         action_high: the highest, likewise.
     """
 
+    action_mask: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     action_bins: Annotated[int, Meta(ge=2, le=1000)] | None = None
     action_low: float | None = None
     action_high: float | None = None

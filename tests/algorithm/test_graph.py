@@ -53,6 +53,12 @@ RECORD = EnvironmentSpec(
     action_space=Product(ns=(3, 2, 4)),
     max_episode_steps=500,
 )
+MASKED = EnvironmentSpec(
+    observation_space=Record((Leaf(("a",), Vector(size=3)), Leaf(("may",), Bits(size=5)))),
+    action_space=Product(ns=(3, 2)),
+    max_episode_steps=500,
+    action_mask=1,
+)
 CATEGORY = EnvironmentSpec(
     observation_space=Category(n=7), action_space=Categorical(n=3), max_episode_steps=500
 )
@@ -74,6 +80,8 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {"memory": "gru", "memory_size": 12}),
     (VECTOR, {"memory": "gru", "baseline": "value", "frame_stack": 2}),
     (IMAGE, {"memory": "gru", "baseline": "action_value"}),
+    (MASKED, {"frame_stack": 2, "baseline": "value"}),
+    (MASKED, {"memory": "gru"}),
     (RECORD, {"memory": "gru", "baseline": "value", "observe_previous": True}),
     (RECORD, {"baseline": "action_value", "normalise_observations": True}),
     (VECTOR, {"baseline": "value", "normalise_observations": True, "frame_stack": 2}),
@@ -131,6 +139,8 @@ def test_it_is_the_function_that_is_trained(
                 parameter.add_(0.3 * torch.randn_like(parameter))
     function = acting(config, behavior, spec)
     seen, command, state = probe_rows(function, 64)
+    if spec.action_mask is not None:
+        seen[spec.action_mask][:] = seen[spec.action_mask] % 2
     if isinstance(spec.observation_space, Category):
         seen = (np.arange(seen[0].size, dtype=np.int32).reshape(seen[0].shape) % 7,)
     found = function.logits(seen, command, state)

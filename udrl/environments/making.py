@@ -22,10 +22,11 @@ from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
 from udrl.environments.conversions import observation_conversion
+from udrl.environments.masking import MASK, OBSERVATION, ObserveMask
 from udrl.environments.previous import ObservePrevious
 from udrl.errors import UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
-from udrl.spaces import ObservationSpace
+from udrl.spaces import MOST_LEAVES, Bits, ObservationSpace, Vector, leaves_of
 
 Environment = gym.Env[Any, Any]
 
@@ -47,12 +48,15 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         action_space: what can be done.
         max_episode_steps: steps after which an episode is truncated.
         max_return: the greatest return possible, if declared (caps evaluation commands, 2.3.2).
+        action_mask: which leaf of an observation says what actions are allowed, by its number; 1
+            or 0 for each of the ``n_parameters``; None: all are, always.
     """
 
     observation_space: ObservationSpace
     action_space: ActionSpace
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**31)]
     max_return: float | None = None
+    action_mask: Annotated[int, Meta(ge=0, le=MOST_LEAVES - 1)] | None = None
 
     @property
     def step_bytes(self) -> int:
@@ -132,13 +136,15 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
     observations = actions = None
     problems = []
     try:
-        observations = observation_conversion(env.observation_space)
-    except UnsupportedEnvironment as error:
-        problems.append(str(error))
-    try:
         actions = action_conversion(env.action_space, settings)
     except UnsupportedEnvironment as error:
         problems.append(str(error))
+    if actions is not None and settings.action_mask == "info":
+        env = ObserveMask(env, actions.plain.n_parameters)
+    try:
+        observations = observation_conversion(env.observation_space)
+    except UnsupportedEnvironment as error:
+        problems.insert(0, str(error))
     if env.spec is None or env.spec.max_episode_steps is None:
         problems.append(
             "it has no step limit, so an episode might never end; set one, e.g. "
@@ -194,14 +200,38 @@ def specify(env: Environment, config: Config) -> EnvironmentSpec:
     """Return the spec of an environment that :func:`make_environment` made."""
     assert env.spec is not None
     assert env.spec.max_episode_steps is not None
+    space, actions = (env.get_wrapper_attr(name).plain for name in ("observations", "actions"))
     declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
     max_return = config.max_return if config.max_return is not None else declared
     return EnvironmentSpec(
-        observation_space=env.get_wrapper_attr("observations").plain,
-        action_space=env.get_wrapper_attr("actions").plain,
+        observation_space=space,
+        action_space=actions,
+        action_mask=_mask(config, space, actions),
         max_episode_steps=env.spec.max_episode_steps,
         max_return=None if max_return is None else float(max_return),
     )
+
+
+def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int | None:
+    """Return the number of the leaf that says which actions are allowed."""
+    name = config.actions.action_mask
+    if name is None:
+        return None
+    key = MASK if name == "info" else name
+    leaves = [leaf.path for leaf in leaves_of(space)]
+    found = [k for k, path in enumerate(leaves) if path in ((key,), (OBSERVATION, key))]
+    if not found:
+        raise UnsupportedEnvironment(
+            f"action_mask = {name!r}: environment {config.environment!r} shows no such entry; "
+            f"expected 'info', or one of {', '.join(repr(path[-1]) for path in leaves if path)}"
+        )
+    leaf = leaves_of(space)[found[0]].space
+    if not isinstance(leaf, Bits | Vector) or leaf.size != actions.n_parameters:
+        raise UnsupportedEnvironment(
+            f"action_mask = {name!r}: it is {leaf}, expected {actions.n_parameters} numbers, 0 or "
+            f"1, as {actions} has outputs"
+        )
+    return found[0]
 
 
 def limit_steps(env: Environment, max_steps: int) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from udrl.environments.masking import OBSERVATION
+
 #: Keys of what is observed besides; in training they are hidden together, at random.
 ACTION, REWARD, IS_THERE = PREVIOUS = ("previous_action", "previous_reward", "has_previous")
-OBSERVATION = "observation"
 
 
 class ObservePrevious(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):

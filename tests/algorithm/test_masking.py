@@ -1,0 +1,173 @@
+"""Actions that are not allowed are never taken."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.actions import Categorical, Product
+from udrl.algorithm1 import algorithm1
+from udrl.commands import CommandSampler
+from udrl.config import Budget, Config, build
+from udrl.environments import make_environment
+from udrl.episode import Episode, fault
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.graph import acting_graph
+from udrl.inference import ActingFunction
+from udrl.policy import Policy
+from udrl.rollout import Rollout
+
+
+class Doors(gym.Env[Any, Any]):
+    """Some doors are open; going through a closed one is an error, and the highest pays most."""
+
+    def __init__(self, *, shows: bool = False, two: bool = False, fault: str = "") -> None:
+        self.shows, self.two, self.fault = shows, two, fault
+        self.action_space = spaces.MultiDiscrete([4, 2]) if two else spaces.Discrete(4)
+        seen = spaces.Box(0, 1, (1,), np.float32)
+        self.observation_space: spaces.Space[Any] = seen
+        if shows:
+            self.observation_space = spaces.Dict(
+                doors=spaces.Box(0, 1, (6 if two else 4,), np.int8), time=seen
+            )
+
+    def _returned(self) -> tuple[Any, dict[str, Any]]:
+        self.open = self.np_random.integers(0, 2, 4, np.int8)
+        self.open[self.np_random.integers(4)] = 1
+        mask: Any = self.open
+        if self.two:
+            mask = (self.open, np.array([0, 1], np.int8))
+        time = np.array([self.t / 6], np.float32)
+        if self.fault == "none open":
+            mask = np.zeros(4, np.int8)
+        if self.fault == "too short":
+            mask = np.ones(3, np.int8)
+        info = {} if self.fault == "no mask" else {"action_mask": mask}
+        flat = np.concatenate(mask) if self.two else mask
+        return ({"doors": flat, "time": time} if self.shows else time), info
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._returned()
+
+    def step(self, action: Any) -> Any:
+        door, second = action if self.two else (action, 1)
+        assert self.open[door], "closed"
+        assert second == 1
+        self.t += 1
+        observation, info = self._returned()
+        return observation, float(door), self.t == 6, False, info
+
+
+gym.register("Doors-v0", entry_point=lambda **k: Doors(**k), max_episode_steps=20)
+
+
+def config(mask: str | None = "info", given: dict[str, Any] | None = None, **values: Any) -> Config:
+    small = {
+        "environment": "Doors-v0", "environment_kwargs": given or {}, "action_mask": mask,
+        "hidden": [8, 8], "batch_size": 32, "n_updates_per_iter": 10, "n_warm_up_episodes": 20,
+        "n_episodes_per_iter": 5, "last_few": 5, "eval_every": 100, "eval_episodes": 5,
+        "held_actions": 0.5, "held_rate": 0.3, "hold_steps": 2,
+    }  # fmt: skip
+    return build(Config, small | values)
+
+
+@pytest.mark.parametrize(
+    ("mask", "given", "values"),
+    [
+        ("info", {}, {}),
+        ("info", {"two": True}, {"observe_previous": True, "frame_stack": 2}),
+        ("doors", {"shows": True}, {"eval_temperature": 0.0}),
+        ("doors", {"shows": True, "two": True}, {"observe_previous": True, "memory": "gru"}),
+        ("doors", {"shows": True}, {"baseline": "action_value", "normalise_observations": True}),
+    ],
+)
+def test_whole_runs_keep_to_what_is_allowed(
+    mask: str, given: dict[str, Any], values: dict[str, Any]
+) -> None:
+    settings = config(mask, given, **values)
+    runs = [algorithm1(settings, Budget(max_env_steps=400), n) for n in (1, 5)]
+    assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
+    assert np.isfinite(runs[0].state.loss)
+
+
+def test_a_random_action_is_any_of_those_allowed() -> None:
+    space, mask = Categorical(n=4), np.array([[0, 1, 0, 1]], np.uint8).repeat(1000, axis=0)
+    found = space.uniform_among(mask, np.linspace(0, 1, 1000, endpoint=False))
+    assert found.tolist() == [1] * 500 + [3] * 500
+    pairs, both = Product(ns=(2, 3)), np.array([[1, 0, 0, 1, 1]], np.uint8).repeat(8, axis=0)
+    drawn = pairs.uniform_among(both, np.random.default_rng(1).random((8, 2)))
+    assert drawn[:, 0].tolist() == [0] * 8
+    assert set(drawn[:, 1].tolist()) == {1, 2}
+    assert pairs.allowed(both, drawn).all()
+    assert pairs.allowed(both[:1], np.array([[1, 0]])).tolist() == [[False, False]]
+
+
+def test_one_that_is_watched_keeps_to_it_too() -> None:
+    settings = config("info", {"two": True})
+    run = algorithm1(settings, Budget(max_env_steps=300))
+    generator = EpisodeGenerator(settings, 2)
+    function = ActingFunction(acting_graph(settings.network, generator.spec), run.state.weights)
+    sampler = CommandSampler(settings, generator.spec)
+    policy = Policy(function, settings, generator.spec)
+    for command in [*sampler.explore(9, run.buffer), *sampler.warm_up()[:3]]:
+        (episode,) = generate_episodes(generator, [command], function)
+        rollout = Rollout(policy, make_environment(settings), command)
+        actions = []
+        while not rollout.over:
+            rollout.step()
+            actions.append(rollout.action)
+        assert actions == episode.actions.tolist()
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"fault": "no mask"}, "a dict of nothing as info, without 'action_mask'"),
+        (
+            {"fault": "too short"},
+            r"info\['action_mask'\] an array of int8, shape \(3,\), expected 4",
+        ),
+    ],
+)
+def test_masks_that_are_none_are_the_environments_fault(given: dict[str, Any], says: str) -> None:
+    generator = EpisodeGenerator(config("info", given), 1)
+    commands = CommandSampler(config(), generator.spec).warm_up()
+    with pytest.raises(EnvironmentFault, match=says):
+        generate_episodes(generator, commands, None)
+
+
+@pytest.mark.parametrize(
+    ("mask", "given", "says"),
+    [
+        (
+            "walls",
+            {"shows": True},
+            "shows no such entry; expected 'info', or one of 'doors', 'time'",
+        ),
+        ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
+    ],
+)
+def test_entries_that_are_no_masks_are_refused(mask: str, given: dict[str, Any], says: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=says):
+        EpisodeGenerator(config(mask, given), 1)
+
+
+def test_an_episode_with_a_forbidden_action_is_none() -> None:
+    settings = config()
+    generator = EpisodeGenerator(settings, 1)
+    commands = CommandSampler(settings, generator.spec).warm_up()[:1]
+    (episode,) = generate_episodes(generator, commands, None)
+    assert fault(episode, generator.spec) is None
+    mask = episode.observations["['action_mask']"]
+    forbidden = episode.actions.copy()
+    step = next(t for t in range(episode.length) if not mask[t].all())
+    forbidden[step] = mask[step].argmin()
+    spoiled = Episode(
+        0, episode.observations, forbidden, episode.rewards, episode.terminated, episode.truncated
+    )
+    assert fault(spoiled, generator.spec) == "an action was taken that action_mask does not allow"

@@ -1,0 +1,60 @@
+"""Which actions are allowed, as a part of what is observed (``action_mask``)."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from udrl.environments.conversions import describe
+from udrl.errors import EnvironmentFault
+
+#: Key of the mask in ``info``, and in what is observed.
+MASK = "action_mask"
+OBSERVATION = "observation"
+
+
+class ObserveMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Shows the environment's observation in a ``Dict``, with ``info["action_mask"]``.
+
+    Args:
+        env: any environment whose ``info`` has the mask after every reset and step.
+        size: numbers of the mask, one for each output of the behavior function.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], size: int) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, size=size)
+        gym.Wrapper.__init__(self, env)
+        self._size = size
+        self.observation_space = spaces.Dict(
+            [(OBSERVATION, env.observation_space), (MASK, spaces.MultiBinary(size))]
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._shown("reset", observation, info), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._shown("step", observation, info), reward, terminated, truncated, info
+
+    def _shown(self, where: str, observation: Any, info: Any) -> dict[str, Any]:
+        try:
+            given = info[MASK]
+        except (KeyError, TypeError, IndexError) as error:
+            raise EnvironmentFault(
+                f"{where}() returned {describe(info)} as info, without {MASK!r}; set "
+                f"action_mask only where every info has it"
+            ) from error
+        parts = given if isinstance(given, tuple) else (given,)
+        mask = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
+        if mask.size != self._size or mask.dtype.kind not in "biuf":
+            raise EnvironmentFault(
+                f"{where}() returned as info[{MASK!r}] {describe(given)}, expected {self._size} "
+                f"numbers, 0 or 1"
+            )
+        return {OBSERVATION: observation, MASK: mask.astype(np.int8)}
