@@ -93,6 +93,7 @@ class Experience:
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
+        self._limit = spec.max_episode_steps
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
         seen, acted = spec.observation_space, spec.action_space
         self._leaves = leaves_of(seen)
@@ -233,8 +234,8 @@ class RankedExperience:
         """Make lambda-returns the desired returns of all trailing segments.
 
         G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
-        expected; after a truncation what was expected a step before (the last observation is not
-        kept).
+        expected, nor after the environment's step limit, which ends the return; where an episode
+        was cut before it, what was expected a step before (the last observation is not kept).
 
         Args:
             expected: V at every step, in the order of :meth:`steps`, float32.
@@ -243,7 +244,8 @@ class RankedExperience:
         held, slots, first = self._experience, self._slots, self._first_step
         last = first + self.lengths - 1
         earned = held._earned[self._row(*self._all_steps())]
-        beyond = np.where(held._truncated[slots], expected[last], 0.0)
+        cut = held._truncated[slots] & (self.lengths < held._limit)
+        beyond = np.where(cut, expected[last], 0.0)
         # What follows each step: rewards earned until then, V, and (where it ends) the label.
         earned_next, expected_next = np.roll(earned, -1), np.roll(expected, -1)
         earned_next[last], expected_next[last] = held._returns[slots], beyond
