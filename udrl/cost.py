@@ -23,12 +23,14 @@ _LONG_S = 60.0
 def training_s(config: Config, spec: EnvironmentSpec) -> float:
     """Return about how many seconds the updates of an iteration take on a CPU."""
     network, training = config.network, config.training
-    widths = layer_widths(spec.observation_space, network)
-    acting = _encoder(config, spec, widths[0]) + sum(i * o for i, o in pairwise(widths))
-    expecting = (
-        _encoder(config, spec, VALUE_WIDTH)
-        + n_features(spec.observation_space, network.convolutions, VALUE_WIDTH) * VALUE_WIDTH
-    )
+    space, first = spec.observation_space, network.hidden[0]
+    widths = layer_widths(space, network)
+    acting = _features(config, spec, first, network.memory_size)
+    acting += sum(i * o for i, o in pairwise(widths))
+    width = VALUE_WIDTH
+    if network.memory == "none":
+        width = n_features(space, network.convolutions, VALUE_WIDTH)
+    expecting = _features(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
     networks = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
     examples = training.n_updates_per_iter * training.batch_size
     operations = _OF_AN_UPDATE * examples * (acting + networks * expecting)
@@ -52,6 +54,16 @@ def slow(config: Config, spec: EnvironmentSpec) -> str:
         f"every iteration will train for about {seconds / 60:.0f} minutes on a CPU "
         f"({training.n_updates_per_iter} updates of {training.batch_size} {what}); lower {remedies}"
     )
+
+
+def _features(config: Config, spec: EnvironmentSpec, width: int, remembered: int) -> float:
+    """Return multiplications of an encoder and of the memory behind it, for one observation."""
+    network = config.network
+    encoding = _encoder(config, spec, width)
+    if network.memory == "none":
+        return encoding
+    n_in = n_features(spec.observation_space, network.convolutions, width)
+    return encoding + 3 * remembered * (n_in + remembered)
 
 
 def _encoder(config: Config, spec: EnvironmentSpec, width: int) -> float:

@@ -107,7 +107,7 @@ def test_a_closed_gate_hides_the_observation() -> None:
     with torch.no_grad():
         behavior.command.bias.fill_(-1000.0)
     observation, command = rows(6)
-    assert torch.equal(behavior(observation, command), behavior(-observation, command))
+    assert torch.equal(behavior((observation,), command), behavior((-observation,), command))
 
 
 @pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])

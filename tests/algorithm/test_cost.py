@@ -42,7 +42,13 @@ def test_the_cost_of_an_image_is_that_of_its_convolutions() -> None:
 def test_every_network_adds_its_cost(baseline: str, networks: int) -> None:
     config = settings(hidden=[8], baseline=baseline, n_updates_per_iter=1, batch_size=1)
     found = training_s(config, spec(Vector(size=5))) * 5e10 / 6
-    assert found == pytest.approx(5 * 8 + networks * (5 * 8 + 64 * 64))
+    assert found == pytest.approx(5 * 8 + networks * (5 * 64 + 64 * 64))
+
+
+def test_a_memory_adds_its_cost() -> None:
+    config = settings(hidden=[8], memory="gru", memory_size=16, n_updates_per_iter=1, batch_size=1)
+    found = training_s(config, spec(Vector(size=5))) * 5e10 / 6
+    assert found == pytest.approx(5 * 8 + 3 * 16 * (8 + 16))
 
 
 def test_large_pictures_are_announced_with_what_to_do() -> None:
