@@ -32,6 +32,11 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         return self.n
 
     @property
+    def components(self) -> tuple[int, ...]:
+        """How many values there are of each component, which is the action itself."""
+        return (self.n,)
+
+    @property
     def dtype(self) -> np.dtype[Any]:
         """The smaller of uint8 and int32 that holds them."""
         return np.dtype(np.uint8 if self.n <= 256 else np.int32)
@@ -113,6 +118,11 @@ class Product(IndexVectors, frozen=True, tag="product"):
     def n_parameters(self) -> int:
         """Outputs of the behavior function."""
         return sum(self.ns)
+
+    @property
+    def components(self) -> tuple[int, ...]:
+        """How many values there are of each component."""
+        return self.ns
 
     @property
     def dtype(self) -> np.dtype[Any]:

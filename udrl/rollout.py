@@ -75,6 +75,11 @@ class Rollout:
         """P(a | s_t, c_t), float64 [n_parameters]: what the next action is sampled from."""
         return self._policy.spec.action_space.probabilities(self._advance()[0], self.temperature)
 
+    @property
+    def components(self) -> tuple[int, ...]:
+        """How many values there are of each component of an action."""
+        return self._policy.spec.action_space.components
+
     def tell(self, desired_return: float, desired_horizon: int) -> None:
         """Give another order from here on."""
         self._desired = np.array([[desired_return, desired_horizon]], np.float64)

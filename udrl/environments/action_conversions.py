@@ -79,12 +79,13 @@ class _Joined(Conversion):
     def __init__(
         self, name: str, declared: spaces.Space[Any], parts: Sequence[tuple[Any, Conversion]]
     ) -> None:
-        ns = tuple(n for _, c in parts for n in _ns(c))
+        ns = tuple(n for _, c in parts for n in c.plain.components)
         super().__init__(name, declared, Product(ns=ns))
         self._parts = parts
-        ends = np.cumsum([len(_ns(c)) for _, c in parts])
+        ends = np.cumsum([len(c.plain.components) for _, c in parts])
         self._where = [
-            slice(int(end) - len(_ns(c)), int(end)) for end, (_, c) in zip(ends, parts, strict=True)
+            slice(int(end) - len(c.plain.components), int(end))
+            for end, (_, c) in zip(ends, parts, strict=True)
         ]
 
     def back(self, values: Array) -> Any:
@@ -115,11 +116,6 @@ class _Joined(Conversion):
         ]
 
 
-def _ns(conversion: Conversion) -> tuple[int, ...]:
-    plain = conversion.plain
-    return plain.ns if isinstance(plain, Product) else (plain.n,)
-
-
 def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Conversion:
     """Return how actions of a space become plain, and back.
 
@@ -143,7 +139,10 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
             problems.append(str(error))
     if not leaves:
         problems.append(f"its actions are {space}, of which there is only one")
-    elif not problems and (n := sum(n for _, c in parts for n in _ns(c))) > _MOST_PARAMETERS:
+    elif (
+        not problems
+        and (n := sum(n for _, c in parts for n in c.plain.components)) > _MOST_PARAMETERS
+    ):
         problems.append(f"its actions are {space}, for which the network would have {n:,} outputs; "
                         f"at most {_MOST_PARAMETERS:,} are supported")  # fmt: skip
     if problems:

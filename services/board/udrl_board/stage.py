@@ -86,8 +86,9 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
         temperature: of the next action.
         step: steps so far.
         obtained: return so far.
-        action: the last one; None before the first.
-        probabilities: of the next action; empty when it is over.
+        action: the last one, an index or one for each component; None before the first.
+        probabilities: of the next action, component by component; empty when it is over.
+        components: how many values there are of each component.
         over: whether it has ended.
         truncated: whether a time limit ended it.
         was_told: whether the command was changed on the way.
@@ -106,6 +107,7 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
     obtained: float
     action: int | list[int] | None
     probabilities: list[float]
+    components: list[int]
     over: bool
     truncated: bool
     was_told: bool
@@ -313,6 +315,7 @@ class Stage(threading.Thread):
             obtained=rollout.episode_return,
             action=rollout.action,
             probabilities=[] if rollout.over else rollout.probabilities.tolist(),
+            components=list(rollout.components),
             over=rollout.over,
             truncated=rollout.truncated,
             was_told=self._was_told,

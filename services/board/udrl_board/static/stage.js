@@ -5,6 +5,19 @@ import { $, facts, nice, number } from "./page.js";
 const FIELDS = ["desired-return", "desired-horizon"];
 const round = (x) => (Math.abs(x) < 1 ? Number(Number(x).toPrecision(4)) : Math.round(x * 1000) / 1000);
 
+// Probabilities of all values; of several components the likeliest value of each.
+function nextAction({ probabilities, components }) {
+  const share = (p, value) => `${value}: ${Math.round(100 * p)}\u00a0%`;
+  if (!probabilities.length) return "–";
+  if (components.length === 1) return probabilities.map(share).join(", ");
+  let first = 0;
+  return components.map((n) => {
+    const shares = probabilities.slice(first, first += n);
+    const likeliest = Math.max(...shares);
+    return share(likeliest, shares.indexOf(likeliest));
+  }).join(", ");
+}
+
 export class Command {
   constructor() {
     this.map = new Plane($("map"), { x: "desired return", y: "desired horizon", label: "Commands: what the replay buffer has seen, and what is asked for" });
@@ -159,8 +172,8 @@ export class Command {
       ["obtained", number(message.obtained)],
       ["still desired", number(message.desired_return)],
       ["within", `${number(Math.max(message.desired_horizon, 1))} steps`],
-      ["last action", message.action ?? "–"],
-      ["next action", message.probabilities.map((p, action) => `${action}: ${Math.round(100 * p)}\u00a0%`).join(", ") || "–"],
+      ["last action", [message.action ?? "–"].flat().join(", ")],
+      ["next action", nextAction(message)],
     ]);
     if (message.over) this.map.mark("left", null);
     else this.map.mark("left", message.desired_return, message.desired_horizon, 5);
