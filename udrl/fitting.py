@@ -28,9 +28,9 @@ _RATE_BY_CHANCE, _RATE = 0.15, 0.05
 #: What the network reads well.
 _LEAST, _MOST = 0.1, 10.0
 #: Env steps in an iteration: if its episodes are like random ones, and at most.
-_USUAL_STEPS, _MOST_STEPS = 2_000, 5_000
+_USUAL_STEPS, _MOST_STEPS = 1_000, 5_000
 #: Fewest episodes of an iteration.
-_FEWEST_EPISODES = 10
+_FEWEST_EPISODES = 5
 #: Fewest episodes and env steps of the warm-up: where a reward is rare, one must be found by chance
 #: before there is anything to learn from.
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000

@@ -74,10 +74,10 @@ def test_scales_are_one_over_what_is_usual(
 @pytest.mark.parametrize(
     ("length", "limit", "expected"),
     [
-        (20, 500, 10),  # 100 would be 2,000 steps, but up to 50,000
-        (20, 20, 100),
-        (1, 1, 2_000),
-        (300, 500, 10),
+        (20, 500, 10),  # 50 would be 1,000 steps, but up to 25,000
+        (20, 20, 50),
+        (1, 1, 1_000),
+        (300, 500, 5),
         (9, 100, 50),
     ],
 )
@@ -209,7 +209,7 @@ def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
         fitted = fit(endless, OPEN, generator)
     assert Endless.steps <= 60_000
     assert fitted.network.horizon_scale == 0.0005
-    assert fitted.commands.n_episodes_per_iter == 10
+    assert fitted.commands.n_episodes_per_iter == 5
     assert fitted.commands.n_warm_up_episodes == 50
 
 
