@@ -10,7 +10,7 @@ from torch import Tensor
 
 from udrl.batches import Seen, Windows, tensor_of
 from udrl.config import Config
-from udrl.segments import RankedExperience
+from udrl.segments import RankedExperience, Segments
 
 #: From what is seen, the actions (int64) and the states before: the outputs, and the states after.
 Network = Callable[[Seen, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
@@ -77,7 +77,7 @@ def _window_by_window(
         there = np.flatnonzero(windows.counts > chunk)
         for ranks in np.split(there, range(_AT_ONCE, len(there), _AT_ONCE)):
             segments, valid = windows.steps(ranks, np.full(len(ranks), chunk))
-            examples = experience.examples(type(segments)(*(s.reshape(-1) for s in segments)))
+            examples = experience.examples(Segments(*(s.reshape(-1) for s in segments)))
             numbers = torch.from_numpy(windows.first[ranks] + chunk).to(device)
             found, after = network(
                 _placed(examples.seen, device), _acted(examples.action, device), states[numbers]

@@ -26,7 +26,7 @@ def test_services_at_lead_0_equal_the_reference(
     assert status.evaluation.mean == expected.evaluations[status.evaluation.iteration].mean
 
 
-@pytest.mark.parametrize("lead", [0, 1, 3])
+@pytest.mark.parametrize("lead", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize(("make", "budget"), CASES)
 def test_result_does_not_depend_on_actors_or_environments(
     make: Callable[..., Config], budget: int, lead: int, run: Runner

@@ -40,6 +40,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_run_whose_disk_is_full_stops_and_goes_on_with_more_space(
     disk: Path, cli: Callable[..., Cli], run: Callable[..., Status]
 ) -> None:

@@ -90,6 +90,7 @@ def test_services_meet_at_a_router_of_somebody_else(
     assert digests(status) == digests(run(small(), BUDGET))
 
 
+@pytest.mark.slow
 def test_killed_services_come_back_with_their_keys(
     cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
 ) -> None:

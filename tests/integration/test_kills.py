@@ -32,9 +32,9 @@ def undisturbed() -> dict[str, object]:
 @pytest.mark.parametrize(
     "kills",
     [
-        [("actor", 1), ("actor", 8)],
-        [("learner", 1), ("learner", 9)],
-        [("replay", 1), ("replay", 9)],
+        pytest.param([("actor", 1), ("actor", 8)], marks=pytest.mark.slow),
+        pytest.param([("learner", 1), ("learner", 9)], marks=pytest.mark.slow),
+        pytest.param([("replay", 1), ("replay", 9)], marks=pytest.mark.slow),
         [("replay", 2), ("learner", 5), ("actor", 8)],
     ],
     ids=["actor", "learner", "replay", "each"],
@@ -73,7 +73,9 @@ def test_run_killed_as_a_whole_goes_on_from_its_directory(
     assert digests(status) == digests(run(small(), BUDGET))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_signal_ends_the_run_cleanly_and_it_can_be_resumed(
     number: signal.Signals, cli: Callable[..., Cli], run: Callable[..., Status], tmp_path: Path
 ) -> None:

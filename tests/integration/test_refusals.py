@@ -132,6 +132,7 @@ def test_first_that_delivers_says_how_all_must_round(hosted: Hosted) -> None:
     assert_conserved(hosted.status())
 
 
+@pytest.mark.slow
 def test_peers_that_round_differently_and_deliver_nothing_keep_nobody_away(hosted: Hosted) -> None:
     hosted.join("actor", "idle", "of its own")
     hosted.join("learner", "idle", "of its own")

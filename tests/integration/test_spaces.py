@@ -34,7 +34,7 @@ def nested(**changes: Any) -> Config:
     return build(Config, SETTINGS | changes)
 
 
-@pytest.mark.parametrize("frame_stack", [1, 2])
+@pytest.mark.parametrize("frame_stack", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_of_records_and_products_equals_the_reference(frame_stack: int, run: Runner) -> None:
     config = nested(frame_stack=frame_stack)
     expected = reference(config, 1500)

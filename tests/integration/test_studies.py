@@ -46,6 +46,7 @@ def runs_of(root: Path, algorithm: str) -> list[Path]:
     return sorted((root / "runs").glob(f"{algorithm}-*"))
 
 
+@pytest.mark.slow
 def test_a_comparison_is_interrupted_and_goes_on(
     cli: Callable[..., Cli], study: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -140,6 +141,7 @@ def test_all_studies_share_their_runs(
     assert len(runs_of(tmp_path, "udrl")) == 4 + 2
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_search_goes_on_with_more_configurations(
     study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
