@@ -19,7 +19,9 @@ import zenoh
 
 Weights = Mapping[str, npt.NDArray[np.float32]]
 MASK = 2**64 - 1
-DTYPES = {"vector": "<f4", "image": "|u1", "category": "<i4"}
+DTYPES = {
+    "vector": "<f4", "bits": "|u1", "image": "|u1", "category": "<i4", "categories": "<i4",
+}  # fmt: skip
 
 
 # Random streams.
@@ -63,20 +65,33 @@ class Network:
         options.intra_op_num_threads = 1
         self._session = onnxruntime.InferenceSession(model.SerializeToString(), options)
 
-    def logits(self, observation: npt.NDArray[Any], desired: list[float]) -> npt.NDArray[Any]:
-        """Return the logits of one row."""
-        row = {"observation": observation[None], "command": np.array([desired], np.float64)}
-        (found,) = self._session.run(["logits"], row)
-        logits: npt.NDArray[Any] = found[0]
-        return logits
+        self._names = [one.name for one in self._session.get_inputs()]
+        self._outputs = [one.name for one in self._session.get_outputs()]
+        ends = self._session.get_inputs()[-1]
+        self.state_size = ends.shape[1] if ends.name == "state" else 0
+
+    def logits(
+        self, shown: list[npt.NDArray[Any]], desired: list[float], state: npt.NDArray[Any]
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Return the logits of one row, and the state at the next step."""
+        given = [*(one[None] for one in shown), np.array([desired], np.float64)]
+        given += [state[None]] if self.state_size else []
+        found = self._session.run(self._outputs, dict(zip(self._names, given, strict=True)))
+        return found[0][0], found[1][0] if self.state_size else state
 
 
-def seen(observations: list[npt.NDArray[Any]], stack: int) -> npt.NDArray[Any]:
-    """Return the most recent observations, oldest first; the first stands for those before it."""
-    last = len(observations) - 1
-    return np.concatenate(
-        [np.atleast_1d(observations[max(last - k, 0)]) for k in reversed(range(stack))]
-    )
+def leaves(spec: dict[str, Any]) -> list[tuple[list[Any], dict[str, Any]]]:
+    """Return path and space of each leaf of the observations."""
+    space = spec["observation_space"]
+    if space["kind"] != "record":
+        return [([], space)]
+    return [(list(leaf["path"]), leaf["space"]) for leaf in space["leaves"]]
+
+
+def seen(observations: list[list[npt.NDArray[Any]]], stack: int) -> list[npt.NDArray[Any]]:
+    """Return the most recent of each leaf, oldest first; the first stands for those before it."""
+    recent = [observations[max(len(observations) - 1 - k, 0)] for k in reversed(range(stack))]
+    return [np.concatenate(list(map(np.atleast_1d, one))) for one in zip(*recent, strict=True)]
 
 
 def choose(row: list[float], u: float, temperature: float) -> int:
@@ -89,13 +104,76 @@ def choose(row: list[float], u: float, temperature: float) -> int:
     return min(sum(c <= u * total for c in cumulative), len(row) - 1)
 
 
-def as_promised(observation: Any, spec: dict[str, Any]) -> npt.NDArray[Any]:
-    """Return an observation of an environment as its space says."""
-    kind = spec["observation_space"]["kind"]
-    array = np.asarray(observation, DTYPES[kind])
-    if kind == "image":
-        array = np.moveaxis(array if array.ndim == 3 else array[..., None], -1, 0)
-    return array
+def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.NDArray[Any]]:
+    """Return the leaves of an observation of an environment as its space says."""
+    found = []
+    for path, leaf in leaves(spec):
+        value, of = observation, space
+        for key in path:
+            value, of = value[key], of[key]
+        array = np.asarray(value)
+        if leaf["kind"] in ("category", "categories"):
+            array = array - of.start
+        array = array.astype(DTYPES[leaf["kind"]])
+        if leaf["kind"] == "image":
+            array = np.moveaxis(array if array.ndim == 3 else array[..., None], -1, 0)
+        elif leaf["kind"] != "category":
+            array = array.reshape(-1)
+        found.append(array)
+    return found
+
+
+def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDArray[Any]:
+    """Return an episode's observations as they are sent."""
+    if spec["observation_space"]["kind"] != "record":
+        return np.array([one for (one,) in steps])
+    rows = [b"".join(leaf.tobytes() for leaf in step) for step in steps]
+    return np.frombuffer(b"".join(rows), f"|V{len(rows[0])}")
+
+
+def components(spec: dict[str, Any]) -> list[int]:
+    """Return how many values there are of each component of an action."""
+    space = spec["action_space"]
+    return list(space["ns"]) if space["kind"] == "product" else [space["n"]]
+
+
+def is_box(space: Any) -> bool:
+    return isinstance(space, gym.spaces.Box)
+
+
+def all_within(space: Any) -> list[Any]:
+    """Return the spaces in dictionaries and tuples."""
+    if isinstance(space, gym.spaces.Dict):
+        return [leaf for inner in space.spaces.values() for leaf in all_within(inner)]
+    if isinstance(space, gym.spaces.Tuple):
+        return [leaf for inner in space.spaces for leaf in all_within(inner)]
+    return [space]
+
+
+def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
+    """Return an action as its environment takes it; the indices are used up."""
+    dimensions = sum(math.prod(one.shape) for one in all_within(space) if is_box(one))
+    m = config["action_bins"] or (11 if dimensions <= 2 else 7)
+
+    def one(inner: Any) -> Any:
+        if isinstance(inner, gym.spaces.Dict):
+            return {key: one(part) for key, part in inner.spaces.items()}
+        if isinstance(inner, gym.spaces.Tuple):
+            return tuple(one(part) for part in inner.spaces)
+        if isinstance(inner, gym.spaces.Discrete):
+            return indices.pop(0) + inner.start
+        mine = [indices.pop(0) for _ in range(math.prod(inner.shape))]
+        if is_box(inner):
+            low = np.where(np.isfinite(inner.low), inner.low, config["action_low"])
+            high = np.where(np.isfinite(inner.high), inner.high, config["action_high"])
+            bounds = zip(low.ravel().tolist(), high.ravel().tolist(), mine, strict=True)
+            mine = [a + i * (b - a) / (m - 1) for a, b, i in bounds]
+        array = np.array(mine).reshape(inner.shape)
+        if isinstance(inner, gym.spaces.MultiDiscrete):
+            array = array + inner.start
+        return array.astype(inner.dtype)
+
+    return one(space)
 
 
 def run_episode(
@@ -103,46 +181,56 @@ def run_episode(
 ) -> dict[str, Any]:
     """Carry out a command and return the arrays and flags of its episode."""
     config, spec = hello["config"], hello["environment"]
-    n_actions = spec["action_space"]["n"]
+    ns = components(spec)
     limited = {"max_episode_steps": command["max_steps"]} | config["environment_kwargs"]
     env = gym.make(config["environment"], **limited)
-    u = numbers(command["stream_key"], command["max_steps"])
+    u = numbers(command["stream_key"], command["max_steps"] * len(ns))
     begins = numbers(hashlib.sha256(command["stream_key"]).digest()[:16], command["max_steps"])
     begun = held_until = 0
     desired, horizon = command["desired_return"], float(command["desired_horizon"])
     observation, _ = env.reset(seed=command["environment_seed"])
-    observations: list[npt.NDArray[Any]] = []
-    actions: list[int] = []
+    observations: list[list[npt.NDArray[Any]]] = []
+    actions: list[list[int]] = []
     rewards: list[np.float32] = []
+    state = np.zeros(network.state_size if network else 0, np.float32)
     terminated = truncated = False
     while not (terminated or truncated):
         if command["cap"] is not None:
             desired = min(desired, command["cap"])
-        observations.append(as_promised(observation, spec))
+        observations.append(as_promised(observation, env.observation_space, spec))
         t = len(actions)
         since = t - command["random_from"]
         if command["random_rate"] and t >= held_until and begins[t] < command["random_rate"]:
             begun = t
             multiple = math.floor(1 / (1 - begins[t] / command["random_rate"]))
             held_until = t + command["random_hold"] * multiple
-        if t < held_until:
-            action = int(u[begun] * n_actions)
-        elif not command["random_rate"] and 0 <= since < command["random_steps"]:
-            action = int(u[t - since % command["random_hold"]] * n_actions)
-        else:
-            assert network is not None
+        row: list[float] = []
+        if network is not None:
             stacked = seen(observations, config["frame_stack"])
-            row = network.logits(stacked, [desired, horizon]).tolist()
-            action = choose(row, u[t], command["temperature"])
+            found, state = network.logits(stacked, [desired, horizon], state)
+            row = found.tolist()
+        decides = t
+        if t < held_until:
+            decides, row = begun, []
+        elif not command["random_rate"] and 0 <= since < command["random_steps"]:
+            decides, row = t - since % command["random_hold"], []
+        action, first = [], 0
+        for i, n in enumerate(ns):
+            number = u[decides * len(ns) + i]
+            own = row[first : first + n]
+            first += n
+            action.append(choose(own, number, command["temperature"]) if own else int(number * n))
         actions.append(action)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        taken = as_declared(list(action), env.action_space, config)
+        observation, reward, terminated, truncated, _ = env.step(taken)
         rewards.append(np.float32(reward))
         desired -= float(rewards[-1])
         horizon -= 1
     env.close()
+    done = np.array(actions, "|u1" if max(ns) <= 256 else "<i4")
     return {
-        "observations": np.array(observations),
-        "actions": np.array(actions, "|u1" if n_actions <= 256 else "<i4"),
+        "observations": packed(observations, spec),
+        "actions": done if spec["action_space"]["kind"] == "product" else done[:, 0],
         "rewards": np.array(rewards, "<f4"),
         "terminated": terminated,
         "truncated": truncated,
@@ -178,37 +266,64 @@ def probe_weights(graph: bytes) -> Weights:
     return weights
 
 
-def probe_rows(hello: dict[str, Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return what the network sees in 16 rows, and their commands."""
-    spec = hello["environment"]
-    space, stack = spec["observation_space"], hello["config"]["frame_stack"]
-    names = ("size", "channels", "height", "width")
-    first, *rest = [space[name] for name in names if name in space] or [1]
-    shape = (16, stack * first, *rest)
-    drawn = numbers(stream_key(0, "probe", 2, 0), math.prod(shape) + 32)
-    observed, desired = drawn[:-32], drawn[-32:]
-    if space["kind"] == "image":
-        observation = np.array([math.floor(u * 256) for u in observed], "|u1")
-    elif space["kind"] == "category":
-        observation = np.zeros(len(observed), "<i4")
-    else:
-        observation = np.array([u * 4 - 2 for u in observed], "<f4")
-    command = np.array([u * 200 - 100 for u in desired], "<f8")
-    return observation.reshape(shape), command.reshape(16, 2)
+def probe_rows(
+    hello: dict[str, Any], state_size: int
+) -> tuple[list[npt.NDArray[Any]], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return what the network sees in 16 rows, leaf by leaf, their commands and states."""
+    stack, sizes = hello["config"]["frame_stack"], []
+    for _, space in leaves(hello["environment"]):
+        names = ("size", "channels", "height", "width")
+        first, *rest = [space[name] for name in names if name in space] or [
+            len(space.get("ns", [1]))
+        ]
+        sizes.append((space["kind"], (16, stack * first, *rest)))
+    total = sum(math.prod(shape) for _, shape in sizes)
+    drawn = numbers(stream_key(0, "probe", 2, 0), total + 32 + 16 * state_size)
+    shown = []
+    for kind, shape in sizes:
+        n = math.prod(shape)
+        observed, drawn = drawn[:n], drawn[n:]
+        if DTYPES[kind] == "|u1":
+            observation = np.array([math.floor(u * 256) for u in observed], "|u1")
+        elif DTYPES[kind] == "<i4":
+            observation = np.zeros(n, "<i4")
+        else:
+            observation = np.array([u * 4 - 2 for u in observed], "<f4")
+        shown.append(observation.reshape(shape))
+    command = np.array([u * 200 - 100 for u in drawn[:32]], "<f8").reshape(16, 2)
+    state = np.array([u * 2 - 1 for u in drawn[32:]], "<f4").reshape(16, state_size)
+    return shown, command, state
 
 
-def probe_logits(hello: dict[str, Any]) -> npt.NDArray[Any]:
+def probe_logits(hello: dict[str, Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     network = Network(hello["graph"], probe_weights(hello["graph"]))
-    rows = zip(*probe_rows(hello), strict=True)
-    return np.array([network.logits(s, c.tolist()) for s, c in rows], "<f4")
+    shown, command, state = probe_rows(hello, network.state_size)
+    rows = [
+        network.logits([leaf[k] for leaf in shown], command[k].tolist(), state[k])
+        for k in range(16)
+    ]
+    logits, after = zip(*rows, strict=True)
+    return np.array(logits, "<f4"), np.array(after, "<f4")
 
 
 def numerics_class(hello: dict[str, Any]) -> str:
-    logits = probe_logits(hello)
-    drawn = numbers(stream_key(0, "probe", 3, 0), 64)
-    actions = [choose(logits[k % 16].tolist(), u, 1.0) for k, u in enumerate(drawn)]
-    dtype = "|u1" if logits.shape[1] <= 256 else "<i4"
-    return arrays_digest({"actions": np.array(actions, dtype), "logits": logits}).hex()[:16]
+    logits, after = probe_logits(hello)
+    ns = components(hello["environment"])
+    drawn = numbers(stream_key(0, "probe", 3, 0), 64 * len(ns))
+    actions = []
+    for k in range(64):
+        first, action = 0, []
+        for i, n in enumerate(ns):
+            own = logits[k % 16].tolist()[first : first + n]
+            action.append(choose(own, drawn[k * len(ns) + i], 1.0))
+            first += n
+        actions.append(action)
+    done = np.array(actions, "|u1" if max(ns) <= 256 else "<i4")
+    is_product = hello["environment"]["action_space"]["kind"] == "product"
+    arrays = {"actions": done if is_product else done[:, 0], "logits": logits}
+    if after.size:
+        arrays["next_state"] = after
+    return arrays_digest(arrays).hex()[:16]
 
 
 def environment_digest(hello: dict[str, Any]) -> str:

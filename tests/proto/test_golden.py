@@ -104,10 +104,10 @@ def test_probe_is_what_the_page_says() -> None:
     hello = msgpack.unpackb((GOLDEN / "hello.msgpack").read_bytes())
     weights = stranger.probe_weights(hello["graph"])
     assert stranger.arrays_digest(weights).hex() == PROBE["weights"]
-    observation, command = stranger.probe_rows(hello)
+    (observation,), command, _ = stranger.probe_rows(hello, 0)
     rows = {"command": command, "observation": observation}
     assert stranger.arrays_digest(rows).hex() == PROBE["rows"]
-    logits = stranger.probe_logits(hello)
+    logits, _ = stranger.probe_logits(hello)
     assert logits.tolist() == MAKE["probe"]()["logits"]
     np.testing.assert_allclose(logits, PROBE["logits"], rtol=0, atol=1e-5)
 

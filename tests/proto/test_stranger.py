@@ -151,6 +151,35 @@ def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None
 def test_episode_has_the_same_bytes(
     version: int, more: dict[str, Any], generator: EpisodeGenerator
 ) -> None:
+    assert_same_episodes(CONFIG, generator, version, more)
+
+
+@pytest.mark.parametrize(
+    ("environment", "settings"),
+    [
+        ("Nested", {}),
+        ("Nested", {"frame_stack": 3, "baseline": "value", "normalise_observations": True}),
+        ("Nested", {"memory": "gru", "baseline": "value", "action_bins": 4}),
+        ("Reach", {}),
+        ("Reach", {"memory": "gru", "memory_size": 5, "frame_stack": 2}),
+    ],
+)
+def test_every_kind_of_space_has_the_same_class_and_bytes(
+    environment: str, settings: dict[str, Any]
+) -> None:
+    config = change(
+        CONFIG, environment=f"kinds_of_spaces:{environment}-v0", convolutions=(4,), **settings
+    )
+    assert_same_class(config)
+    generator = EpisodeGenerator(config, 2)
+    for version, more in ((0, {"random_steps": 25}), (1, {}), (1, {"random_rate": 0.3})):
+        assert_same_episodes(config, generator, version, more)
+    generator.close()
+
+
+def assert_same_episodes(
+    config: Config, generator: EpisodeGenerator, version: int, more: dict[str, Any]
+) -> None:
     commands = [
         Command(
             id=index,
@@ -165,10 +194,10 @@ def test_episode_has_the_same_bytes(
         )
         for index in range(5)
     ]
-    said = hello(CONFIG, generator.spec)
+    said = hello(config, generator.spec)
     behavior = network = None
     if version:
-        weights = untrained(CONFIG, generator.spec).weights
+        weights = untrained(config, generator.spec).weights
         behavior = ActingFunction(said["graph"], weights)
         network = stranger.Network(said["graph"], weights)
     for ours in generate_episodes(generator, commands, behavior):
