@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from udrl.config import Config
+from udrl.environments.masking import below_observation
 from udrl.environments.previous import PREVIOUS
 from udrl.segments import RankedExperience, Segments, draw_segments
 from udrl.streams import Stream
@@ -164,7 +165,9 @@ class Batches:
         self._experience = experience
         leaves = experience.leaves
         kinds = [(s, leaf.space.dtype) for s, leaf in zip(experience.shapes, leaves, strict=True)]
-        self._previous = [k for k, leaf in enumerate(leaves) if leaf.path[:1] in _PREVIOUS]
+        self._previous = [
+            k for k, leaf in enumerate(leaves) if below_observation(leaf.path)[:1] in _PREVIOUS
+        ]
         updates, size = draw.segments.rank.shape
         bytes_each = size * sum(math.prod(s) * d.itemsize for s, d in kinds)
         self._at_once = max(1, min(updates, _GATHERED_BYTES // bytes_each))

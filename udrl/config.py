@@ -59,6 +59,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
         environment_kwargs: keyword arguments for ``gymnasium.make``.
         wrappers: what the environment is wrapped in, one after another, as
             ``package.module:Wrapper``.
+        observe_time: whether the time that is left is observed too.
         observe_previous: whether the previous action and reward are observed too.
         max_episode_steps: time limit of an episode in steps; None: the environment's own.
         max_train_steps: time limit of warm-up and exploratory episodes only; None: no other.
@@ -78,6 +79,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
     environment: Annotated[str, Meta(min_length=1, max_length=200)]
     environment_kwargs: Keywords = {}
     wrappers: Annotated[tuple[Wrapper, ...], Meta(min_length=0, max_length=16)] = ()
+    observe_time: bool = False
     observe_previous: bool = False
     max_episode_steps: PositiveInt | None = None
     max_train_steps: PositiveInt | None = None

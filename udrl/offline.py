@@ -16,10 +16,10 @@ from gymnasium.envs.registration import EnvSpec
 
 from udrl.config import Config, change
 from udrl.digests import episode_digest, replay_digest
+from udrl.environments import previous, time_left
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.conversions import Conversion, observation_conversion
 from udrl.environments.making import EnvironmentSpec, make_environment
-from udrl.environments.previous import observation_space, shown_in_all_steps
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
 
@@ -89,20 +89,26 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
 
 
 class _Reader:
-    """Makes episodes of a dataset's, whose spaces become plain as an environment's do."""
+    """Makes episodes of a dataset's, whose spaces become plain as an environment's do.
+
+    What the run's environment shows besides is added, if it follows from what the dataset has.
+    """
 
     def __init__(self, name: str, dataset: Any, config: Config, spec: EnvironmentSpec) -> None:
         self._name = name
         self._spec = spec
+        self._adds_time = self._adds_previous = False
         seen, done = dataset.observation_space, dataset.action_space
         try:
             actions = action_conversion(done, config.actions)
             observations = observation_conversion(seen)
-            self._adds_previous = config.observe_previous and (
-                observations.plain != spec.observation_space
-            )
-            if self._adds_previous:
-                observations = observation_conversion(observation_space(seen, done))
+            if observations.plain != spec.observation_space:
+                self._adds_time = config.observe_time
+                self._adds_previous = config.observe_previous
+                shown = time_left.observation_space(seen) if self._adds_time else seen
+                if self._adds_previous:
+                    shown = previous.observation_space(shown, done)
+                observations = observation_conversion(shown)
         except UnsupportedEnvironment as error:
             raise ConfigError(
                 f"dataset {name!r}: {error}; name a dataset of the run's environment"
@@ -117,10 +123,13 @@ class _Reader:
 
     def _shown(self, data: Any) -> Any:
         """Return the observations of a dataset's episode as those of the run's environment."""
-        if not self._adds_previous:
-            return data.observations
-        done = self._actions.declared
-        return shown_in_all_steps(done, data.observations, data.actions, data.rewards)
+        shown, n = data.observations, len(data.rewards) + 1
+        if self._adds_time:
+            shown = time_left.shown_in_all_steps(shown, n, self._spec.max_episode_steps)
+        if self._adds_previous:
+            done = self._actions.declared
+            shown = previous.shown_in_all_steps(done, shown, data.actions, data.rewards)
+        return shown
 
     def episode(self, number: int, data: Any) -> Episode:
         rewards = np.asarray(data.rewards, np.float32)

@@ -21,6 +21,8 @@ from udrl.spaces import leaves_of
 from udrl.targets import Desired, ReturnInTime
 
 _PAGE = 64
+#: More steps than an episode has.
+_NEVER = 2**62
 #: Pages that there are at least, once there are any.
 _FIRST_PAGES = 256
 
@@ -93,7 +95,8 @@ class Experience:
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
-        self._limit = spec.max_episode_steps
+        # An agent that sees the time coming expects nothing after it (Pardo et al., 2018).
+        self._ends_at = spec.max_episode_steps if config.observe_time else _NEVER
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
         seen, acted = spec.observation_space, spec.action_space
         self._leaves = leaves_of(seen)
@@ -234,8 +237,8 @@ class RankedExperience:
         """Make lambda-returns the desired returns of all trailing segments.
 
         G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
-        expected, nor after the environment's step limit, which ends the return; where an episode
-        was cut before it, what was expected a step before (the last observation is not kept).
+        expected; after a truncation what was expected a step before (the last observation is not
+        kept), except at the environment's own limit where the time that is left is observed.
 
         Args:
             expected: V at every step, in the order of :meth:`steps`, float32.
@@ -244,8 +247,8 @@ class RankedExperience:
         held, slots, first = self._experience, self._slots, self._first_step
         last = first + self.lengths - 1
         earned = held._earned[self._row(*self._all_steps())]
-        cut = held._truncated[slots] & (self.lengths < held._limit)
-        beyond = np.where(cut, expected[last], 0.0)
+        goes_on = held._truncated[slots] & (self.lengths < held._ends_at)
+        beyond = np.where(goes_on, expected[last], 0.0)
         # What follows each step: rewards earned until then, V, and (where it ends) the label.
         earned_next, expected_next = np.roll(earned, -1), np.roll(expected, -1)
         earned_next[last], expected_next[last] = held._returns[slots], beyond

@@ -125,9 +125,10 @@ def side_by_side(elements: list[Any]) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning:minari")
+@pytest.mark.parametrize("time", [False, True])
 @pytest.mark.parametrize("environment", ["CartPole-v1", NESTED])
 def test_a_dataset_without_it_is_completed(
-    environment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    environment: str, time: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
     from minari.data_collector import EpisodeBuffer
@@ -135,7 +136,7 @@ def test_a_dataset_without_it_is_completed(
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     raw = gym.make(environment)
     raw.action_space.seed(3)
-    settings = config(environment=environment)
+    settings = config(environment=environment, observe_time=time)
     own = make_environment(settings)
     expected, buffers = [], []
     for seed in (0, 1):

@@ -22,8 +22,9 @@ from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
 from udrl.environments.conversions import observation_conversion
-from udrl.environments.masking import MASK, OBSERVATION, ObserveMask
+from udrl.environments.masking import MASK, ObserveMask, below_observation
 from udrl.environments.previous import ObservePrevious
+from udrl.environments.time_left import ObserveTime
 from udrl.errors import UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
 from udrl.spaces import MOST_LEAVES, Bits, ObservationSpace, Vector, leaves_of
@@ -103,6 +104,8 @@ def make_environment(config: Config) -> Adapter:
         ) from error
     for wrapper in config.wrappers:
         env = _wrapped(env, wrapper)
+    if config.observe_time and env.spec is not None and env.spec.max_episode_steps is not None:
+        env = ObserveTime(env, env.spec.max_episode_steps)
     return adapt(ObservePrevious(env) if config.observe_previous else env, name, config.actions)
 
 
@@ -219,7 +222,7 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
         return None
     key = MASK if name == "info" else name
     leaves = [leaf.path for leaf in leaves_of(space)]
-    found = [k for k, path in enumerate(leaves) if path in ((key,), (OBSERVATION, key))]
+    found = [k for k, path in enumerate(leaves) if below_observation(path) == (key,)]
     if not found:
         raise UnsupportedEnvironment(
             f"action_mask = {name!r}: environment {config.environment!r} shows no such entry; "

@@ -8,10 +8,18 @@ from gymnasium import spaces
 
 from udrl.environments.conversions import describe
 from udrl.errors import EnvironmentFault
+from udrl.spaces import Key
 
 #: Key of the mask in ``info``, and in what is observed.
 MASK = "action_mask"
 OBSERVATION = "observation"
+
+
+def below_observation(path: tuple[Key, ...]) -> tuple[Key, ...]:
+    """Return the way to a leaf from where our wrappers' own keys are."""
+    while path[:1] == (OBSERVATION,):
+        path = path[1:]
+    return path
 
 
 class ObserveMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):

@@ -1,0 +1,58 @@
+"""The time that is left as a part of what is observed (``observe_time``)."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from udrl.environments.masking import OBSERVATION
+
+TIME_LEFT = "time_left"
+
+
+class ObserveTime(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Shows the environment's observation in a ``Dict``, with the time that is left.
+
+    That is 1 at an episode's first step and counts down to 0 at the step limit.
+
+    Args:
+        env: any environment.
+        max_steps: its step limit.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], max_steps: int) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, max_steps=max_steps)
+        gym.Wrapper.__init__(self, env)
+        self._max_steps = max_steps
+        self._step = 0
+        self.observation_space = observation_space(env.observation_space)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._step = 0
+        return self._shown(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._step += 1
+        return self._shown(observation), reward, terminated, truncated, info
+
+    def _shown(self, observation: Any) -> dict[str, Any]:
+        left = 1 - self._step / self._max_steps
+        return {OBSERVATION: observation, TIME_LEFT: np.array([left], np.float32)}
+
+
+def observation_space(seen: spaces.Space[Any]) -> spaces.Dict:
+    """Return the space of observations with the time that is left."""
+    return spaces.Dict([(OBSERVATION, seen), (TIME_LEFT, spaces.Box(0, 1, (1,), np.float32))])
+
+
+def shown_in_all_steps(observations: Any, n: int, max_steps: int) -> dict[str, Any]:
+    """Return ``n`` observations as the wrapper would have shown them."""
+    left = np.array([[1 - step / max_steps] for step in range(n)], np.float32)
+    return {OBSERVATION: observations, TIME_LEFT: left}
