@@ -104,6 +104,8 @@ def _create(
         # First, as an actor does it: in an instance that has seen nothing else.
         digest = repeated_digest(generator)
         config, offline = settle_dataset(config, generator.spec)
+        if left_open:
+            log.info("choosing settings by random episodes of %s", config.environment)
         config = fit(config, left_open, generator, offline)
     exact = digest != ""
     progress = Progress(exact=exact)
