@@ -14,10 +14,13 @@ from torch import Tensor, nn
 from udrl.action_losses import negative_log_likelihood
 from udrl.architecture import FORBIDDEN, layer_widths, n_features
 from udrl.config import Config
+from udrl.custom import make_custom
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.initialisation import draw_weights
 from udrl.recurrence import Memory
+from udrl.setting_groups import NetworkSettings
+from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 from udrl.value import ValueFunction, relative
 
@@ -37,20 +40,31 @@ class BehaviorFunction(nn.Module):
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
         network, precision = config.network, PRECISIONS[config.arithmetic.precision]
-        self._activation = activation = ACTIVATIONS[network.activation]
+        self._activation = ACTIVATIONS[network.activation]
         self._actions = spec.action_space
         self._mask = spec.action_mask
+        self.custom: nn.Module | None = None
+        self.memory: Memory | None = None
+        if network.behavior is not None:
+            self.custom = make_custom(network, spec)
+        else:
+            self._assemble(spec, network, precision)
+        self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
+
+    def _assemble(
+        self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
+    ) -> None:
+        """Make the network of section 3.2."""
+        activation = self._activation
         first, *_ = widths = layer_widths(spec.observation_space, network)
         space, width = spec.observation_space, network.hidden[0]
         self.encoder = make_encoder(space, network, width, activation, precision)
-        self.memory = None
         if network.memory != "none":
             n_in = n_features(space, network.convolutions, width)
             self.memory = Memory(n_in, network.memory_size)
         self.command = fully_connected(ReturnInTime.size, first)
         self.layers = nn.ModuleList(fully_connected(i, o) for i, o in pairwise(widths))
         self.action = fully_connected(widths[-1], spec.action_space.n_parameters)
-        self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
     def forward(
         self, seen: tuple[Tensor, ...], command: Tensor, states: tuple[Tensor, ...] = ()
@@ -76,12 +90,17 @@ class BehaviorFunction(nn.Module):
         self, seen: tuple[Tensor, ...], command: Tensor, state: Tensor | None = None
     ) -> Tensor:
         """Return the same for commands that are relative already, where there is a value."""
+        if self.custom is not None:
+            return self._allowed(seen, self.custom(*seen, command))
         features = self.remember(seen, state)[0]
         features = features * torch.sigmoid(apply(self.command, command.to(features.dtype)))
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
             features = self._activation(apply(layer, features))
-        parameters = apply(self.action, features).float()
+        return self._allowed(seen, apply(self.action, features).float())
+
+    def _allowed(self, seen: tuple[Tensor, ...], parameters: Tensor) -> Tensor:
+        """Return parameters with those of forbidden actions far too low."""
         if self._mask is None:
             return parameters
         allowed = seen[self._mask][:, -self._actions.n_parameters :].float()
@@ -107,8 +126,16 @@ class BehaviorFunction(nn.Module):
         return negative_log_likelihood(self._actions, parameters, action)
 
 
+#: Index of the stream that seeds torch's own generator.
+_OWN = 2
+
+
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
     """Return the behavior function of weights version 0, a function of the run's seed."""
-    behavior = BehaviorFunction(spec, config)
+    stream = Stream(stream_key(config.seed, Purpose.INITIALISE, index=_OWN))
+    with torch.random.fork_rng(devices=[]):
+        # For a network of somebody's own, which draws its parameters itself.
+        torch.manual_seed(int(stream.integers(1, 0, 2**52)[0]))
+        behavior = BehaviorFunction(spec, config)
     draw_weights(behavior, config, 0, ("command", "action", "value.expected"))
     return behavior

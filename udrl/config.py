@@ -108,6 +108,11 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
                 f"segments = {segments!r} with memory = {self.network.memory!r}: windows of steps "
                 f"are trained on with what followed until the end; set segments = 'trailing'"
             )
+        if self.network.behavior is not None and self.network.memory != "none":
+            raise ConfigError(
+                f"memory = {self.network.memory!r} with behavior = {self.network.behavior!r}: a "
+                f"network of your own has no memory; set memory = 'none'"
+            )
         last_few, replay_size = self.commands.last_few, self.buffer.replay_size
         if last_few > replay_size:
             raise ConfigError(

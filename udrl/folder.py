@@ -5,6 +5,7 @@
     model.safetensors   the behavior function's weights
     config.json         :class:`Description`: what they are the weights of
     README.md           the model card
+    graph.onnx          with a behavior function of one's own: its graph, without weights
 """
 
 from pathlib import Path
@@ -21,6 +22,7 @@ from udrl.weights import decode_behavior, encode_weights
 FORMAT = 2
 
 _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
+_GRAPH = "graph.onnx"
 #: Weights of more than this nobody has trained with this project.
 _MOST_BYTES = 4 << 30
 
@@ -78,6 +80,8 @@ def save(folder: Path, policy: Policy, card: str) -> None:
         (folder / _WEIGHTS).write_bytes(encode_weights(policy.behavior.weights))
         (folder / _DESCRIPTION).write_bytes(described + b"\n")
         (folder / _CARD).write_text(card, encoding="utf-8")
+        if policy.config.network.behavior is not None:
+            (folder / _GRAPH).write_bytes(policy.behavior.graph)
     except OSError as error:
         raise ConfigError(
             f"{error.filename or folder}: {error.strerror}; name a folder you may write"
@@ -111,7 +115,10 @@ def load(folder: str | Path) -> Policy:
             f"{folder / _DESCRIPTION}: {error}; export the run again, with this version of udrl"
         ) from error
     config = description.config
-    graph = acting_graph(config.network, description.environment)
+    if config.network.behavior is None:
+        graph = acting_graph(config.network, description.environment)
+    else:
+        graph = _read(folder / _GRAPH)
     behavior = decode_behavior(graph, weights)
     return Policy(
         behavior,

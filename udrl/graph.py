@@ -13,6 +13,7 @@ memory, ``state`` is another input, float32 [batch, size], zeros at an episode's
 """
 
 from collections.abc import Mapping
+from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
@@ -38,7 +39,7 @@ from udrl.architecture import (
     state_sizes,
 )
 from udrl.environments.making import EnvironmentSpec
-from udrl.errors import InvalidWeights
+from udrl.errors import ConfigError, InvalidWeights
 from udrl.memory import FrameStack
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Bits, Categories, Category, Image, Record, leaves_of
@@ -83,6 +84,7 @@ class _Builder:
 
     def __init__(self, network: NetworkSettings, spec: EnvironmentSpec) -> None:
         self._network = network
+        self._spec = spec
         self._space = spec.observation_space
         self._leaves = [(f"observation{leaf.name}", leaf.space) for leaf in leaves_of(self._space)]
         self._shapes = FrameStack(self._space, network.frame_stack).shapes
@@ -137,21 +139,57 @@ class _Builder:
     def logits(self) -> str:
         """Append the network of section 3.2; see :class:`udrl.behavior.BehaviorFunction`."""
         network = self._network
+        if network.behavior is not None:
+            logits = self._custom()
+            return logits if self._mask is None else self._allowed(logits)
         activation = _OPERATORS[network.activation]
         first, *_ = widths = layer_widths(self._space, network)
         features = self._encode("encoder", activation, network.hidden[0])
         if network.memory != "none":
             n_in = n_features(self._space, network.convolutions, network.hidden[0])
             features = self._remember("memory", features, n_in, network.memory_size)
-        command = self._command()
-        if network.baseline != "none":
-            command = self._relative(command)
+        command = self._relative_command()
         gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
         features = self._append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self._append(activation, self._layer(f"layers.{k}", features, n_in, n_out))
         logits = self._layer("action", features, widths[-1], self._n_parameters)
         return logits if self._mask is None else self._allowed(logits)
+
+    def _custom(self) -> str:
+        """Append a network of somebody's own, as torch exports it; see :mod:`udrl.custom`."""
+        # By name, since it imports torch, which nobody needs for any other graph.
+        try:
+            exported = import_module("udrl.custom").exported
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"behavior {self._network.behavior!r} needs {error.name} where its run is created; "
+                f'install it with: pip install "udrl[train]"'
+            ) from error
+        model: onnx.ModelProto = exported(self._network, self._spec)
+        given = [*(name for name, _ in self._leaves), self._relative_command()]
+        names = dict(zip([one.name for one in model.graph.input], given, strict=True))
+        for tensor in model.graph.initializer:
+            if tensor.raw_data:
+                names[tensor.name] = self._constant(numpy_helper.to_array(tensor))
+            else:
+                names[tensor.name] = self._weight(f"custom.{tensor.name}", *tensor.dims)
+        for node in model.graph.node:
+            mine = onnx.NodeProto()
+            mine.CopyFrom(node)
+            mine.name = ""
+            mine.input[:] = [names[name] if name else "" for name in node.input]
+            for name in node.output:
+                names[name] = f"custom.{len(self._nodes)}.{name}"
+            mine.output[:] = [names[name] for name in node.output]
+            self._nodes.append(mine)
+        # As the last node, whose output is renamed.
+        return self._append("Identity", names[model.graph.output[0].name])
+
+    def _relative_command(self) -> str:
+        """Append what the behavior function reads of a command."""
+        command = self._command()
+        return command if self._network.baseline == "none" else self._relative(command)
 
     def _allowed(self, logits: str) -> str:
         """Append what the last mask of the stack says of the logits: 0, or far too little."""

@@ -70,12 +70,16 @@ class ActingFunction:
         graph: of the run (:func:`udrl.graph.acting_graph`).
         weights: of the version.
 
+    Attributes:
+        graph: the same.
+        weights: the same.
+
     Raises:
         InvalidWeights: the bytes are no graph, or the weights are not those of the graph.
     """
 
     def __init__(self, graph: bytes, weights: Weights) -> None:
-        self._graph = graph
+        self.graph = graph
         self.weights = weights
         self._session = _session(self.model)
         self._calls: dict[int, Call] = {}
@@ -83,12 +87,12 @@ class ActingFunction:
     @property
     def model(self) -> bytes:
         """The graph with the weights: an ONNX model of its own."""
-        return with_weights(self._graph, self.weights)
+        return with_weights(self.graph, self.weights)
 
     def call(self, n: int) -> Call:
         """Return a call of ``n`` rows. It is not for several threads at once."""
         if n not in self._calls:
-            together = n == 1 or is_exact_together(self._graph, n)
+            together = n == 1 or is_exact_together(self.graph, n)
             rows = _Together if together else _OneByOne
             self._calls[n] = rows(self._session, n)
         return self._calls[n]

@@ -44,6 +44,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     """The network, and how it reads a command (section 3.2, Appendix B.2).
 
     Attributes:
+        behavior: a class of your own instead of the paper's network, as ``package.module:Class``
+            (:mod:`udrl.custom`); None: the paper's.
         frame_stack: most recent observations that the network sees at once, one after another
             along the first dimension; before an episode's first there is the first again.
         memory: ``none``, or ``gru``: a gated recurrent unit between encoder and command, which
@@ -66,6 +68,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             same, of what actions bring on average (:mod:`udrl.value`).
     """
 
+    behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     frame_stack: Annotated[int, Meta(ge=1, le=64)] = 1
     memory: Literal["none", "gru"] = "none"
     memory_size: Annotated[int, Meta(ge=1, le=65_536)] = 64

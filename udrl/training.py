@@ -160,7 +160,7 @@ def _normalise(state: TrainingState, experience: RankedExperience) -> None:
         values = np.concatenate(arrays).astype(np.float64)
         mean, deviation = torch.from_numpy(values.mean(0)), torch.from_numpy(values.std(0))
         for network in networks:
-            if network is not None:
+            if network is not None and hasattr(network, "encoder"):
                 network.encoder.normalise(k, mean, deviation)
 
 

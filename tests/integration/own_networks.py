@@ -1,0 +1,64 @@
+"""Behavior functions that somebody else wrote, importable as ``own_networks:Concatenating``."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from udrl.environments.making import EnvironmentSpec
+from udrl.setting_groups import NetworkSettings
+
+
+class Concatenating(nn.Module):
+    """Observation and command side by side, with a layer normalisation and a constant."""
+
+    def __init__(self, spec: EnvironmentSpec, network: NetworkSettings) -> None:
+        super().__init__()
+        size, width = spec.observation_space.shape[0] * network.frame_stack, network.hidden[0]
+        self.first = nn.Linear(size + 2, width)
+        self.norm = nn.LayerNorm(width)
+        self.last = nn.Linear(width, spec.action_space.n_parameters)
+        self.register_buffer("unit", torch.tensor([0.5]), persistent=False)
+        self.unit: Tensor
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        features = self.first(torch.cat(inputs, dim=1) * self.unit)
+        logits: Tensor = self.last(torch.relu(self.norm(features)))
+        return logits
+
+
+class Idle(Concatenating):
+    """Has a layer that it does not use."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.idle = nn.Linear(2, 2)
+
+
+class Narrow(Concatenating):
+    """Returns too little."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return super().forward(*inputs)[:, :1]
+
+
+class Broken(Concatenating):
+    """Raises an exception."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        raise RuntimeError("not today")
+
+
+class Persistent(Concatenating):
+    """Has a buffer that looks like a parameter from outside."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.register_buffer("kept", torch.zeros(1))
+
+
+class NoModule:
+    """No module at all."""
+
+    def __init__(self, *given: Any) -> None:
+        pass

@@ -1,0 +1,105 @@
+"""A behavior function of somebody's own, where torch and its class are and where they are not."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from udrl.algorithm1 import algorithm1
+from udrl.behavior import initialise
+from udrl.config import Budget, Config, build
+from udrl.environments.making import make_environment, specify
+from udrl.errors import ConfigError
+from udrl.graph import acting_graph, weight_shapes
+from udrl.inference import ActingFunction
+from udrl.training import weights_of
+from udrl_inspect.agents import load_agent
+from udrl_inspect.exporting import export_folder
+from udrl_proto.reports import Status
+from whole_run import SMALL, digests, reference
+
+Runner = Callable[..., Status]
+
+
+def settings(name: str = "Concatenating", **values: Any) -> Config:
+    return build(
+        Config,
+        SMALL | {"behavior": f"own_networks:{name}", "lead": 0, "baseline": "value"} | values,
+    )
+
+
+@pytest.mark.parametrize("baseline", ["none", "value"])
+@pytest.mark.parametrize("frame_stack", [1, 2])
+def test_the_graph_is_the_module(baseline: str, frame_stack: int) -> None:
+    config = settings(baseline=baseline, frame_stack=frame_stack)
+    spec = specify(make_environment(config), config)
+    behavior, graph = initialise(config, spec), acting_graph(config.network, spec)
+    weights = weights_of(behavior)
+    assert weight_shapes(graph) == {n: t.shape for n, t in weights.items()}
+    function, rng = ActingFunction(graph, weights), np.random.default_rng(1)
+    seen = (rng.standard_normal((20, 4 * frame_stack), np.float32),)
+    command = np.tile([[50.0, 60.0]], (20, 1))
+    scaled = command * [config.network.return_scale, config.network.horizon_scale]
+    with torch.inference_mode():
+        shown = tuple(map(torch.from_numpy, seen))
+        expected = behavior(shown, torch.from_numpy(scaled).float()).numpy()
+    np.testing.assert_allclose(function.logits(seen, command), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_run_equals_the_reference_and_its_folder_needs_no_class(
+    run: Runner, tmp_path: Path
+) -> None:
+    config, run_dir = settings(), tmp_path / "run"
+    status = run(config, 3000, run_dir=run_dir)
+    assert digests(status) == digests(reference(config, 3000))
+    agent = load_agent(run_dir)
+    export_folder(agent, run_dir, tmp_path / "folder")
+    told = agent.policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist()
+    program = (
+        "import sys, udrl\n"
+        f"policy = udrl.load({str(tmp_path / 'folder')!r})\n"
+        "print(policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist())\n"
+        "assert 'torch' not in sys.modules and 'own_networks' not in sys.modules\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True
+    )
+    assert found.stdout.strip() == str(told)
+
+
+def test_its_first_weights_follow_from_the_seed() -> None:
+    def weights(seed: int) -> Any:
+        config = settings(seed=seed)
+        spec = specify(make_environment(config), config)
+        return weights_of(initialise(config, spec))["custom.first.weight"].tolist()
+
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    assert weights(1) == weights(1) != weights(2)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("NoSuchClass", "AttributeError.*importable here, as package.module:Class"),
+        ("NoModule", "is NoModule, expected a torch.nn.Module"),
+        ("Idle", "its parameters idle.bias, idle.weight have no effect"),
+        ("Persistent", r"kept would not be trained; .*persistent=False"),
+        ("Narrow", r"returns torch.float32 \(2, 1\) for a batch of 2, expected .* \(2, 2\)"),
+        ("Broken", "cannot be computed or exported: RuntimeError: not today"),
+    ],
+)
+def test_what_cannot_be_one_is_refused_when_the_run_begins(name: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        algorithm1(settings(name), Budget(max_env_steps=100))
+
+
+def test_it_has_no_memory() -> None:
+    with pytest.raises(ConfigError, match="a network of your own has no memory"):
+        settings(memory="gru")
