@@ -58,7 +58,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
         environment: a Gymnasium id, registered or importable (``package.module:Env-v0``).
         environment_kwargs: keyword arguments for ``gymnasium.make``.
         wrappers: what the environment is wrapped in, one after another, as
-            ``package.module:Wrapper``.
+            ``package.module:Wrapper``, or with arguments, ``package.module:Wrapper(size=8)``.
         observe_time: whether the time that is left is observed too.
         observe_previous: whether the previous action and reward are observed too.
         max_episode_steps: time limit of an episode in steps; None: the environment's own.

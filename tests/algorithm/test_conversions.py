@@ -218,6 +218,10 @@ def test_components_outside_are_faults() -> None:
             ),
             r"its observation\['b'\]\[0\] is Text.*besides.*\['b'\]\[1\] is Sequence",
         ),
+        (
+            spaces.Dict(say=spaces.Text(4), see=spaces.Discrete(2)),
+            r"observation\['say'\] is Text.*leave it out with gymnasium.wrappers.FilterObs",
+        ),
         (spaces.Box(-1, 1, (0, 3)), "supported are Box"),
         (spaces.Discrete(2**20 + 1), "1,048,577 states.*at most 1,048,576"),
         (spaces.Dict({}), "0 parts; supported are 1 to 256"),

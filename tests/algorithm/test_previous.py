@@ -1,5 +1,6 @@
 """The previous action and reward as a part of what is observed."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from udrl.episode import Episode
 from udrl.errors import ConfigError, UnsupportedEnvironment
 from udrl.offline import read_dataset
 from udrl.segments import Experience
-from udrl.spaces import Record
+from udrl.spaces import Record, Vector
 from udrl.training import train, untrained
 
 NESTED = "kinds_of_spaces:Nested-v0"
@@ -186,17 +187,32 @@ def test_wrappers_are_applied_in_order() -> None:
     assert all(e.length <= 5 for e in warm_up(limited))
 
 
+def test_wrappers_take_literals_as_arguments() -> None:
+    settings = config(
+        observe_previous=False,
+        wrappers=["gymnasium.wrappers:FrameStackObservation(stack_size=3, padding_type='zero')"],
+    )
+    space = specify(make_environment(settings), settings).observation_space
+    assert space == Vector(size=12)
+
+
 @pytest.mark.parametrize(
     ("wrapper", "says"),
     [
         ("FlattenObservation", "there is no colon"),
+        ("gymnasium.wrappers:FrameStackObservation(3)", "arguments need their names"),
+        ("gymnasium.wrappers:FrameStackObservation(stack_size=open('x'))", "ValueError"),
+        ("gymnasium.wrappers:a.b(c=1)", "no name of a class"),
+        ("gymnasium.wrappers:", "SyntaxError"),
         ("gymnasium.wrappers:NoSuchWrapper", "AttributeError"),
         ("no_such_package:Wrapper", "ModuleNotFoundError"),
         ("gymnasium.wrappers:TransformObservation", "TypeError"),
     ],
 )
 def test_wrappers_that_cannot_be_applied_are_refused(wrapper: str, says: str) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=f"{wrapper}.*{says}.*package.module:Wrapper"):
+    with pytest.raises(
+        UnsupportedEnvironment, match=f"{re.escape(wrapper)}.*{says}.*package.module:Wrapper"
+    ):
         make_environment(config(wrappers=[wrapper]))
 
 

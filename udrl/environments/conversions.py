@@ -337,16 +337,16 @@ def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
             return Boxed(name, space, Vector(size=int(np.prod(space.shape))))
     raise UnsupportedEnvironment(
         f"its {name} is {space}; supported are Box, Discrete, MultiDiscrete, MultiBinary, and Dict "
-        f"and Tuple of these; {_help(space)}"
+        f"and Tuple of these; {_help(name, space)}"
     )
 
 
-def _help(space: spaces.Space[Any]) -> str:
+def _help(name: str, space: spaces.Space[Any]) -> str:
     """Return what helps with an unsupported space."""
-    match space:
-        case spaces.Text() | spaces.Sequence() | spaces.Graph() | spaces.OneOf():
-            return (
-                "its elements differ in size; wrap it in gymnasium.wrappers.TransformObservation, "
-                "which makes arrays of one shape, or drop it with FilterObservation"
-            )
-    return "wrap it in gymnasium.wrappers.TransformObservation"
+    drop = ""
+    if name.endswith("']"):
+        drop = ", or leave it out with gymnasium.wrappers.FilterObservation"
+    differ = ""
+    if isinstance(space, spaces.Text | spaces.Sequence | spaces.Graph | spaces.OneOf):
+        differ = "its elements differ in size; "
+    return f"{differ}make arrays of it with gymnasium.wrappers.TransformObservation{drop}"

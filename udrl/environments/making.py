@@ -5,6 +5,7 @@ However an environment presents itself, the algorithm sees observations of the k
 what is supported.
 """
 
+import ast
 import errno
 import os
 import threading
@@ -110,18 +111,34 @@ def make_environment(config: Config) -> Adapter:
 
 
 def _wrapped(env: Environment, name: str) -> Environment:
-    module, colon, attribute = name.partition(":")
+    module, colon, call = name.partition(":")
     try:
         if not colon:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
-        wrapped: Environment = getattr(import_module(module), attribute)(env)
+        attribute, arguments = _called(call)
+        wrapped: Environment = getattr(import_module(module), attribute)(env, **arguments)
     except Exception as error:
         close(env)
         raise UnsupportedEnvironment(
             f"wrapper {name!r} cannot be applied: {type(error).__name__}: {error}; name a wrapper "
-            f"that is importable here, as package.module:Wrapper, and takes an environment alone"
+            f"that is importable here, as package.module:Wrapper or "
+            f"package.module:Wrapper(shape=(84, 84))"
         ) from error
     return wrapped
+
+
+def _called(call: str) -> tuple[str, dict[str, Any]]:
+    """Return name and keyword arguments, which are literals, of a call; nothing is evaluated."""
+    node = ast.parse(call.strip(), mode="eval").body
+    arguments: dict[str, Any] = {}
+    if isinstance(node, ast.Call):
+        if node.args:
+            raise ValueError("arguments need their names")
+        arguments = {str(k.arg): ast.literal_eval(k.value) for k in node.keywords}
+        node = node.func
+    if not isinstance(node, ast.Name):
+        raise TypeError("there is no name of a class behind the colon")
+    return node.id, arguments
 
 
 def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
