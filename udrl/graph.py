@@ -15,7 +15,6 @@ memory, ``state`` is another input, float32 [batch, size], zeros at an episode's
 from collections.abc import Mapping
 from importlib import import_module
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +40,7 @@ from udrl.architecture import (
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidWeights
 from udrl.memory import FrameStack
+from udrl.onnx_nodes import Nodes
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Bits, Categories, Category, Image, Record, leaves_of
 from udrl.targets import ReturnInTime
@@ -79,10 +79,11 @@ def critic_shapes(network: NetworkSettings, spec: EnvironmentSpec) -> dict[str, 
     return weight_shapes(graph.model())
 
 
-class _Builder:
-    """Appends nodes; each method returns the name of a result."""
+class _Builder(Nodes):
+    """Appends the networks of a run; each method returns the name of a result."""
 
     def __init__(self, network: NetworkSettings, spec: EnvironmentSpec) -> None:
+        super().__init__()
         self._network = network
         self._spec = spec
         self._space = spec.observation_space
@@ -92,8 +93,6 @@ class _Builder:
         self._n_parameters = spec.action_space.n_parameters
         self._target = ReturnInTime(network)
         self._states: list[str] = []  # the next ones
-        self._nodes: list[onnx.NodeProto] = []
-        self._tensors: list[onnx.TensorProto] = []
 
     def model(self) -> bytes:
         """Return the model, with what was appended last as its output."""
@@ -103,16 +102,16 @@ class _Builder:
             )
             for (name, leaf), shape in zip(self._leaves, self._shapes, strict=True)
         ]
-        self._nodes[-1].output[0] = "logits"
+        self.nodes[-1].output[0] = "logits"
         outputs, states = [("logits", self._n_parameters)], []
         if self._states:
             size = sum(state_sizes(self._network))
             states = [helper.make_tensor_value_info("state", TensorProto.FLOAT, ["batch", size])]
             # Behind the logits, which stay the last of their nodes.
-            self._nodes.append(helper.make_node("Concat", self._states, ["next_state"], axis=1))
+            self.nodes.append(helper.make_node("Concat", self._states, ["next_state"], axis=1))
             outputs.append(("next_state", size))
         graph = helper.make_graph(
-            self._nodes,
+            self.nodes,
             "behavior_function",
             [
                 *observed,
@@ -125,7 +124,7 @@ class _Builder:
                 helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
                 for name, size in outputs
             ],
-            self._tensors,
+            self.tensors,
         )
         model = helper.make_model(
             graph,
@@ -149,11 +148,11 @@ class _Builder:
             n_in = n_features(self._space, network.convolutions, network.hidden[0])
             features = self._remember("memory", features, n_in, network.memory_size)
         command = self._relative_command()
-        gate = self._append("Sigmoid", self._layer("command", command, self._target.size, first))
-        features = self._append("Mul", features, gate)
+        gate = self.append("Sigmoid", self.layer("command", command, self._target.size, first))
+        features = self.append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
-            features = self._append(activation, self._layer(f"layers.{k}", features, n_in, n_out))
-        logits = self._layer("action", features, widths[-1], self._n_parameters)
+            features = self.append(activation, self.layer(f"layers.{k}", features, n_in, n_out))
+        logits = self.layer("action", features, widths[-1], self._n_parameters)
         return logits if self._mask is None else self._allowed(logits)
 
     def _custom(self) -> str:
@@ -171,20 +170,20 @@ class _Builder:
         names = dict(zip([one.name for one in model.graph.input], given, strict=True))
         for tensor in model.graph.initializer:
             if tensor.raw_data:
-                names[tensor.name] = self._constant(numpy_helper.to_array(tensor))
+                names[tensor.name] = self.constant(numpy_helper.to_array(tensor))
             else:
-                names[tensor.name] = self._weight(f"custom.{tensor.name}", *tensor.dims)
+                names[tensor.name] = self.weight(f"custom.{tensor.name}", *tensor.dims)
         for node in model.graph.node:
             mine = onnx.NodeProto()
             mine.CopyFrom(node)
             mine.name = ""
             mine.input[:] = [names[name] if name else "" for name in node.input]
             for name in node.output:
-                names[name] = f"custom.{len(self._nodes)}.{name}"
+                names[name] = f"custom.{len(self.nodes)}.{name}"
             mine.output[:] = [names[name] for name in node.output]
-            self._nodes.append(mine)
+            self.nodes.append(mine)
         # As the last node, whose output is renamed.
-        return self._append("Identity", names[model.graph.output[0].name])
+        return self.append("Identity", names[model.graph.output[0].name])
 
     def _relative_command(self) -> str:
         """Append what the behavior function reads of a command."""
@@ -195,10 +194,10 @@ class _Builder:
         """Append what the last mask of the stack says of the logits: 0, or far too little."""
         n = self._n_parameters
         length = self._network.frame_stack
-        mask = self._columns(self._leaves[self._mask or 0][0], (length - 1) * n, length * n)
-        allowed = self._append("Cast", mask, to=TensorProto.FLOAT)
-        forbidden = self._append("Sub", allowed, self._number(1.0))
-        return self._append("Sub", logits, self._append("Mul", forbidden, self._number(FORBIDDEN)))
+        mask = self.columns(self._leaves[self._mask or 0][0], (length - 1) * n, length * n)
+        allowed = self.append("Cast", mask, to=TensorProto.FLOAT)
+        forbidden = self.append("Sub", allowed, self.number(1.0))
+        return self.append("Sub", logits, self.append("Mul", forbidden, self.number(FORBIDDEN)))
 
     def action_values(self) -> str:
         """Append the critic; see :class:`udrl.value.Critic`."""
@@ -208,29 +207,29 @@ class _Builder:
         """Append what is read of a command: bounded and scaled (:mod:`udrl.targets`)."""
         command, target = "command", self._target
         if target.horizon_follows:
-            desired_return = self._column(command, 0)
-            horizon = self._append("Floor", desired_return)
-            command = self._append("Concat", desired_return, horizon, axis=1)
-        bounded = self._append("Max", command, self._constant(np.array([target.least])))
-        scaled = self._append("Mul", bounded, self._constant(np.array([target.scales])))
-        return self._append("Cast", scaled, to=TensorProto.FLOAT)
+            desired_return = self.column(command, 0)
+            horizon = self.append("Floor", desired_return)
+            command = self.append("Concat", desired_return, horizon, axis=1)
+        bounded = self.append("Max", command, self.constant(np.array([target.least])))
+        scaled = self.append("Mul", bounded, self.constant(np.array([target.scales])))
+        return self.append("Cast", scaled, to=TensorProto.FLOAT)
 
     def _relative(self, command: str) -> str:
         """Append the desired return relative to V(s) and D(s); see :mod:`udrl.value`."""
         expected = self._expected("value", 2)
-        d = self._column(expected, 1)
-        root = self._append("Mul", d, d)
-        root = self._append("Sqrt", self._append("Add", root, self._number(SQUAREPLUS)))
-        deviation = self._append("Mul", self._append("Add", d, root), self._number(0.5))
-        deviation = self._append("Add", deviation, self._number(LEAST_DEVIATION))
-        above = self._append("Sub", self._column(command, 0), self._column(expected, 0))
-        bounded = self._append(
+        d = self.column(expected, 1)
+        root = self.append("Mul", d, d)
+        root = self.append("Sqrt", self.append("Add", root, self.number(SQUAREPLUS)))
+        deviation = self.append("Mul", self.append("Add", d, root), self.number(0.5))
+        deviation = self.append("Add", deviation, self.number(LEAST_DEVIATION))
+        above = self.append("Sub", self.column(command, 0), self.column(expected, 0))
+        bounded = self.append(
             "Clip",
-            self._append("Div", above, deviation),
-            self._number(-DEVIATIONS),
-            self._number(DEVIATIONS),
+            self.append("Div", above, deviation),
+            self.number(-DEVIATIONS),
+            self.number(DEVIATIONS),
         )
-        return self._append("Concat", bounded, self._column(command, 1), axis=1)
+        return self.append("Concat", bounded, self.column(command, 1), axis=1)
 
     def _expected(self, name: str, n: int) -> str:
         """Append a network that expects ``n`` numbers of an observation."""
@@ -239,26 +238,26 @@ class _Builder:
         if self._network.memory != "none":
             features = self._remember(f"{name}.memory", features, width, VALUE_WIDTH)
             width = VALUE_WIDTH
-        features = self._append("Tanh", self._layer(f"{name}.hidden", features, width, VALUE_WIDTH))
-        return self._layer(f"{name}.expected", features, VALUE_WIDTH, n)
+        features = self.append("Tanh", self.layer(f"{name}.hidden", features, width, VALUE_WIDTH))
+        return self.layer(f"{name}.expected", features, VALUE_WIDTH, n)
 
     def _remember(self, name: str, features: str, n_in: int, size: int) -> str:
         """Append a gated recurrent unit; see :class:`udrl.recurrence.Memory`."""
         first = sum(state_sizes(self._network)[: len(self._states)])
-        before = self._columns("state", first, first + size)
+        before = self.columns("state", first, first + size)
         gates = []
         for given, of, n in ((features, "ih", n_in), (before, "hh", size)):
-            weight = self._weight(f"{name}.cell.weight_{of}_l0", 3 * size, n)
-            bias = self._weight(f"{name}.cell.bias_{of}_l0", 3 * size)
-            all_ = self._append("Gemm", given, weight, bias, transB=1)
-            gates.append([self._columns(all_, k * size, (k + 1) * size) for k in range(3)])
+            weight = self.weight(f"{name}.cell.weight_{of}_l0", 3 * size, n)
+            bias = self.weight(f"{name}.cell.bias_{of}_l0", 3 * size)
+            all_ = self.append("Gemm", given, weight, bias, transB=1)
+            gates.append([self.columns(all_, k * size, (k + 1) * size) for k in range(3)])
         (r_in, z_in, n_in_), (r_then, z_then, n_then) = gates
-        r = self._append("Sigmoid", self._append("Add", r_in, r_then))
-        z = self._append("Sigmoid", self._append("Add", z_in, z_then))
-        new = self._append("Tanh", self._append("Add", n_in_, self._append("Mul", r, n_then)))
+        r = self.append("Sigmoid", self.append("Add", r_in, r_then))
+        z = self.append("Sigmoid", self.append("Add", z_in, z_then))
+        new = self.append("Tanh", self.append("Add", n_in_, self.append("Mul", r, n_then)))
         # (1 - z) new + z before
-        kept = self._append("Mul", z, self._append("Sub", before, new))
-        self._states.append(self._append("Add", new, kept))
+        kept = self.append("Mul", z, self.append("Sub", before, new))
+        self._states.append(self.append("Add", new, kept))
         return self._states[-1]
 
     def _encode(self, name: str, activation: str, width: int) -> str:
@@ -271,8 +270,8 @@ class _Builder:
             for k in range(len(self._leaves))
         ]
         together = sum(n_features(leaf, channels, width) for _, leaf in self._leaves)
-        joined = self._append("Concat", *features, axis=1)
-        return self._append(activation, self._layer(f"{name}.joined", joined, together, width))
+        joined = self.append("Concat", *features, axis=1)
+        return self.append(activation, self.layer(f"{name}.joined", joined, together, width))
 
     def _encode_leaf(self, number: int, name: str, activation: str, width: int) -> str:
         (observation, leaf), (first, *_) = self._leaves[number], self._shapes[number]
@@ -284,72 +283,40 @@ class _Builder:
             case Categories(ns=ns):
                 features = self._embedding(observation, name, ns, width)
             case Bits():
-                numbers = self._append("Cast", observation, to=TensorProto.FLOAT)
-                features = self._layer(f"{name}.layer", numbers, first, width)
+                numbers = self.append("Cast", observation, to=TensorProto.FLOAT)
+                features = self.layer(f"{name}.layer", numbers, first, width)
             case _:
                 if self._network.normalise_observations:
                     observation = self._normalised(observation, f"{name}.{NORMALISER}", first)
-                features = self._layer(f"{name}.layer", observation, first, width)
-        return self._append(activation, features)
+                features = self.layer(f"{name}.layer", observation, first, width)
+        return self.append(activation, features)
 
     def _normalised(self, observation: str, name: str, size: int) -> str:
-        above = self._append("Sub", observation, self._weight(f"{name}.mean", size))
-        scaled = self._append("Mul", above, self._weight(f"{name}.scale", size))
-        return self._append("Clip", scaled, self._number(-NORMAL_BOUND), self._number(NORMAL_BOUND))
+        above = self.append("Sub", observation, self.weight(f"{name}.mean", size))
+        scaled = self.append("Mul", above, self.weight(f"{name}.scale", size))
+        return self.append("Clip", scaled, self.number(-NORMAL_BOUND), self.number(NORMAL_BOUND))
 
     def _embedding(self, observation: str, name: str, ns: tuple[int, ...], width: int) -> str:
         sizes = np.array(ns * self._network.frame_stack, np.int32)
-        table = self._weight(f"{name}.embedding.weight", int(sizes.sum()), width)
-        first = self._constant(np.cumsum(sizes, dtype=np.int32) - sizes)
-        vectors = self._append("Gather", table, self._append("Add", observation, first))
-        features = self._append("ReduceSum", vectors, self._constant(np.array([1])), keepdims=0)
-        return self._append("Add", features, self._weight(f"{name}.bias", width))
+        table = self.weight(f"{name}.embedding.weight", int(sizes.sum()), width)
+        first = self.constant(np.cumsum(sizes, dtype=np.int32) - sizes)
+        vectors = self.append("Gather", table, self.append("Add", observation, first))
+        features = self.append("ReduceSum", vectors, self.constant(np.array([1])), keepdims=0)
+        return self.append("Add", features, self.weight(f"{name}.bias", width))
 
     def _convolutions(self, observation: str, n_channels: int, name: str, activation: str) -> str:
-        features = self._append("Cast", observation, to=TensorProto.FLOAT)
-        features = self._append("Mul", features, self._number(1 / 255))
+        features = self.append("Cast", observation, to=TensorProto.FLOAT)
+        features = self.append("Mul", features, self.number(1 / 255))
         channels = pairwise((n_channels, *self._network.convolutions))
         for k, (n_in, n_out) in enumerate(channels):
-            weight = self._weight(f"{name}.{k}.weight", n_out, n_in, FILTER, FILTER)
-            bias = self._weight(f"{name}.{k}.bias", n_out)
-            features = self._append(
+            weight = self.weight(f"{name}.{k}.weight", n_out, n_in, FILTER, FILTER)
+            bias = self.weight(f"{name}.{k}.bias", n_out)
+            features = self.append(
                 "Conv", features, weight, bias,
                 kernel_shape=[FILTER] * 2, strides=[STRIDE] * 2, pads=[PADDING] * 4,
             )  # fmt: skip
-            features = self._append(activation, features)
-        return self._append("Flatten", features)
-
-    def _layer(self, name: str, features: str, n_in: int, n_out: int) -> str:
-        """Append a fully connected layer, its weight stored as torch does."""
-        weight = self._weight(f"{name}.weight", n_out, n_in)
-        bias = self._weight(f"{name}.bias", n_out)
-        return self._append("Gemm", features, weight, bias, transB=1)
-
-    def _column(self, matrix: str, index: int) -> str:
-        """Append the selection of one column, [batch, 1]."""
-        return self._columns(matrix, index, index + 1)
-
-    def _columns(self, matrix: str, first: int, last: int) -> str:
-        """Append the selection of columns, [batch, last - first]."""
-        where = (self._constant(np.array([n])) for n in (first, last, 1))
-        return self._append("Slice", matrix, *where)
-
-    def _weight(self, name: str, *shape: int) -> str:
-        self._tensors.append(onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT))
-        return name
-
-    def _number(self, value: float) -> str:
-        return self._constant(np.array(value, np.float32))
-
-    def _constant(self, value: npt.NDArray[np.generic]) -> str:
-        name = f"constant.{len(self._tensors)}"
-        self._tensors.append(numpy_helper.from_array(value, name))
-        return name
-
-    def _append(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        output = f"{operator.lower()}.{len(self._nodes)}"
-        self._nodes.append(helper.make_node(operator, inputs, [output], **attributes))
-        return output
+            features = self.append(activation, features)
+        return self.append("Flatten", features)
 
 
 def _parse(graph: bytes) -> onnx.ModelProto:

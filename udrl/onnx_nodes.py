@@ -1,0 +1,57 @@
+"""Nodes and tensors of an ONNX graph, one after another."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+
+class Nodes:
+    """Appends nodes; each method returns the name of a result.
+
+    Attributes:
+        nodes: so far.
+        tensors: constants, and weights, which have no values yet.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.tensors: list[onnx.TensorProto] = []
+
+    def layer(self, name: str, features: str, n_in: int, n_out: int) -> str:
+        """Append a fully connected layer, its weight stored as torch does."""
+        weight = self.weight(f"{name}.weight", n_out, n_in)
+        bias = self.weight(f"{name}.bias", n_out)
+        return self.append("Gemm", features, weight, bias, transB=1)
+
+    def column(self, matrix: str, index: int) -> str:
+        """Append the selection of one column, [batch, 1]."""
+        return self.columns(matrix, index, index + 1)
+
+    def columns(self, matrix: str, first: int, last: int) -> str:
+        """Append the selection of columns, [batch, last - first]."""
+        where = (self.constant(np.array([n])) for n in (first, last, 1))
+        return self.append("Slice", matrix, *where)
+
+    def weight(self, name: str, *shape: int) -> str:
+        """Append a weight of a shape, without values."""
+        self.tensors.append(onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT))
+        return name
+
+    def number(self, value: float) -> str:
+        """Append a constant, float32."""
+        return self.constant(np.array(value, np.float32))
+
+    def constant(self, value: npt.NDArray[np.generic]) -> str:
+        """Append a constant."""
+        name = f"constant.{len(self.tensors)}"
+        self.tensors.append(numpy_helper.from_array(value, name))
+        return name
+
+    def append(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """Append a node."""
+        output = f"{operator.lower()}.{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, inputs, [output], **attributes))
+        return output
