@@ -33,11 +33,10 @@ from torch import Tensor, nn
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError
 from udrl.memory import FrameStack
+from udrl.onnx_nodes import OPSET
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import leaves_of
 from udrl.targets import ReturnInTime
-
-_OPSET = 13
 
 
 def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
@@ -126,7 +125,7 @@ def _export(module: nn.Module, inputs: list[Tensor]) -> onnx.ModelProto:
             tuple(inputs),
             file,  # type: ignore[arg-type]  # the legacy exporter takes files
             dynamo=False,
-            opset_version=_OPSET,
+            opset_version=OPSET,
             do_constant_folding=False,
             input_names=names,
             output_names=["logits"],

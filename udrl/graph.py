@@ -40,7 +40,7 @@ from udrl.architecture import (
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidWeights
 from udrl.memory import FrameStack
-from udrl.onnx_nodes import Nodes
+from udrl.onnx_nodes import OPSET, Nodes
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Bits, Categories, Category, Image, Record, leaves_of
 from udrl.targets import ReturnInTime
@@ -49,7 +49,7 @@ from udrl.targets import ReturnInTime
 Weights = Mapping[str, npt.NDArray[np.float32]]
 
 # As old as the operators below allow, so that old runtimes can read an exported agent.
-_OPSET, _IR_VERSION = 13, 7
+_IR_VERSION = 7
 
 _OPERATORS = {"relu": "Relu", "tanh": "Tanh"}
 
@@ -130,7 +130,7 @@ class _Builder(Nodes):
             graph,
             producer_name="udrl",
             ir_version=_IR_VERSION,
-            opset_imports=[helper.make_opsetid("", _OPSET)],
+            opset_imports=[helper.make_opsetid("", OPSET)],
         )
         serialised: bytes = model.SerializeToString(deterministic=True)
         return serialised

@@ -7,6 +7,9 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+#: As old as the operators allow, so that old runtimes can read an exported agent.
+OPSET = 13
+
 
 class Nodes:
     """Appends nodes; each method returns the name of a result.

@@ -111,8 +111,8 @@ class IndexVectors(Space, frozen=True):
         return None
 
 
-class Vector(Space, frozen=True, tag="vector"):
-    """Numbers, float32 [size]."""
+class Sized(Space, frozen=True):
+    """One dimension of ``size`` numbers."""
 
     size: Size
 
@@ -120,6 +120,10 @@ class Vector(Space, frozen=True, tag="vector"):
     def shape(self) -> tuple[int, ...]:
         """[size]."""
         return (self.size,)
+
+
+class Vector(Sized, frozen=True, tag="vector"):
+    """Numbers, float32 [size]."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -135,15 +139,8 @@ class Vector(Space, frozen=True, tag="vector"):
         return None if np.isfinite(values).all() else "not all finite numbers"
 
 
-class Bits(Space, frozen=True, tag="bits"):
+class Bits(Sized, frozen=True, tag="bits"):
     """Zeros and ones, uint8 [size]."""
-
-    size: Size
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """[size]."""
-        return (self.size,)
 
     @property
     def dtype(self) -> np.dtype[Any]:
