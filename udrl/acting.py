@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from udrl.actions import Actions
+from udrl.actions import Actions, random_actions
 from udrl.architecture import state_sizes
 from udrl.commands import Command
 from udrl.config import Config
@@ -197,15 +197,10 @@ class EpisodeGenerator:
         if self._greedy:
             actions[self._greedy] = space.mode(self._parameters[self._greedy])
         if self._n_random:
-            actions[random] = self._random(numbers[random], random)
+            k = self.spec.action_mask
+            mask = None if k is None else parts_of(self._rows.observation)[k][random]
+            actions[random] = random_actions(space, mask, numbers[random])
         return actions
-
-    def _random(self, numbers: npt.NDArray[np.float64], rows: npt.NDArray[np.bool_]) -> Actions:
-        """Return random actions of some rows, of those that are allowed."""
-        space, mask = self.spec.action_space, self.spec.action_mask
-        if mask is None:
-            return space.uniform(numbers)
-        return space.uniform_among(parts_of(self._rows.observation)[mask][rows], numbers)
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
         episode = self._recording.end(row, terminated=terminated, truncated=truncated)

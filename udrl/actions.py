@@ -69,10 +69,6 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         """Return actions that are all as likely, int64 [rows], for float64 [rows] in [0, 1)."""
         return (uniforms * self.n).astype(np.int64)
 
-    def uniform_among(self, mask: npt.NDArray[Any], uniforms: Numbers) -> Actions:
-        """Return actions that are all as likely, of those that masks, [rows, n], allow."""
-        return self.sample(_logits_of(mask), np.ones((len(mask), 1)), uniforms)
-
     def allowed(self, mask: npt.NDArray[Any], actions: Actions) -> npt.NDArray[np.bool_]:
         """Return whether masks, [rows, n], allow actions, [rows]; bool of the actions' shape."""
         ones: npt.NDArray[np.bool_] = mask[np.arange(len(mask)), actions] > 0
@@ -161,10 +157,6 @@ class Product(IndexVectors, frozen=True, tag="product"):
         actions: Actions = (uniforms * np.array(self.ns)).astype(np.int64)
         return actions
 
-    def uniform_among(self, mask: npt.NDArray[Any], uniforms: Numbers) -> Actions:
-        """Return actions that are all as likely, of those that masks allow."""
-        return self.sample(_logits_of(mask), np.ones((len(mask), 1)), uniforms)
-
     def allowed(self, mask: npt.NDArray[Any], actions: Actions) -> npt.NDArray[np.bool_]:
         """Return whether masks, [rows, n_parameters], allow actions, [rows, components]; bool."""
         places = actions.astype(np.int64) + np.array(self.ends) - np.array(self.ns)
@@ -218,11 +210,6 @@ class Product(IndexVectors, frozen=True, tag="product"):
         return padded
 
 
-def _logits_of(mask: npt.NDArray[Any]) -> Numbers:
-    """Return logits that are 0 for what is allowed, and far too little for all else."""
-    return (1.0 - mask) * FORBIDDEN
-
-
 @lru_cache
 def _places(ns: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
     """Return where a component's logits stand, [components, most], and which do not exist."""
@@ -234,3 +221,17 @@ def _places(ns: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.
 
 #: The kinds there are.
 ActionSpace = Categorical | Product
+
+
+def random_actions(space: ActionSpace, mask: npt.NDArray[Any] | None, uniforms: Numbers) -> Actions:
+    """Return actions that are all as likely, of those that are allowed, int64 [rows, *shape].
+
+    Args:
+        space: of the actions.
+        mask: 1 for what is allowed, 0 for all else, [rows, n_parameters]; None: everything is.
+        uniforms: float64 [rows, *shape] in [0, 1).
+    """
+    if mask is None:
+        return space.uniform(uniforms)
+    logits: Numbers = (1.0 - mask) * FORBIDDEN
+    return space.sample(logits, np.ones((len(mask), 1)), uniforms)

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from udrl.actions import random_actions
 from udrl.commands import Command
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
@@ -107,7 +108,9 @@ class Rollout:
         space, (number, is_random) = self._policy.spec.action_space, self._decision()
         logits, self._state = self._advance()
         if is_random:
-            action: Any = self._random(number[None])[0]
+            k = self._policy.spec.action_mask
+            mask = None if k is None else parts_of(self._recent[-1][None])[k]
+            action: Any = random_actions(space, mask, number[None])[0]
         else:
             action = space.choose(logits, self.temperature, number)
         self.action = action = np.asarray(action).tolist()
@@ -142,14 +145,6 @@ class Rollout:
                 f"support that"
             )
         return picture
-
-    def _random(self, number: Any) -> Any:
-        """Return random actions, of those that are allowed."""
-        spec = self._policy.spec
-        if spec.action_mask is None:
-            return spec.action_space.uniform(number)
-        mask = parts_of(self._recent[-1][None])[spec.action_mask]
-        return spec.action_space.uniform_among(mask, number)
 
     def _decision(self) -> tuple[Any, bool]:
         """Return the number, or numbers, that decide this step's action, and if it is random."""

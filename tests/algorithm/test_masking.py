@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.actions import Categorical, Product
+from udrl.actions import Categorical, Product, random_actions
 from udrl.algorithm1 import algorithm1
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
@@ -97,10 +97,10 @@ def test_whole_runs_keep_to_what_is_allowed(
 
 def test_a_random_action_is_any_of_those_allowed() -> None:
     space, mask = Categorical(n=4), np.array([[0, 1, 0, 1]], np.uint8).repeat(1000, axis=0)
-    found = space.uniform_among(mask, np.linspace(0, 1, 1000, endpoint=False))
+    found = random_actions(space, mask, np.linspace(0, 1, 1000, endpoint=False))
     assert found.tolist() == [1] * 500 + [3] * 500
     pairs, both = Product(ns=(2, 3)), np.array([[1, 0, 0, 1, 1]], np.uint8).repeat(8, axis=0)
-    drawn = pairs.uniform_among(both, np.random.default_rng(1).random((8, 2)))
+    drawn = random_actions(pairs, both, np.random.default_rng(1).random((8, 2)))
     assert drawn[:, 0].tolist() == [0] * 8
     assert set(drawn[:, 1].tolist()) == {1, 2}
     assert pairs.allowed(both, drawn).all()
