@@ -68,7 +68,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
     Raises:
         ConfigError: it cannot be exported, or returns something else than logits.
     """
-    module = make_custom(network, spec).eval()
+    module = make_custom(network, spec).train(mode=False)
     shapes = FrameStack(spec.observation_space, network.frame_stack).shapes
     dtypes = [leaf.space.dtype.name for leaf in leaves_of(spec.observation_space)]
     inputs = [

@@ -100,12 +100,13 @@ def test_a_generator_is_as_good_as_new_after_the_probes() -> None:
 def test_the_acting_class_sees_a_change_of_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings()
     expected = class_of(config)
-    logits = ActingFunction.logits
+    advance = ActingFunction.advance
 
     def rounds_otherwise(self: ActingFunction, *rows: Any) -> Any:
-        return np.nextafter(logits(self, *rows), np.float32(np.inf))
+        logits, state = advance(self, *rows)
+        return np.nextafter(logits, np.float32(np.inf)), state
 
-    monkeypatch.setattr(ActingFunction, "logits", rounds_otherwise)
+    monkeypatch.setattr(ActingFunction, "advance", rounds_otherwise)
     assert class_of(config) != expected
 
 
@@ -117,8 +118,8 @@ def test_the_training_class_sees_a_change_of_the_last_bit(
     assert training_class(config, LANDER) == expected
     obey = BehaviorFunction.obey
 
-    def rounds_otherwise(self: BehaviorFunction, s: tuple[Tensor, ...], c: Tensor) -> Tensor:
-        return obey(self, s, c) * (1 + 2**-23)
+    def rounds_otherwise(self: BehaviorFunction, *inputs: Any) -> Tensor:
+        return obey(self, *inputs) * (1 + 2**-23)
 
     monkeypatch.setattr(BehaviorFunction, "obey", rounds_otherwise)
     assert training_class(config, LANDER) != expected

@@ -8,12 +8,27 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 import udrl_proto.reports  # noqa: F401 - its messages are found too
-from udrl.config import Config, FlatSettings, build, flat
+from udrl.config import Config, FlatSettings, Keywords, build, flat
 from udrl.setting_groups import SettingsGroup
 from udrl.spaces import Leaf
 from udrl_proto.messages import Message
 
 MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
+
+#: Of an environment: numbers and texts in lists and tables. Drawn from its type, it would take
+#: minutes: a type of several levels names each level several times.
+_PLAIN = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.text(max_size=20)
+_PLAIN |= st.floats(allow_nan=False, allow_infinity=False)
+_INNER = (
+    _PLAIN
+    | st.lists(_PLAIN, max_size=3)
+    | st.dictionaries(st.text(max_size=20), _PLAIN, max_size=3)
+)
+KEYWORD_VALUES = (
+    _PLAIN
+    | st.lists(_INNER, max_size=3)
+    | st.dictionaries(st.text(max_size=20), _INNER, max_size=3)
+)
 
 
 def messages(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
@@ -61,6 +76,8 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
             return leaves.map(tuple)
         case inspect.VarTupleType(item_type=item, min_length=least, max_length=most):
             return st.lists(_any(item), min_size=least or 0, max_size=min(most or 4, 4)).map(tuple)
+        case inspect.DictType() if node == inspect.type_info(Keywords):
+            return st.dictionaries(_any(node.key_type), KEYWORD_VALUES, max_size=3)
         case inspect.DictType(key_type=key, value_type=value):
             return st.dictionaries(_any(key), _any(value), max_size=3)
         case inspect.StrType(pattern=str(pattern)) if "f4" in pattern:
@@ -95,5 +112,7 @@ def _possible(values: dict[str, Any]) -> dict[str, Any]:
     last_few = min(values.get("last_few", 75), 1_000_000)
     values |= {"last_few": last_few, "replay_size": max(values.get("replay_size", 500), last_few)}
     if values.get("segments") == "all":
-        values["baseline"] = "none"
+        values |= {"baseline": "none", "memory": "none"}
+    if values.get("behavior") is not None:
+        values["memory"] = "none"
     return values
