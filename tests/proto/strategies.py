@@ -17,18 +17,20 @@ MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
 
 #: Of an environment: numbers and texts in lists and tables. Drawn from its type, it would take
 #: minutes: a type of several levels names each level several times.
-_PLAIN = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.text(max_size=20)
-_PLAIN |= st.floats(allow_nan=False, allow_infinity=False)
-_INNER = (
-    _PLAIN
-    | st.lists(_PLAIN, max_size=3)
-    | st.dictionaries(st.text(max_size=20), _PLAIN, max_size=3)
+_PLAIN: st.SearchStrategy[Any] = st.one_of(
+    st.booleans(),
+    st.integers(-(2**63), 2**63 - 1),
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.text(max_size=20),
 )
-KEYWORD_VALUES = (
-    _PLAIN
-    | st.lists(_INNER, max_size=3)
-    | st.dictionaries(st.text(max_size=20), _INNER, max_size=3)
-)
+
+
+def _one_or_several(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    tables = st.dictionaries(st.text(max_size=20), inner, max_size=3)
+    return _PLAIN | st.lists(inner, max_size=3) | tables
+
+
+KEYWORD_VALUES = _one_or_several(_one_or_several(_PLAIN))
 
 
 def messages(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
