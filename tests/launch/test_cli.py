@@ -34,3 +34,23 @@ cli.main()
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
     assert (ended.returncode, ended.stdout, ended.stderr) == (3, b"worked\n", b"")
+
+
+def test_numpy_computes_in_one_thread() -> None:
+    """Its threads spin while they wait: two actors on two cores made a fifth of the steps."""
+    program = """
+import os, sys, click
+from udrl_launch import cli
+
+@click.command()
+def count():
+    import numpy as np
+    np.ones((500, 500)) @ np.ones((500, 500))
+    print(len(os.listdir("/proc/self/task")))
+
+cli.cli.add_command(count)
+sys.argv = ["udrl", "count"]
+cli.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"1\n", b"")

@@ -40,6 +40,9 @@ _GROUP = "udrl.commands"
 
 def main() -> NoReturn:
     """Run the command line; errors of ours are one line, without a traceback."""
+    # Before NumPy is imported: its threads wait for each other by spinning, on cores that other
+    # processes of the run need.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     find_modules_of_the_user()
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
