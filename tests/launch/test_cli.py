@@ -1,5 +1,6 @@
 """The command line as a whole."""
 
+import os
 import subprocess
 import sys
 
@@ -52,5 +53,8 @@ cli.cli.add_command(count)
 sys.argv = ["udrl", "count"]
 cli.main()
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    unset = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
+    ended = subprocess.run(
+        [sys.executable, "-c", program], env=unset, capture_output=True, timeout=30
+    )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"1\n", b"")
