@@ -29,13 +29,13 @@ _HEAD = """\
 {index}
 
 - `ENV` is a Gymnasium id, registered (`LunarLander-v3`) or importable (`package.module:Env-v0`).
-- `RUN_DIR` is the [directory of a run](operations.md#the-run-directory).
+- `RUN_DIR` is the [directory of a run](operations-reference.md#the-run-directory).
 - An endpoint is `tcp/HOST:PORT`, e.g. `tcp/127.0.0.1:7447`; with [`--keys`](operations.md#keys)
   it is `tls/HOST:PORT`.
 
 Every command has `--help`, and `udrl --version` prints the version. Results go to standard output;
 progress, logs and errors go to standard error. An error is one line that names the value, what was
-expected and the remedy. The [exit code](operations.md#exit-codes) says of which kind it is.
+expected and the remedy. The [exit code](operations-reference.md#exit-codes) says of which kind it is.
 
 Settings that have no option of their own are set with `--set NAME=VALUE`, or in a file named by
 `--config`: see [configuration](configuration.md).

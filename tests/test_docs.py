@@ -182,13 +182,13 @@ ERRORS: list[type[UdrlError]] = [
 
 
 def test_every_error_is_documented_with_its_exit_code() -> None:
-    rows = records(section("docs/operations.md", "## Exit codes"), "code")
+    rows = records(section("docs/operations-reference.md", "## Exit codes"), "code")
     found = {name: int(row[0]) for row in rows for name in codes(row[1])}
     assert found == {error.__name__: error.exit_code for error in ERRORS}
 
 
 def test_exit_codes_say_which_children_are_started_again() -> None:
-    rows = records(section("docs/operations.md", "## Exit codes"), "code")
+    rows = records(section("docs/operations-reference.md", "## Exit codes"), "code")
     assert {int(row[0]) for row in rows if row[4] == "no"} == FINAL_CODES
     assert {int(row[0]) for row in rows if row[4] == "yes"} == {
         error.exit_code for error in ERRORS if error.exit_code < 128
@@ -204,7 +204,9 @@ def test_every_table_and_column_of_the_store_is_documented(tmp_path: Path) -> No
             for (name,) in tables_there
         }
     db.close()
-    parts = re.split(r"^\*\*(\w+)\*\*:", section("docs/operations.md", "### The store"), flags=re.M)
+    parts = re.split(
+        r"^\*\*(\w+)\*\*:", section("docs/operations-reference.md", "## The store"), flags=re.M
+    )
     found = {
         name: names(text, "column") for name, text in zip(parts[1::2], parts[2::2], strict=True)
     }
@@ -214,7 +216,7 @@ def test_every_table_and_column_of_the_store_is_documented(tmp_path: Path) -> No
 def test_every_counter_of_the_store_is_in_the_status_or_in_operations() -> None:
     shown = {path.rpartition(".")[2] for path in fields(inspect.type_info(Status))}
     shown |= {"latest_version"}  # the status' weights_version
-    text = section("docs/operations.md", "### The store")
+    text = section("docs/operations-reference.md", "## The store")
     assert set(Progress.__struct_fields__) - shown <= set(codes(text))
 
 
@@ -232,7 +234,7 @@ def log_formats() -> Iterator[tuple[Path, str]]:
 
 
 def test_every_log_line_of_weight_is_documented() -> None:
-    documented = names(section("docs/operations.md", "## Log lines"), "line")
+    documented = names(section("docs/operations-reference.md", "## Log lines"), "line")
     for path, line in log_formats():
         shown = re.sub(r"%(\.\d+)?[srdf]", "…", line)
         assert shown == "…" or shown in documented, f"{path}: {shown}"
@@ -241,7 +243,7 @@ def test_every_log_line_of_weight_is_documented() -> None:
 def test_no_log_line_is_documented_that_is_not_there() -> None:
     text = " ".join(text_of(path) for path in SOURCES)
     literal = re.sub(r'"\s*\n?\s*f?"', "", text)
-    for line in names(section("docs/operations.md", "## Log lines"), "line"):
+    for line in names(section("docs/operations-reference.md", "## Log lines"), "line"):
         pattern = r"[^\n]{1,80}?".join(re.escape(part) for part in line.split("…"))
         assert re.search(pattern, literal), line
 

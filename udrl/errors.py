@@ -21,7 +21,7 @@
     └── Interrupted              a wait that ended because the process was told to stop
 
 A message names the value, what was expected, and the remedy. ``exit_code`` is what a command ends
-with (``docs/operations.md``).
+with (``docs/operations-reference.md``).
 """
 
 

@@ -362,7 +362,7 @@ def test_role_is_here_under_its_own_name_only(
 
 def test_table_of_rights_is_documented() -> None:
     found = {}
-    for line in section("docs/protocol.md", "## Who may do what").splitlines():
+    for line in section("docs/protocol.md", "## Permissions").splitlines():
         if line.startswith("| `"):
             cells = [re.findall(r"`([^`]+)`", cell) for cell in line.strip("|").split("|")]
             (role,), asks, hears, says, tokens = cells

@@ -14,7 +14,7 @@ from udrl_launch.paths import STARTED_IN, environment_of_children
 
 log = logging.getLogger("udrl")
 
-#: Exit codes that starting again would only repeat (``docs/operations.md``).
+#: Exit codes that starting again would only repeat (``docs/operations-reference.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
 #: A child that ended so often, and whose work did not get on meanwhile, is given up.

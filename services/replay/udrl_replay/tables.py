@@ -2,7 +2,7 @@
 
 SQLite notices a file that is torn or out of order, not a number that has become another one. So
 each row has a seal: a digest of its columns, those aside that have a checksum of their own. All
-columns are documented in ``docs/operations.md``.
+columns are documented in ``docs/operations-reference.md``.
 """
 
 import hashlib
