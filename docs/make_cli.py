@@ -35,7 +35,7 @@ _HEAD = """\
 
 Every command has `--help`, and `udrl --version` prints the version. Results go to standard output;
 progress, logs and errors go to standard error. An error is one line that names the value, what was
-expected and the remedy. The [exit code](operations-reference.md#exit-codes) says of which kind it is.
+expected and the remedy. The [exit code](operations-reference.md#exit-codes) says which kind.
 
 Settings that have no option of their own are set with `--set NAME=VALUE`, or in a file named by
 `--config`: see [configuration](configuration.md).

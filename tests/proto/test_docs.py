@@ -17,6 +17,7 @@ from udrl.config import Config, FlatSettings, Keywords
 from udrl.environments import EnvironmentSpec
 from udrl.spaces import Bits, Categories, Category, Image, Leaf, Record, Vector
 from udrl_proto import PROTOCOL, keys, verbs
+from udrl_proto.codec import LARGEST, SMALL
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
@@ -124,9 +125,37 @@ def test_every_message_is_described_field_by_field(kind: type[Any]) -> None:
     assert all(row[3] for row in rows)
 
 
-def test_every_verb_is_described() -> None:
-    described_verbs = [row[0].strip("`") for row in table_in(PAGE, "### Verbs")]
-    assert described_verbs == list(verbs.BY_NAME)
+def size(n: int) -> str:
+    """Return a size in bytes as the tables have it."""
+    for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
+        if n > verbs.FEW and n % unit == 0:
+            return f"{n // unit} {name}"
+    return str(n)
+
+
+def test_every_verb_is_described_with_its_askers_messages_and_limits() -> None:
+    rows = {row[0].strip("`"): row[1:] for row in table_in(PAGE, "### Verbs")}
+    assert list(rows) == list(verbs.BY_NAME)
+    for name, verb in verbs.BY_NAME.items():
+        askers, request, reply, limit = rows[name]
+        assert askers.split(", ") == list(verb.askers)
+        assert request == f"[{verb.request.__name__}](#{verb.request.__name__.lower()})"
+        assert reply == f"[{verb.reply.__name__}](#{verb.reply.__name__.lower()})"
+        if verb is verbs.EPISODE:  # it is the run's
+            assert limit.startswith("max_episode_steps x ")
+            assert limit.endswith(f" + {verbs.FEW}")
+        else:
+            assert limit == size(verb.limit)
+
+
+def test_limits_of_replies_are_described() -> None:
+    large = [v.reply.__name__ for v in verbs.VERBS if v.reply_limit > SMALL]
+    assert {v.reply_limit for v in verbs.VERBS} == {SMALL, LARGEST}
+    most, exceptions, limit = re.findall(
+        r"Replies have at most (.+?), except (.+?): (.+?)\.", PAGE
+    )[0]
+    assert (most, limit) == (size(SMALL), size(LARGEST))
+    assert re.split(r", | and ", exceptions) == large
 
 
 def test_every_key_expression_is_described() -> None:
