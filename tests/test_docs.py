@@ -94,9 +94,9 @@ def default_of(field: inspect.Field) -> str:
 @pytest.mark.parametrize(
     ("kind", "heading"),
     [
-        (Config, "## What a run is: `Config`"),
-        (Budget, "## How far it goes: `Budget`"),
-        (Fleet, "## Who carries it out: `Fleet`"),
+        (Config, "## Run settings: `Config`"),
+        (Budget, "## Stopping criteria: `Budget`"),
+        (Fleet, "## Parallelism: `Fleet`"),
     ],
 )
 def test_every_setting_is_documented_with_its_type_default_and_range(
@@ -123,19 +123,26 @@ def test_every_preset_is_documented_with_what_differs_from_the_defaults() -> Non
         name: {n: v for n, v in preset(name).items() if n != "environment" and v != defaults[n]}
         for name in preset_names()
     }
-    found = {
-        codes(name)[0]: tomllib.loads("\n".join(codes(settings)))
-        for name, settings in records(section("docs/configuration.md", "## Presets"), "preset")
-    }
-    assert found == expected
+    blocks = re.findall(
+        r"^### Preset `([^`]+)`\n\n```toml\n(.*?)^```$",
+        text_of("docs/configuration.md"),
+        flags=re.DOTALL | re.MULTILINE,
+    )
+    assert {name: tomllib.loads(settings) for name, settings in blocks} == expected
+
+
+def test_every_preset_is_documented_with_what_it_is_for() -> None:
+    rows = records(section("docs/configuration.md", "## Presets"), "preset")
+    assert sorted(name for row in rows for name in codes(row[0])) == preset_names()
+    assert all(row[1] for row in rows)
 
 
 def test_example_of_a_configuration_file_is_accepted(tmp_path: Path) -> None:
-    for language, code in Page("docs/configuration.md").code:
-        if language == "toml":
-            file = tmp_path / "example.toml"
-            file.write_text(code, encoding="utf-8")
-            gather(read_toml(file)["environment"], file=file, options={})
+    toml = [code for language, code in Page("docs/configuration.md").code if language == "toml"]
+    (example,) = (code for code in toml if "environment" in tomllib.loads(code))
+    file = tmp_path / "example.toml"
+    file.write_text(example, encoding="utf-8")
+    gather(read_toml(file)["environment"], file=file, options={})
 
 
 # Metrics.
