@@ -225,7 +225,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise ConfigError(f"--set {text}: expected HYPERPARAMETER=VALUE, e.g. --set batch_size=512")
+        raise ConfigError(f"--set {text}: expected NAME=VALUE, e.g. --set batch_size=512")
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:

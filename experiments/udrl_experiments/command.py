@@ -28,7 +28,7 @@ _ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
 
 @click.group()
 def study() -> None:
-    """Conduct one of the paper's experiments.
+    """Run one of the paper's experiments.
 
     Example: udrl study lander --seeds 1-3 --max-env-steps 3M
     """
@@ -38,18 +38,18 @@ def _options(command: Command) -> Command:
     """Add the options that all studies have."""
     options = (
         click.option("--scale", type=click.Choice(get_args(Scale)), default="small",
-                     show_default=True, help="Seeds and steps for an evening on two cores, or the "
-                     "paper's."),
-        click.option("--seeds", metavar="SEEDS", help="E.g. 1-20 or 1,2,7-9."),
-        click.option("--max-env-steps", type=STEPS, help="Of each run, e.g. 500K or 10M."),
-        click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
-                     help="Change a setting of all UDRL runs; may be repeated."),
+                     show_default=True, help="Number of seeds and steps: for an evening on two "
+                     "cores, or the paper's."),
+        click.option("--seeds", metavar="SEEDS", help="Seeds of the runs, e.g. 1-20 or 1,2,7-9."),
+        click.option("--max-env-steps", type=STEPS, help="Env steps per run, e.g. 500K or 10M."),
+        click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+                     help="Change a setting of all UDRL runs. May be repeated."),
         click.option("--folder", type=click.Path(path_type=Path, file_okay=False),
                      default=Path("runs/studies"), show_default=True,
-                     help="Where studies live. They share their runs."),
+                     metavar="DIR", help="Folder of all studies, which share their runs."),
         click.option("--side-by-side", type=click.IntRange(1, 1024), metavar="N",
                      help="Runs at a time. Default: one for every two cores."),
-        click.option("--resume", is_flag=True, help="Go on with the study that is in the folder."),
+        click.option("--resume", is_flag=True, help="Resume the study in the folder."),
     )  # fmt: skip
     for option in reversed(options):
         command = option(command)
@@ -60,7 +60,7 @@ def _tasks(*default: str) -> Callable[[Command], Command]:
     """Add the option that names tasks."""
     return click.option(
         "--task", "names", multiple=True, type=click.Choice(list(TASKS)), default=default,
-        show_default=True, help="On which; may be repeated.",
+        show_default=True, help="Task to run. May be repeated.",
     )  # fmt: skip
 
 
@@ -68,7 +68,7 @@ def _algorithms(command: Command) -> Command:
     """Add the option that names algorithms."""
     return click.option(
         "--algorithm", "algorithms", multiple=True, type=click.Choice(_ALGORITHMS),
-        default=_ALGORITHMS, show_default=True, help="Who takes part; may be repeated.",
+        default=_ALGORITHMS, show_default=True, help="Algorithm to run. May be repeated.",
     )(command)  # fmt: skip
 
 
@@ -140,9 +140,9 @@ def sparse(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
 @_options
 @_tasks(*TASKS)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=EPISODES, show_default=True,
-              help="For each desired return.")  # fmt: skip
+              metavar="N", help="Episodes per desired return.")  # fmt: skip
 def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
-    """Figure 6: what trained agents obtain, against what they are told.
+    """Figure 6: desired and obtained returns of trained agents.
 
     Example: udrl study sensitivity --task lander --task sparse
     """
@@ -153,7 +153,7 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 @_options
 @_tasks("lander")
 def lead(names: tuple[str, ...], **options: Any) -> int:
-    """What asynchrony costs: lead 0, 1, 2, 4 and 8.
+    """Cost of asynchrony: lead 0, 1, 2, 4 and 8.
 
     Example: udrl study lead --side-by-side 1
     """
@@ -164,7 +164,7 @@ def lead(names: tuple[str, ...], **options: Any) -> int:
 @_options
 @_tasks("lander", "sparse")
 def segments(names: tuple[str, ...], **options: Any) -> int:
-    """Trailing segments against all (section 2.3.3).
+    """Trailing segments and segments of all lengths (section 2.3.3).
 
     Example: udrl study segments --task sparse
     """
@@ -175,7 +175,7 @@ def segments(names: tuple[str, ...], **options: Any) -> int:
 @_options
 @_tasks("lander", "sparse")
 @click.option("--strategy", "strategies", multiple=True, metavar="PACKAGE.MODULE:CLASS",
-              help="One of your own besides; may be repeated.")  # fmt: skip
+              help="Strategy of your own to add. May be repeated.")  # fmt: skip
 def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any) -> int:
     """Strategies for exploratory commands (sections 2.3.4 and 6).
 
@@ -189,14 +189,14 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 @_tasks("lander")
 @_algorithms
 @click.option("--configurations", type=click.IntRange(1, 100_000), metavar="N",
-              help="Of each algorithm. Default: 8, or the paper's.")  # fmt: skip
+              help="Configurations per algorithm. Default: 8, or the paper's number.")  # fmt: skip
 def search(
     names: tuple[str, ...],
     algorithms: tuple[Algorithm, ...],
     configurations: int | None,
     **options: Any,
 ) -> int:
-    """Appendix B: random search over the paper's spaces, on Ray Tune.
+    """Appendix B: random search with Ray Tune.
 
     Example: udrl study search --algorithm UDRL --configurations 16
     """

@@ -74,7 +74,7 @@ class Plan(NamedTuple):
         scale: where seeds and steps come from when they are not given.
         seeds: of the runs; None: 1 to 20 in the paper, 1 to 3 at the small scale.
         max_env_steps: of each run; None: as the scale says.
-        assignments: ``HYPERPARAMETER=VALUE``, changes of UDRL's presets.
+        assignments: ``NAME=VALUE``, changes of UDRL's presets.
     """
 
     scale: Scale = "small"

@@ -213,7 +213,7 @@ def test_an_assignment_is_a_name_and_a_toml_value_or_a_bare_word(
 
 @pytest.mark.parametrize("text", ["batch_size", "=512", " =512", ""])
 def test_an_assignment_without_name_or_equals_sign_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="expected HYPERPARAMETER=VALUE"):
+    with pytest.raises(ConfigError, match="expected NAME=VALUE"):
         parse_assignment(text)
 
 

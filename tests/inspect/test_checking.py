@@ -67,7 +67,7 @@ def test_what_cannot_be_trained_on_is_refused() -> None:
 def test_command_prints_lines_or_json() -> None:
     told = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
     assert "repeats       yes, from its seed" in told.stdout
-    assert "verdict       it can be trained on: udrl train CartPole-v1" in told.stdout
+    assert "verdict       supported; train with: udrl train CartPole-v1" in told.stdout
     told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(told.stdout)["max_episode_steps"] == 500
     told = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)

@@ -27,7 +27,7 @@ def refusal(process: Cli) -> tuple[int, str]:
         (["train", "CartPole-v1", "--set", "batch_size=many"], "batch_size = 'many'"),
         (["train", "CartPole-v1", "--set", "learning_rate=nan"], "learning_rate = nan"),
         (["train", "CartPole-v1", "--set", "last_few=9999"], "last_few = 9999"),
-        (["train", "CartPole-v1", "--set", "batch_size"], "HYPERPARAMETER=VALUE"),
+        (["train", "CartPole-v1", "--set", "batch_size"], "NAME=VALUE"),
         (["train", "CartPole-v1", "--set", "environment=Acrobot-v1"], "the argument ENV"),
         (["train", "CartPole-v1", "--preset", "nope"], "preset 'nope'"),
         (["train", "CartPole-v1", "--config", "missing.toml"], "missing.toml"),

@@ -59,7 +59,7 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
         "--desired-horizon", "40", "--weights", "best",
     ).finish()  # fmt: skip
     assert code == 0, error
-    assert "commanded return 30.0 within 40 steps, temperature 0," in out
+    assert "desired return 30.0 within 40 steps, temperature 0," in out
 
     for name in ("run.sqlite", "metrics.csv", "config.toml", "weights.safetensors"):
         assert (run_dir / name).stat().st_size > 0
@@ -154,6 +154,6 @@ def commands(command: click.Command, *names: str) -> Iterator[tuple[str, click.C
 def test_help_of_each_command_has_an_example() -> None:
     missing = [
         name for name, command in commands(command_line)
-        if not command.hidden and "Example: udrl" not in (command.help or "")
+        if not command.hidden and "\nExample:\n  udrl " not in (command.help or "")
     ]  # fmt: skip
     assert not missing

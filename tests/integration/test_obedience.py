@@ -197,5 +197,5 @@ def test_a_directory_that_cannot_be_written_costs_no_report(run_dir: Path) -> No
     (run_dir / "obedience.json.part").mkdir()
     said, problem = call("obedience", run_dir, "--episodes", 2, "--points", 2)
     assert "Highest mean return" in said
-    assert "the report is not kept in" in problem
+    assert "the report cannot be written to" in problem
     assert "make the directory writable" in problem

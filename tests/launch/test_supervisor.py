@@ -65,7 +65,7 @@ def test_error_that_would_be_repeated_is_final(supervisor: Supervisor, code: int
 
 def test_child_that_dies_without_getting_on_is_given_up(supervisor: Supervisor) -> None:
     start(supervisor, "child", "print('why'); raise SystemExit(1)")
-    says = "child ended with code 1 6 times without getting on:\nwhy"
+    says = "child ended with code 1 6 times without progress:\nwhy"
     with pytest.raises(RunFailed, match=says):
         check_until(supervisor, lambda: False)
 
@@ -85,7 +85,7 @@ def test_child_that_gets_on_is_started_again_for_ever(supervisor: Supervisor) ->
 
 def test_signal_is_called_by_its_name_and_what_it_usually_means(supervisor: Supervisor) -> None:
     start(supervisor, "child", "import os; os.kill(os.getpid(), 9)")
-    says = r"child ended by SIGKILL \(somebody killed it, or memory ran out\) 6 times"
+    says = r"child ended by SIGKILL \(killed, or out of memory\) 6 times"
     with pytest.raises(RunFailed, match=says):
         check_until(supervisor, lambda: False)
     assert module.how_it_ended(-11) == "ended by SIGSEGV (a crash in native code)"
@@ -110,7 +110,7 @@ def test_log_without_end_is_shortened(
     supervisor.children[0].shorten_log()
     log_file = supervisor.children[0].log_file
     assert log_file.stat().st_size <= 4000
-    assert log_file.read_text().splitlines()[0] == "... what stood here was dropped"
+    assert log_file.read_text().splitlines()[0] == "... earlier output was removed"
     assert supervisor.children[0].last_words().splitlines()[-1] == "line 20000"
 
 

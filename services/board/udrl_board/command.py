@@ -29,19 +29,19 @@ _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
 @click.argument("run_dir", type=RUN_DIR, required=False)
 @CONNECT
 @click.option("--port", type=click.IntRange(0, 65_535), default=0, show_default=True,
-              help="Where the page is served; 0: any that is free.")  # fmt: skip
-@click.option("--host", default="127.0.0.1", show_default=True,
-              help="Address to serve on. Beyond loopback, browsers must know a token.")  # fmt: skip
+              metavar="PORT", help="Port to serve on; 0 = any free port.")  # fmt: skip
+@click.option("--host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
+              help="Address to serve on. Beyond loopback, browsers need a token.")  # fmt: skip
 @click.option(
     "--token",
     envvar="UDRL_BOARD_TOKEN",
     metavar="TOKEN",
-    help="What browsers must know. Default: a new one, beyond loopback or a proxy.",
+    help="Token that browsers need. Default: a new one beyond loopback or behind a proxy.",
 )
 @click.option("--allow-origin", "origins", multiple=True, metavar="ORIGIN",
-              help="Origin of the board's pages behind a proxy, e.g. https://hub.example; may be "
+              help="Origin of the board behind a proxy, e.g. https://hub.example. May be "
               "repeated.")  # fmt: skip
-@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@click.option("--open", "opens", is_flag=True, help="Open the board in the browser.")
 @KEYS
 @RUN
 def board(
@@ -55,7 +55,9 @@ def board(
     keys: Path | None,
     run_id: str | None,
 ) -> int:
-    """Watch a run in the browser, and tell its agent what to do.
+    """Watch a run and command its agent in the browser.
+
+    Pass either RUN_DIR or --connect ENDPOINT.
 
     Example: udrl board runs/mine --open
     """

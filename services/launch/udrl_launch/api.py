@@ -1,4 +1,4 @@
-"""``udrl.train``: what ``udrl train`` does, as a function.
+"""``udrl.train``: the command ``udrl train`` as a function.
 
 ::
 
@@ -26,17 +26,17 @@ from udrl_launch.training import train as run_training
 from udrl_proto.reports import Status
 from udrl_replay.creation import directory_name, exists
 
-#: Called with the status of a run; what returns False stops it.
+#: Called with the status of a run. It stops the run by returning False.
 Callback = Callable[[Status], bool | None]
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came of a training.
+    """The result of a training.
 
     Attributes:
-        run_dir: the run's directory, for everything that looks at runs.
-        status: how it ended, or was when it was stopped (``docs/metrics.md``).
+        run_dir: the run's directory.
+        status: the run's status when it ended or was stopped (``docs/metrics.md``).
     """
 
     run_dir: Path
@@ -47,7 +47,7 @@ class Trained:
         """The agent.
 
         Raises:
-            StoreError: the run ended before anything was trained.
+            StoreError: the run ended before any weights were trained.
         """
         return load_agent(self.run_dir).policy
 
@@ -62,26 +62,26 @@ def train(
     in_process: bool = True,
     **settings: Any,
 ) -> Trained:
-    """Train an agent: replay, learner and actors, from the first episode to the last evaluation.
+    """Train an agent until its final evaluation.
 
     Args:
         environment: a Gymnasium id, registered or importable.
-        run_dir: the run's directory; None: a new one in ``./runs``.
-        preset: shipped settings; None: those named like the environment, else ``any``;
-            ``"none"``: none.
-        resume: go on with the run in ``run_dir``, if there is one.
-        callbacks: called about twice a second with the run's status, and at the end; one that
-            returns False stops the run, which can be resumed.
-        in_process: all services as threads of this process; else a process each, faster for long
-            runs.
-        settings: any of ``docs/configuration.md``: of the run, its budget and its fleet.
+        run_dir: the run's directory. None: a new one in ``./runs``.
+        preset: a preset. None: the one named after the environment, else ``any``. ``"none"``: the
+            defaults.
+        resume: resume the run in ``run_dir``, if there is one.
+        callbacks: called with the run's status about twice a second, and at the end. A callback
+            that returns False stops the run, which can then be resumed.
+        in_process: run all services as threads of this process. False: as separate processes,
+            which is faster for long runs.
+        settings: any setting of ``docs/configuration.md``, by name.
 
     Raises:
-        ConfigError: a setting is unknown or impossible.
-        UdrlError: the run cannot be started, cannot go on, or failed.
+        ConfigError: a setting is unknown or invalid.
+        UdrlError: the run cannot be started, cannot continue, or failed.
     """
     if resume and run_dir is None:
-        raise ConfigError("resume needs run_dir: the directory of the run to go on with")
+        raise ConfigError("resume needs run_dir, the directory of the run to resume")
     chosen = None if run_dir is None else Path(run_dir).absolute()
     going_on = resume and chosen is not None and exists(chosen)
     gathered = gather(
@@ -106,7 +106,7 @@ def train(
 
 
 class _Callbacks:
-    """Tells others of the run, and stops it if one of them wants that."""
+    """Passes the status to callbacks, and stops the run if one returns False."""
 
     def __init__(self, callbacks: list[Callback], stop: threading.Event) -> None:
         self._callbacks = callbacks

@@ -1,6 +1,6 @@
-"""Making keys: a private authority, and a certificate for each role of a run.
+"""Creating keys: a private certificate authority, and a certificate for each role.
 
-Importing this needs the extra ``secure``.
+Needs the extra ``secure``.
 """
 
 import ipaddress
@@ -21,27 +21,27 @@ from udrl.errors import ConfigError
 from udrl_proto.access import REPLAY, ROLES
 from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
 
-#: Where the authority itself is kept, beside the roles' folders; it goes to no other machine.
+#: Folder of the authority itself, which is not copied to other machines, and its key file.
 AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
 
 _ALWAYS = ("localhost", "127.0.0.1", "::1")
 _LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(?:\.{_LABEL})*")
-#: Clocks of machines differ: a certificate is valid a little before it was made.
+#: Clocks differ between machines, so certificates are valid from a little earlier.
 _CLOCKS_DIFFER = timedelta(hours=1)
 
 
 def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta(365)) -> None:
-    """Make an authority, and a folder with key and certificate for each role.
+    """Create an authority, and a folder with key and certificate for each role.
 
     Args:
-        folder: where; it must not exist, or hold nothing but folders, such as volumes.
-        hosts: names and IP addresses by which others reach the replay service; those of the
-            loopback interface are always among them.
-        valid: how long everything is.
+        folder: must not exist, or contain only folders, such as volumes.
+        hosts: host names and IP addresses of the replay service. Those of the loopback interface
+            are always included.
+        valid: validity of everything.
 
     Raises:
-        ConfigError: a host is none, or the folder holds something or cannot be written.
+        ConfigError: a host is invalid, or the folder is not empty or cannot be written.
     """
     names = [_alternative(host) for host in dict.fromkeys((*_ALWAYS, *hosts))]
     authority = _Authority(valid)
@@ -70,10 +70,10 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
 
 
 def are_there(folder: Path, hosts: Iterable[str] = ()) -> bool:
-    """Say whether a folder holds keys for every role, good for these hosts.
+    """Return whether a folder has keys for every role, valid for these hosts.
 
     Raises:
-        ConfigError: it holds keys that are expired, do not fit together or lack a host.
+        ConfigError: its keys are expired, do not match or lack a host.
     """
     files = [folder / role / name for role in ROLES for name in (CA, CERTIFICATE, KEY)]
     if not all(file.is_file() for file in files):
@@ -85,20 +85,20 @@ def are_there(folder: Path, hosts: Iterable[str] = ()) -> bool:
     for host in hosts:
         if _alternative(host) not in named:
             raise ConfigError(
-                f"the keys in {folder} are not good for --host {host}; remove them and give all "
-                f"services new ones, or use a name that they have"
+                f"the keys in {folder} are not valid for --host {host}; remove them and create new "
+                f"ones for all services, or use a host that they include"
             )
     return True
 
 
 class _Authority:
-    """Issues certificates; nobody else's are trusted by those who hold one."""
+    """Issues certificates. Holders of one trust no other authority."""
 
     def __init__(self, valid: timedelta) -> None:
         self.key = ec.generate_private_key(ec.SECP256R1())
         now = datetime.now(UTC)
         self._valid = now - _CLOCKS_DIFFER, now + valid
-        # Names differ, so that one authority is never taken for another with the same name.
+        # Names differ, so that no authority is mistaken for another of the same name.
         self._name = _name(f"udrl authority {secrets.token_hex(4)}")
         self.certificate = self._signed(
             self._builder(self._name, self.key.public_key())
@@ -109,7 +109,7 @@ class _Authority:
     def issue(
         self, role: str, key: ec.EllipticCurvePublicKey, names: list[x509.GeneralName]
     ) -> bytes:
-        """Return a certificate, in PEM; only one with names is good for a server."""
+        """Return a certificate, in PEM. Only one with names is valid for a server."""
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = self._builder(_name(role), key)
         if names:

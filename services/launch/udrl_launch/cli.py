@@ -1,5 +1,6 @@
 """The command ``udrl``."""
 
+import inspect
 import os
 import sys
 from importlib import import_module
@@ -39,7 +40,7 @@ _GROUP = "udrl.commands"
 
 
 def main() -> NoReturn:
-    """Run the command line; errors of ours are one line, without a traceback."""
+    """Run the command line. A :class:`UdrlError` is shown as one line, without a traceback."""
     # Before NumPy is imported: its threads wait for each other by spinning, on cores that other
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -48,7 +49,7 @@ def main() -> NoReturn:
         output.keep_for_json()
     try:
         code = cli(standalone_mode=False)
-    except BrokenPipeError:  # nobody reads on, e.g. `| head`
+    except BrokenPipeError:  # e.g. `| head`
         code = 0
     except UdrlError as error:
         click.echo(f"udrl: error: {error}", err=True)
@@ -58,15 +59,15 @@ def main() -> NoReturn:
         code = error.exit_code
     except click.Abort:
         code = 130
-    # Not sys.exit: Zenoh's threads may still be in a callback, and when the interpreter ends under
-    # them the process now and then aborts, after all its work. No command leaves work to exit
-    # handlers, and what is left of it is memory.
+    # Not sys.exit: Zenoh's threads may still be in a callback, and if the interpreter shuts down
+    # under them, the process occasionally aborts after all its work is done. No command relies on
+    # exit handlers.
     output.flush()
     os._exit(code or 0)
 
 
 class _Commands(click.Group):
-    """Imports a command when it is wanted; other packages add theirs as entry points."""
+    """Imports a command when it is used. Other packages add theirs as entry points."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [*_COMMANDS, *sorted(entry_points(group=_GROUP).names - _COMMANDS.keys())]
@@ -75,11 +76,23 @@ class _Commands(click.Group):
         command: click.Command
         if cmd_name in _COMMANDS:
             command = getattr(import_module(_COMMANDS[cmd_name]), cmd_name)
-            return command
+            return _with_example(command)
         for added in entry_points(group=_GROUP, name=cmd_name):
             command = added.load()
-            return command
+            return _with_example(command)
         return super().get_command(ctx, cmd_name)
+
+
+def _with_example(command: click.Command) -> click.Command:
+    """Put the example in a command's help on a line of its own, which click does not wrap."""
+    if command.help is not None:
+        about, found, example = inspect.cleandoc(command.help).partition("Example: ")
+        if found:
+            command.help = f"{about}\b\nExample:\n  {' '.join(example.split())}"
+    if isinstance(command, click.Group):
+        for subcommand in command.commands.values():
+            _with_example(subcommand)
+    return command
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -1,4 +1,4 @@
-"""All services of a run on this machine: a process each, or threads of this one."""
+"""All services of a run on this machine, as processes or as threads."""
 
 import sys
 import threading
@@ -19,7 +19,7 @@ from udrl_proto.credentials import load
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 
-#: Seconds that freshly started services look for the replay service.
+#: Seconds for which services look for the replay service after they start.
 _PATIENCE_S = "60"
 
 
@@ -28,15 +28,15 @@ class Local(Protocol):
 
     @property
     def done(self) -> bool:
-        """Whether all have ended well."""
+        """Whether all have ended without an error."""
         ...
 
     def check(self) -> None:
-        """Start again what has died; raise what cannot be mended."""
+        """Restart dead services; raise the first unrecoverable error."""
         ...
 
     def note(self, status: Status) -> None:
-        """Learn how far the run is."""
+        """Take note of the run's progress."""
         ...
 
     def end(self) -> None:
@@ -45,7 +45,7 @@ class Local(Protocol):
 
 
 class Processes:
-    """A process for each service, started again when it dies."""
+    """A process for each service, restarted when it dies."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Processes:
                 self._supervisor.start(name, *arguments, *secured)
             except OSError as error:
                 self._supervisor.end()
-                raise UdrlError(f"{name} cannot be started: {error}; free some of that") from error
+                raise UdrlError(f"cannot start {name}: {error}; free that resource") from error
 
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
@@ -86,15 +86,15 @@ class Processes:
 
     @property
     def done(self) -> bool:
-        """Whether all have ended well."""
+        """Whether all have ended without an error."""
         return self._supervisor.done
 
     def check(self) -> None:
-        """Start again what has died; raise what cannot be mended."""
+        """Restart dead services; raise the first unrecoverable error."""
         self._supervisor.check()
 
     def note(self, status: Status) -> None:
-        """Learn how far the run is, so that those who die without getting on are given up."""
+        """Take note of the run's progress, to give up on services that die without progress."""
         self._supervisor.work = {
             "replay": status.episodes.delivered,
             "learner": status.weights_version,
@@ -107,7 +107,7 @@ class Processes:
 
 
 class Threads:
-    """A thread for each service; the first that fails ends all."""
+    """A thread for each service. The first error ends all of them."""
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class Threads:
 
     @property
     def done(self) -> bool:
-        """Whether all have ended, or the replay service has and the others had their time."""
+        """Whether all have ended, or the replay service has and the grace period is over."""
         if self._run_ended is None and not self._threads[0].is_alive():
             self._run_ended = time.monotonic()
         if self._run_ended is not None and time.monotonic() - self._run_ended > END_S:
@@ -180,7 +180,7 @@ class Threads:
             raise self._errors[0]
 
     def note(self, status: Status) -> None:
-        """Nothing is started again here."""
+        """Do nothing: threads are not restarted."""
 
     def end(self) -> None:
         """End all of them."""

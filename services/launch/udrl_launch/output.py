@@ -1,4 +1,4 @@
-"""Standard output, kept for JSON where it is asked for, whatever an environment prints."""
+"""Standard output, reserved for JSON if that was requested, even if environments print."""
 
 import os
 import sys
@@ -11,9 +11,9 @@ _kept: TextIO | None = None
 
 
 def keep_for_json() -> None:
-    """Let all that is printed go to standard error, except what :func:`print_json` prints.
+    """Redirect standard output to standard error, except for :func:`print_json`.
 
-    Below Python, since simulators print from C too.
+    At the level of file descriptors, because simulators print from C too.
     """
     global _kept
     sys.stdout.flush()
@@ -27,7 +27,7 @@ def print_json(value: object) -> None:
 
 
 def flush() -> None:
-    """Write out what was printed; that nobody reads on is no error."""
+    """Flush all output; a closed pipe is not an error."""
     for stream in (sys.stdout, sys.stderr, _kept):
         if stream is not None:
             try:

@@ -1,4 +1,4 @@
-"""Where a command was started: environments may change the working directory meanwhile."""
+"""Paths relative to where a command was started; environments may change the directory."""
 
 import os
 import sys
@@ -8,20 +8,20 @@ from udrl.errors import ConfigError
 
 STARTED_IN = Path.cwd()
 
-#: Tells a child where its parent looks for modules, after everything that the child knows itself.
+#: Where the parent looks for modules; a child appends these to its own search path.
 _MODULE_PATH = "UDRL_MODULE_PATH"
 
 
 def shown(path: Path) -> str:
-    """Return a path as whoever started the command would write it."""
+    """Return a path relative to where the command was started, if it is below that."""
     return str(path.relative_to(STARTED_IN) if path.is_relative_to(STARTED_IN) else path)
 
 
 def new_run_dir(name: str) -> Path:
-    """Make a directory for a new run in ``./runs``, with a number behind its name if it is taken.
+    """Create a directory for a new run in ``./runs``; a number is appended if the name is taken.
 
     Raises:
-        ConfigError: it cannot be made.
+        ConfigError: it cannot be created.
     """
     runs, number = Path("runs").absolute(), 1
     try:
@@ -35,11 +35,11 @@ def new_run_dir(name: str) -> Path:
             else:
                 return path
     except OSError as error:
-        raise ConfigError(f"{runs}: {error}; name a directory with --run-dir") from error
+        raise ConfigError(f"{runs}: {error}; choose another directory with --run-dir") from error
 
 
 def find_modules_of_the_user() -> None:
-    """Let modules be found where the parent finds them and in the working directory, last."""
+    """Append the parent's module search path and the working directory to our own."""
     given = os.environ.get(_MODULE_PATH, "").split(os.pathsep)
     for folder in [*filter(None, given), str(STARTED_IN)]:
         if folder not in sys.path:
@@ -47,6 +47,6 @@ def find_modules_of_the_user() -> None:
 
 
 def environment_of_children() -> dict[str, str]:
-    """Return the environment variables of a child that finds the same modules."""
+    """Return environment variables for a child, so that it finds the same modules."""
     found = [str(Path(folder).absolute()) for folder in sys.path]
     return os.environ | {_MODULE_PATH: os.pathsep.join(found)}

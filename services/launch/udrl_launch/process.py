@@ -1,4 +1,4 @@
-"""One service in one process: signals, the parent's death, memory, exit codes."""
+"""One service in one process: signals, death of the parent, memory, exit codes."""
 
 import ctypes
 import logging
@@ -15,22 +15,22 @@ from udrl_launch.signals import Signals
 
 log = logging.getLogger("udrl")
 
-#: Seconds that a service gets to end after SIGINT or SIGTERM; and one that has others to end.
+#: Seconds for a service to end after SIGINT or SIGTERM; more if it has children to end.
 GRACE_S, PARENTS_GRACE_S = 3.0, 4.5
 
 _PR_SET_PDEATHSIG = 1
 
-#: Six for each service that may join.
+#: Open files: six for each service that may join.
 _MOST_FILES = 65_536
 
 #: Parameters of the C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-#: The greatest that it takes for the second.
+#: The largest value of the second.
 _MMAP_THRESHOLD = 32 * 2**20
 
 
 def log_to_stderr(level: int = logging.INFO) -> None:
-    """Let the log go to standard error, a line each, with the time."""
+    """Write the log to standard error, one line per message, with the time."""
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
     log.handlers[:] = [handler]
@@ -38,9 +38,9 @@ def log_to_stderr(level: int = logging.INFO) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Let the kernel end this process when its parent does, however that happens.
+    """Let the kernel kill this process when its parent ends, for whatever reason.
 
-    Nothing is lost: a killed service is what the whole design is made for.
+    Nothing is lost: services may be killed at any time.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -49,38 +49,38 @@ def die_with_parent(parent: int) -> None:
 
 
 def allow_open_files() -> None:
-    """Let this process have as many files open as it may; by default many systems say 1,024.
+    """Raise the limit of open files of this process; the default is often 1,024.
 
-    Each service that joins is a connection of the replay service. More than fleets need is not
-    asked for: some programs that environments start walk through all that could be open.
+    Each service that joins is a connection of the replay service. The limit is not raised further
+    than fleets need: some programs that environments start iterate over all possible files.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
-        with suppress(OSError, ValueError):  # another system's own limit is lower
+        with suppress(OSError, ValueError):  # some systems have a lower limit
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep what it frees, up to 1 GiB, for what it allocates next.
+    """Let this process reuse freed memory, up to 1 GiB, instead of returning it to the kernel.
 
-    Every update of a network for images allocates some dozens of MB and frees them again. By
-    default that memory goes back to the kernel each time, which has to fill it with zeros the next
-    time: a quarter of the update's time. Must be called before there are other threads. Does
-    nothing where the C library is not glibc.
+    Every update of a network for images allocates and frees some dozens of MB. By default that
+    memory is returned to the kernel, which fills it with zeros when it is allocated again: a
+    quarter of the update's time. Must be called before other threads start. Has no effect unless
+    the C library is glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD)
         mallopt(_M_TRIM_THRESHOLD, 2**30)
-        mallopt(_M_ARENA_MAX, 1)  # the arenas of other threads have a threshold of their own
+        mallopt(_M_ARENA_MAX, 1)  # arenas of other threads have their own threshold
 
 
 def switch_threads_soon() -> float:
-    """Let a thread that waits get the interpreter soon; return the seconds that it took before.
+    """Shorten the interpreter's switch interval; return the previous one in seconds.
 
-    An actor's courier must get it while the loop steps environments: at the default of 5 ms a
-    query takes 5 ms instead of 0.2.
+    An actor's courier needs the interpreter while the loop steps environments: at the default of
+    5 ms a query takes 5 ms instead of 0.2.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
@@ -88,14 +88,14 @@ def switch_threads_soon() -> float:
 
 
 def run_service(service: Callable[[threading.Event], None], grace_s: float = GRACE_S) -> int:
-    """Run a service until it returns or a signal comes; return the exit code.
+    """Run a service until it returns or a signal arrives; return the exit code.
 
-    The service has the main thread, since some environments can be made and stepped nowhere else:
-    those that handle signals, run an event loop or draw. The process may open more files from then
-    on.
+    The service runs in the main thread, because some environments must be created and stepped
+    there: those that handle signals, run an event loop or draw. Also raises the limit of open
+    files.
 
     Args:
-        service: ends soon after the event that it is given is set.
+        service: must end soon after its argument is set.
         grace_s: seconds that it has for that.
     """
     allow_open_files()

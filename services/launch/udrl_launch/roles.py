@@ -40,22 +40,22 @@ def open_run(
     secure: bool,
     check_environment: bool = True,
 ) -> Store:
-    """Go on with a run, or make a new one, and write its configuration beside it.
+    """Resume a run or create a new one, and write its configuration to the run directory.
 
-    None is made where it could not be served.
+    No run is created if it could not be served.
 
     Args:
         run_dir: its directory.
-        settings: what it is, and when it ends.
-        go_on: go on with the run in ``run_dir`` if there is one.
+        settings: its settings and its budget.
+        go_on: resume the run in ``run_dir`` if there is one.
         allow_inexact: accept services of other numerics classes, and a changed environment.
-        listen: the endpoint that it will have; None: a router's.
-        insecure: allow that to be beyond loopback without keys.
+        listen: the endpoint to listen on. None: a router's endpoint is used.
+        insecure: allow it to be beyond loopback without keys.
         secure: whether keys were given.
-        check_environment: with ``go_on``, play some stored episodes again.
+        check_environment: with ``go_on``, replay some stored episodes.
 
     Raises:
-        UdrlError: the settings or the endpoint cannot be used, or there is a run already.
+        UdrlError: the settings or the endpoint cannot be used, or the run exists already.
     """
     if go_on and exists(run_dir):
         store = resume(
@@ -86,12 +86,12 @@ def replay(
     credentials: Credentials | None = None,
     audit: float = 0.0,
 ) -> None:
-    """Serve a run until it has ended; either host its router or use one.
+    """Serve a run until it has ended, at an endpoint of its own or through a router.
 
     Raises:
         ConfigError: the endpoint cannot be used.
         StoreError: the run's file cannot be written.
-        RunFailed: the run cannot go on, or an actor lied (Deceived).
+        RunFailed: the run cannot continue, or an actor delivered false episodes (Deceived).
     """
     run_dir = run_dir.absolute()  # environments may change the working directory for a moment
     with closing(store):
@@ -116,7 +116,7 @@ def replay(
 
 
 def require_torch() -> None:
-    """Refuse to train without torch, which only a learner needs.
+    """Require torch, which only a learner needs.
 
     Raises:
         ConfigError: it is not installed.
@@ -126,15 +126,15 @@ def require_torch() -> None:
 
 
 def require_device(config: Config) -> None:
-    """Refuse to train on a device that is not here.
+    """Require the device that the run trains on.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: this machine does not have it.
     """
     if config.arithmetic.device == "cuda" and not has_cuda():
         raise ConfigError(
-            "device = 'cuda': there is no GPU here that its driver knows; train on a machine that "
-            "has one, or set device = 'cpu'"
+            "device = 'cuda': the CUDA driver finds no GPU; train on a machine that has one, or "
+            "set device = 'cpu'"
         )
 
 
@@ -142,7 +142,7 @@ def learner(address: Address, stop: threading.Event) -> None:
     """Train the run at an address until it has ended.
 
     Raises:
-        ConfigError: torch or the run's device is not here.
+        ConfigError: torch or the run's device is missing.
     """
     require_torch()
     from udrl_learner.service import LearnerService  # the only one that needs torch
@@ -164,9 +164,9 @@ def actor(
     Args:
         address: where the run is.
         environments: how many to step at once.
-        stop: ends everything.
-        hang_s: end the whole process when a round of steps takes longer; None: do not.
-        first_index: of its environments.
+        stop: ends the service.
+        hang_s: end the process if a round of environment steps takes longer. None: never.
+        first_index: index of its first environment.
     """
     with connected("actor", address, stop) as (transport, hello):
         name = unique_name("actor")

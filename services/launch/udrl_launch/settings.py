@@ -1,4 +1,4 @@
-"""Where settings come from: preset, then file, then command line; the last word counts."""
+"""Settings of a command: preset, then file, then command line; the last one is used."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -25,22 +25,22 @@ from udrl.errors import ConfigError
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 
-#: The name of the preset that leaves everything as it is.
+#: The name that stands for no preset.
 NO_PRESET = "none"
-#: That of environments without one of their own.
+#: The preset of environments without their own.
 ANY_PRESET = "any"
-#: What is said of a setting that is left open.
+#: The value of a setting that is chosen automatically.
 _AUTO = "auto"
 
 
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Who carries the run out; changes its speed, never its result.
+    """Parallelism of a run. It changes the speed, never the result.
 
     Attributes:
         actors: actor processes on this machine.
-        envs_per_actor: environments that each steps at once; None: what suits the run.
-        hang_timeout: seconds of one round of steps after which an actor ends and is started again.
-            Making an environment may take five minutes, or as long as this if that is more.
+        envs_per_actor: environments that each actor steps at once. None: chosen to suit the run.
+        hang_timeout: seconds per round of environment steps after which an actor ends and is
+            restarted. Creating an environment may take five minutes, or this long if it is more.
     """
 
     actors: Annotated[int, Meta(ge=0, le=1024)] = 2
@@ -53,12 +53,12 @@ def _from_file(file: Path, environment: str) -> dict[str, Any]:
     named = values.get("environment", environment)
     if named != environment:
         raise ConfigError(
-            f"environment = {named!r} in {file}, but ENV is {environment!r}; make them agree"
+            f"environment = {named!r} in {file}, but ENV is {environment!r}; they must be the same"
         )
     return values
 
 
-#: Environments that one call of a network for vectors serves well.
+#: Environments per actor, at most, if their number is not set: more rows per call gain little.
 _MOST_ENVS = 16
 
 
@@ -66,11 +66,11 @@ class Settings(NamedTuple):
     """All settings of a command.
 
     Attributes:
-        config: what the run is.
+        config: the settings that define the run.
         budget: when it ends.
-        fleet: who carries it out.
-        left_open: settings of ``config`` to choose by what the environment is like, when the run
-            is created (:mod:`udrl.fitting`); until then their values count for nothing.
+        fleet: its parallelism.
+        left_open: settings of ``config`` that are chosen automatically when the run is created
+            (:mod:`udrl.fitting`). Until then their values have no meaning.
     """
 
     config: Config
@@ -80,7 +80,7 @@ class Settings(NamedTuple):
 
     @property
     def envs_per_actor(self) -> int:
-        """Environments that each actor steps at once, all of them busy now and then."""
+        """Environments that each actor steps at once; by default no more than are ever busy."""
         if self.fleet.envs_per_actor is not None:
             return self.fleet.envs_per_actor
         commands, evaluation = self.config.commands, self.config.evaluation
@@ -101,16 +101,16 @@ def gather(
     """Return the settings of a command.
 
     Args:
-        environment: its ENV argument, which wins over everything.
-        preset_name: a shipped preset, or :data:`NO_PRESET`; None: the one named like the
-            environment, or :data:`ANY_PRESET` if there is none.
+        environment: its argument ENV, which overrides everything else.
+        preset_name: a preset, or :data:`NO_PRESET`. None: the one named after the environment, or
+            :data:`ANY_PRESET` if there is none.
         file: a TOML file.
-        stored: the settings of a run to go on with, instead of a preset's.
-        options: command-line options; None means: not given.
-        assignments: those of ``--set``.
+        stored: the settings of a run to resume, in place of a preset's.
+        options: command-line options. A value of None means that the option was not given.
+        assignments: the values of ``--set``.
 
     Raises:
-        ConfigError: a setting is unknown or impossible, or one of ``--set`` has no effect.
+        ConfigError: a setting is unknown or invalid, or one of ``--set`` has no effect.
     """
     values: dict[str, Any] = dict(stored or {})
     if preset_name is None and stored is None:
@@ -134,8 +134,8 @@ def gather(
     left_open = {n for n in OPEN if values.get(n) == _AUTO}
     values |= {name: OPEN[name] for name in left_open}
     if "baseline" in left_open and values.get("segments") == "all":
-        values["baseline"] = "none"  # no other goes with them
-    if stored is not None:  # there they were chosen long ago
+        values["baseline"] = "none"  # the only one that supports them
+    if stored is not None:  # they were chosen when the run was created
         values |= {name: stored[name] for name in left_open if name in stored}
         left_open.clear()
 

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM for a service that has the main thread, which native code may keep."""
+"""SIGINT and SIGTERM for a service in the main thread, which native code may block."""
 
 import contextlib
 import logging
@@ -15,14 +15,14 @@ _STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Signals:
-    """Hears signals in a thread of its own, and ends the process if the service does not.
+    """Receives signals in its own thread, and ends the process if the service does not end.
 
     Args:
-        stop: set when one has come.
-        grace_s: seconds that the service has to end after that.
+        stop: set when a signal arrives.
+        grace_s: seconds for the service to end after that.
 
     Attributes:
-        received: the first that came; None: none did.
+        received: the first signal that arrived, or None.
     """
 
     _heard: "Signals | None" = None
@@ -38,8 +38,8 @@ class Signals:
 
     def __enter__(self) -> Self:
         self._previous = {number: signal.signal(number, self._tell) for number in _STOPPING}
-        # The interpreter writes to it at once, and calls _tell when the main thread is back. Some
-        # programs take it away meanwhile, as event loops do; then _tell is what is left.
+        # The interpreter writes to it at once, and calls _tell once the main thread runs Python
+        # again. Some programs, such as event loops, replace it; _tell still works then.
         self._wakeup_before = signal.set_wakeup_fd(self._mouth.fileno(), warn_on_full_buffer=False)
         self._thread.start()
         Signals._heard = self
@@ -49,14 +49,14 @@ class Signals:
         self._ended.set()
         Signals._heard = None
         signal.set_wakeup_fd(self._wakeup_before)
-        if self.received is None:  # else the process ends, and may be told so again
+        if self.received is None:  # else the process ends, and more signals may arrive
             self._restore()
         self._say(0)
         self._thread.join(1.0)
         self._close()
 
     def _tell(self, number: int, frame: object) -> None:
-        # Nothing that takes a lock: the next signal may come in the middle of this one.
+        # Must not take a lock: the next signal may arrive during this one.
         self._say(number)
 
     def _say(self, number: int) -> None:
@@ -64,7 +64,7 @@ class Signals:
             self._mouth.send(bytes([number]))
 
     def _listen(self) -> None:
-        """Wait for a signal that means the end; an environment may have others of its own."""
+        """Wait for SIGINT or SIGTERM; an environment may use other signals."""
         while (number := self._ear.recv(1)[0]) not in _STOPPING:
             if number == 0:  # the service has ended
                 return
@@ -85,7 +85,7 @@ class Signals:
 
     @classmethod
     def forget(cls) -> None:
-        """Let a forked child have its signals for itself: a word of it would stop the parent."""
+        """Restore the signals in a forked child, whose signals would otherwise stop the parent."""
         heard, cls._heard = cls._heard, None
         if heard is not None:
             signal.set_wakeup_fd(-1)

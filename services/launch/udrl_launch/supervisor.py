@@ -1,4 +1,4 @@
-"""Child processes: started, watched, started again, and ended with their parent."""
+"""Child processes: started, monitored, restarted, and ended with their parent."""
 
 import logging
 import os
@@ -14,14 +14,14 @@ from udrl_launch.paths import STARTED_IN, environment_of_children
 
 log = logging.getLogger("udrl")
 
-#: Exit codes that starting again would only repeat (``docs/operations-reference.md``).
+#: Exit codes that a restart would only repeat (``docs/operations.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
-#: A child that ended so often, and whose work did not get on meanwhile, is given up.
+#: A child is given up after this many deaths without progress in between.
 _MOST_DEATHS = 6
-#: Bytes of a child's log, of which a quarter is kept.
+#: Bytes of a child's log after which only the last quarter is kept.
 _LONGEST_LOG = 1 << 20
-#: Seconds that services have to end after the run has ended or after SIGTERM.
+#: Seconds for services to end after the run has ended or after SIGTERM.
 END_S = 4.0
 
 
@@ -30,12 +30,12 @@ class Child:
     """A service in a process of its own.
 
     Attributes:
-        name: for logs, and the name of its log file.
-        arguments: of the ``udrl`` command.
+        name: for logs and for its log file.
+        arguments: arguments of the ``udrl`` command.
         prefix: another program, with its arguments, that runs it, e.g. in a container.
         starts: how often it was started.
-        deaths: since its work last got on.
-        work: how far that was then.
+        deaths: how often it died since it last made progress.
+        work: its progress at its last death.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Child:
                 [
                     *self.prefix,
                     sys.executable,
-                    "-P",  # a file of the user's must not stand before a module of Python's
+                    "-P",  # a file of the user must not shadow a module of Python
                     "-m",
                     "udrl_launch",
                     *self.arguments,
@@ -68,27 +68,27 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                process_group=0,  # a Ctrl-C at the terminal is the parent's to handle
+                process_group=0,  # the parent handles Ctrl-C in the terminal
             )
 
     def last_words(self) -> str:
-        """Return the end of its log, as far as nobody has removed it."""
+        """Return the end of its log, unless the log was removed."""
         if not self.log_file.exists():
             return f"{self.log_file} is gone"
         return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
 
     def shorten_log(self) -> None:
-        """Keep the end of a log that has become long: environments may print without end."""
+        """Shorten a log that has become long: environments may print without limit."""
         if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
             end = _end_of(self.log_file, _LONGEST_LOG // 4)
-            # The child appends, so it goes on behind whatever is there.
+            # The child opened the file for appending, so it continues after this.
             with self.log_file.open("r+", encoding="utf-8") as log_file:
                 log_file.truncate(0)
-                log_file.write(f"... what stood here was dropped\n{end}")
+                log_file.write(f"... earlier output was removed\n{end}")
 
 
 def _end_of(file: Path, size: int) -> str:
-    """Return the last so many bytes of a file, without the line that they begin in."""
+    """Return the last ``size`` bytes of a file, without an incomplete first line."""
     with file.open("rb") as opened:
         length = opened.seek(0, os.SEEK_END)
         opened.seek(max(0, length - size))
@@ -96,11 +96,11 @@ def _end_of(file: Path, size: int) -> str:
     return end if length <= size else end.partition("\n")[2]
 
 
-#: What ends a process from outside, and what it usually means.
+#: Signals that end a process, and their usual meaning.
 _SIGNALS = {
-    signal.SIGKILL: "somebody killed it, or memory ran out",
+    signal.SIGKILL: "killed, or out of memory",
     signal.SIGSEGV: "a crash in native code",
-    signal.SIGABRT: "native code gave up",
+    signal.SIGABRT: "native code aborted",
     signal.SIGBUS: "a crash in native code, or a full disk behind shared memory",
     signal.SIGILL: "native code for another processor",
     signal.SIGFPE: "native code divided by zero",
@@ -108,7 +108,7 @@ _SIGNALS = {
 
 
 def how_it_ended(code: int) -> str:
-    """Say how a process ended; ``code`` as :class:`subprocess.Popen` has it."""
+    """Describe how a process ended; ``code`` is that of :class:`subprocess.Popen`."""
     if code >= 0:
         return f"ended with code {code}"
     try:
@@ -122,15 +122,15 @@ def how_it_ended(code: int) -> str:
 class Supervisor:
     """Keeps children running until they are done.
 
-    The first child is what the others work for: when it has ended well, nobody is started again,
-    and the others get a few seconds to end too.
+    When the first child has ended without an error, no child is restarted any more, and the others
+    get a few seconds to end too.
 
     Args:
-        log_dir: where their output goes, a file each.
+        log_dir: folder for their logs, one file each.
 
     Attributes:
-        work: how far the children of each role are (``actor``: episodes, ``learner``: versions):
-            who dies again and again while that stands still is given up, however slowly it dies.
+        work: progress of the children of each role (``actor``: episodes, ``learner``: versions). A
+            child that keeps dying without progress is given up, no matter how slowly it dies.
     """
 
     def __init__(self, log_dir: Path) -> None:
@@ -147,10 +147,10 @@ class Supervisor:
         self.children.append(child)
 
     def check(self) -> None:
-        """Start again what has died; call it now and then.
+        """Restart children that died; to be called regularly.
 
         Raises:
-            RunFailed: a child ended in a way that it would end again.
+            RunFailed: a child ended in a way that a restart would only repeat.
         """
         for child in self.children:
             assert child.process is not None
@@ -170,7 +170,7 @@ class Supervisor:
             child.deaths = 1 if work != child.work else child.deaths + 1
             child.work = work
             if code in FINAL_CODES or child.deaths >= _MOST_DEATHS:
-                often = "" if code in FINAL_CODES else f" {child.deaths} times without getting on"
+                often = "" if code in FINAL_CODES else f" {child.deaths} times without progress"
                 failure = RunFailed(
                     f"{child.name} {how_it_ended(code)}{often}:\n{child.last_words()}"
                 )
@@ -181,13 +181,13 @@ class Supervisor:
 
     @property
     def done(self) -> bool:
-        """Whether all children have ended, or the first has and the others had their time."""
+        """Whether all children have ended, or the first has and the grace period is over."""
         if self._first_done is not None and time.monotonic() - self._first_done > END_S:
             return True
         return all(child.done for child in self.children)
 
     def end(self) -> None:
-        """End all children: SIGTERM, and SIGKILL for who does not listen."""
+        """End all children with SIGTERM, then those that remain with SIGKILL."""
         processes = [c.process for c in self.children if c.process is not None]
         for process in processes:
             if process.poll() is None:

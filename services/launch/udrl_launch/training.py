@@ -1,4 +1,4 @@
-"""``udrl train``: all services on this machine, from the first episode to the last evaluation."""
+"""``udrl train``: all services on this machine, until the final evaluation."""
 
 import logging
 import shlex
@@ -31,15 +31,15 @@ log = logging.getLogger("udrl")
 
 
 class Watcher(Protocol):
-    """Who is shown how a run is doing while it goes on."""
+    """Observes the status of a run."""
 
     def show(self, status: Status) -> None:
-        """Take note of a status; called about twice a second."""
+        """Receive a status; called about twice a second."""
         ...
 
 
 class Watchers:
-    """Several watchers, and the last status that they were shown.
+    """Several watchers, and the last status that they received.
 
     Args:
         clock: seconds.
@@ -52,38 +52,38 @@ class Watchers:
         self._shown_at = 0.0
 
     def add(self, watcher: Watcher) -> None:
-        """Let one more watch."""
+        """Add a watcher."""
         self._watchers.append(watcher)
 
     def show(self, status: Status) -> None:
-        """Show all of them a status."""
+        """Pass a status to all watchers."""
         self._latest, self._shown_at = status, self._clock()
         for watcher in self._watchers:
             watcher.show(status)
 
     def latest(self) -> Status | None:
-        """Return the last status that was shown; None: none, or not for some seconds."""
+        """Return the last status; None if there was none in the last few seconds."""
         return self._latest if self._clock() - self._shown_at < _STALE_S else None
 
 
 class Adviser:
-    """Warns once, as soon as a run does not learn."""
+    """Warns once if a run does not learn."""
 
     def __init__(self) -> None:
         self._has_warned = False
 
     def show(self, status: Status) -> None:
-        """Take note of a status."""
+        """Receive a status."""
         if status.advice and not self._has_warned:
             log.warning("%s", status.advice)
             self._has_warned = True
 
 
-#: Seconds after which a status says nothing of now.
+#: Seconds after which a status is stale.
 _STALE_S = 10.0
-#: Seconds between two looks at the processes, and at what they do.
+#: Seconds between checks of the processes, and between status requests.
 _CHECK_S, _POLL_S = 0.1, 0.5
-#: Seconds that freshly started services get until the replay service answers.
+#: Seconds for the replay service to answer after the start.
 _START_S = 60.0
 
 
@@ -104,20 +104,20 @@ def train(
     """Train an agent and return the final status of its run.
 
     Args:
-        settings: what to train, how far, with how many actors.
+        settings: the run's settings, budget and parallelism.
         run_dir: the run's directory.
         stop: ends the training early; the run can be resumed.
-        go_on: go on with the run in ``run_dir`` if there is one.
-        in_process: all services in this process, as threads; else a process each.
+        go_on: resume the run in ``run_dir`` if there is one.
+        in_process: run all services as threads of this process, not as processes.
         allow_inexact: accept actors of other numerics classes.
-        listen: the endpoint of the run; None: a free port of the loopback interface.
+        listen: the endpoint of the run. None: a free port of the loopback interface.
         insecure: allow ``listen`` to be beyond loopback without keys.
-        keys: folder with the keys of all roles (``udrl keys create``); None: nobody is asked.
-        audit: share of the episodes that a second actor makes again, 0 to 1.
-        watcher: is shown the progress.
+        keys: folder with the keys of all roles (``udrl keys create``). None: no authentication.
+        audit: share of the episodes that a second actor repeats, 0 to 1.
+        watcher: receives the status.
 
     Raises:
-        UdrlError: the run cannot be started or cannot go on.
+        UdrlError: the run cannot be started or cannot continue.
         Interrupted: ``stop`` was set.
     """
     require_torch()
@@ -149,7 +149,7 @@ def train(
         services.end()
     if stop.is_set():
         raise Interrupted(
-            "stopped; go on with: "
+            "stopped; resume with: "
             + shlex.join(
                 [
                     "udrl",
@@ -190,7 +190,7 @@ def _watch(
 
 
 class _GiveUp(threading.Event):
-    """Set when the user stops the run or a service fails: ends waits for an answer."""
+    """Set when the user stops the run or a service fails, to end waits for an answer."""
 
     def __init__(self, services: Local, stop: threading.Event) -> None:
         super().__init__()
@@ -206,7 +206,7 @@ class _GiveUp(threading.Event):
 
 
 def free_port() -> int:
-    """Return a port of the loopback interface that nobody listens on now."""
+    """Return a free port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

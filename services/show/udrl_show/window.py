@@ -8,8 +8,8 @@ from udrl.rollout import Rollout
 from udrl_show.film import Picture
 
 KEYS_HELP = (
-    "space: pause and go on; right: one step; up, down: ask for more, for less; page up, "
-    "page down: in more steps, in fewer; g: greedy and back; q: quit"
+    "space = pause; right = one step; up/down = desired return; page up/page down = desired "
+    "horizon; g = greedy; q = quit"
 )
 
 _LEAST_WIDTH = 480

@@ -15,12 +15,14 @@ from udrl_launch.settings import gather
 
 @click.command()
 @click.argument("env")
-@click.option("--config", "file", type=FILE, metavar="FILE", help="Settings from a TOML file.")
-@click.option("--set", "assignments", multiple=True, metavar="HYPERPARAMETER=VALUE",
-              help="Set any setting; may be repeated.")  # fmt: skip
+@click.option("--config", "file", type=FILE, metavar="FILE", help="Read settings from a TOML file.")
+@click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+              help="Set any setting, e.g. --set batch_size=512. May be repeated.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bool) -> int:
-    """Check an environment: whether it can be trained on, what it is like, and how fast.
+    """Check whether an environment can be trained on.
+
+    Also reports its spaces, random returns, speed and memory, and the settings chosen for it.
 
     Example: udrl check your_package.your_module:YourEnv-v0
     """
@@ -34,19 +36,19 @@ def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bo
     given = [f"--set={assignment}" for assignment in assignments]
     given += ["--config", shown(file)] if file else []
     click.echo(
-        f"{'verdict':<13} it can be trained on: {shlex.join(['udrl', 'train', env, *given])}"
+        f"{'verdict':<13} supported; train with: {shlex.join(['udrl', 'train', env, *given])}"
     )
     return 0
 
 
 def _lines(found: Check) -> list[tuple[str, str]]:
-    limit = f"{found.max_episode_steps:,} steps at most"
+    limit = f"at most {found.max_episode_steps:,} steps"
     if found.max_return is not None:
-        limit += f", a return of {found.max_return:g} at most"
+        limit += f", return at most {found.max_return:g}"
     lines = [
         ("environment", found.environment),
-        ("observations", f"{found.declared_observations}; seen as {found.observations}"),
-        ("actions", f"{found.declared_actions}; seen as {found.actions}"),
+        ("observations", f"{found.declared_observations}; read as {found.observations}"),
+        ("actions", f"{found.declared_actions}; read as {found.actions}"),
         ("episodes", limit),
         (
             "at random",
@@ -56,15 +58,15 @@ def _lines(found: Check) -> list[tuple[str, str]]:
         ("repeats", "yes, from its seed" if found.repeats else "NO"),
         (
             "speed",
-            f"{1 / found.step_s:,.0f} steps/s in one process; a reset takes "
-            f"{1000 * found.reset_s:.3g} ms, making one {found.make_s:.2g} s",
+            f"{1 / found.step_s:,.0f} steps/s in one process; reset "
+            f"{1000 * found.reset_s:.3g} ms, creation {found.make_s:.2g} s",
         ),
         (
             "size",
-            f"{found.step_bytes:,} bytes a step; about {found.memory_mib:g} MiB an environment",
+            f"{found.step_bytes:,} bytes per step; about {found.memory_mib:g} MiB per environment",
         ),
     ]
     if found.chosen:
         chosen = ", ".join(f"{name} = {value}" for name, value in found.chosen.items())
-        lines.append(("settings", f"{chosen}, by what random episodes show"))
+        lines.append(("settings", f"{chosen} (chosen from random episodes)"))
     return lines + [("advice", sentence) for sentence in found.advice]

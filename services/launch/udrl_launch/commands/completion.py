@@ -7,9 +7,9 @@ from click.shell_completion import get_completion_class
 @click.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> int:
-    """Print what makes a shell complete udrl's commands, options and run directories.
+    """Print a shell completion script.
 
-    Evaluate it where your shell starts, e.g. in ~/.bashrc: eval "$(udrl completion bash)"
+    Add this to your shell's startup file, e.g. ~/.bashrc: eval "$(udrl completion bash)"
 
     Example: udrl completion bash
     """

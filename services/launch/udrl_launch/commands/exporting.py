@@ -15,22 +15,22 @@ from udrl_launch.commands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
 @click.argument("run_dir", type=RUN_DIR)
 @click.option(
     "--folder", type=FOLDER, metavar="DIR",
-    help="The agent for udrl.load(DIR): weights, settings, and a model card.",
+    help="Write the agent for udrl.load(DIR): weights, settings and a model card.",
 )  # fmt: skip
 @click.option(
     "--onnx", type=FILE, metavar="FILE",
-    help="The agent as an ONNX model; inputs: observation and command (desired return, desired "
-    "horizon); output: logits.",
+    help="Write the agent as an ONNX model. Inputs: observation and command (desired return, "
+    "desired horizon). Output: logits.",
 )  # fmt: skip
 @click.option(
     "--minari", metavar="NAME",
-    help="The replay buffer as a Minari dataset, e.g. LunarLander/mine-v0.",
+    help="Write the replay buffer as a Minari dataset, e.g. LunarLander/mine-v0.",
 )  # fmt: skip
 @WEIGHTS
 def export(
     run_dir: Path, folder: Path | None, onnx: Path | None, minari: str | None, weights: str
 ) -> int:
-    """Hand on a run's agent and its episodes, in the formats of others.
+    """Export a run's agent or its episodes.
 
     Example: udrl export runs/mine --folder my-agent --onnx my-agent.onnx
     """
@@ -46,8 +46,9 @@ def export(
         click.echo(f'folder: {folder}; in Python: udrl.load("{folder}")')
         if kept_of(agent, run_dir) is None:
             click.echo(
-                "The model card does not say which returns this agent obtains when commanded. "
-                f"Measure it, and export again: udrl obedience {run_dir} --weights {agent.version}",
+                "The model card does not say which returns this agent can be asked for. Measure "
+                "them and export again, with: "
+                f"udrl obedience {run_dir} --weights {agent.version}",
                 err=True,
             )
     if onnx is not None:

@@ -1,4 +1,4 @@
-"""``udrl health``: whether a service does its work, for those who start and restart services."""
+"""``udrl health``: whether a service is alive, for process managers and container checks."""
 
 from pathlib import Path
 
@@ -17,19 +17,20 @@ _ANSWER_S = 3.0
 @click.command()
 @click.argument("role", type=click.Choice([REPLAY, "learner", "actor"]))
 @click.option("--connect", metavar="ENDPOINT", required=True,
-              help="Where the run is, e.g. tcp/127.0.0.1:7447.")  # fmt: skip
+              help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")  # fmt: skip
 @KEYS
 @PATIENCE
 @RUN
 def health(role: str, connect: str, keys: Path | None, patience: float, run_id: str | None) -> int:
-    """Ask whether the replay service answers, or whether a learner or actor of this machine is in.
+    """Check whether a service is alive.
 
-    Exit code 0: it is. 6: it is not.
+    The replay service must answer; a learner or actor of this machine must take part in the run.
+    The exit code is 0 if so, else 6.
 
     Example: udrl health actor --connect tcp/127.0.0.1:7447
     """
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
-    # A replay service has no key to ask itself with; it is asked whether the endpoint answers.
+    # The replay service has no key as a client; an observer checks that its endpoint answers.
     with connected("observer" if role == REPLAY else role, address) as (transport, hello):
         if role == REPLAY:
             click.echo(f"run {hello.run_id} answers at {connect}")

@@ -1,4 +1,4 @@
-"""``udrl keys``: making the keys that services prove their roles with."""
+"""``udrl keys``: TLS keys for the services of a run."""
 
 from datetime import timedelta
 from pathlib import Path
@@ -11,7 +11,7 @@ from udrl_proto.access import ROLES
 
 @click.group()
 def keys() -> None:
-    """Make the keys that services prove their roles with.
+    """Create TLS keys for the services of a run.
 
     Example: udrl keys create keys --host replay.example.org
     """
@@ -20,17 +20,17 @@ def keys() -> None:
 @keys.command()
 @click.argument("directory", type=click.Path(path_type=Path), metavar="DIR")
 @click.option("--host", "hosts", multiple=True, metavar="NAME",
-              help="Name or IP address by which others reach the replay service; may be repeated. "
-              "localhost, 127.0.0.1 and ::1 are always among them.")  # fmt: skip
-@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True,
-              help="How long the keys are valid.")  # fmt: skip
+              help="Host name or IP address of the replay service. May be repeated. localhost, "
+              "127.0.0.1 and ::1 are always included.")  # fmt: skip
+@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True, metavar="N",
+              help="Validity in days.")  # fmt: skip
 @click.option(
     "--if-missing",
     is_flag=True,
-    help="Do nothing if the keys are there, valid, and good for every --host.",
+    help="Do nothing if DIR has valid keys for every --host.",
 )
 def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool) -> int:
-    """Make an authority of your own, and a folder with key and certificate for each role.
+    """Create a certificate authority, and a key and certificate for each role.
 
     Example: udrl keys create keys --host replay.example.org
     """
@@ -38,13 +38,13 @@ def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool)
         from udrl_launch import authority
     except ModuleNotFoundError as error:
         raise ConfigError(
-            'making keys needs cryptography; install it with: pip install "udrl[secure]"'
+            'creating keys needs cryptography; install it with: pip install "udrl[secure]"'
         ) from error
     if if_missing and authority.are_there(directory, hosts):
-        click.echo(f"{directory} holds keys for every role already")
+        click.echo(f"{directory} already has keys for every role")
         return 0
     authority.create(directory, hosts, timedelta(days))
     for role in ROLES:
-        click.echo(f"{directory / role}: for the machines of {role}")
-    click.echo(f"{directory / authority.AUTHORITY}: stays here; who has it can make keys for all")
+        click.echo(f"{directory / role}: copy to machines with the role {role}")
+    click.echo(f"{directory / authority.AUTHORITY}: stays here; it can issue keys for every role")
     return 0

@@ -1,4 +1,4 @@
-"""``udrl evaluate``, ``udrl reproduce``, ``udrl status``: looking at a run."""
+"""``udrl evaluate``, ``udrl reproduce`` and ``udrl status``."""
 
 import traceback
 from pathlib import Path
@@ -11,9 +11,10 @@ from udrl_inspect import agents, inspection
 from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
     CONNECT,
+    DESIRED_HORIZON,
+    DESIRED_RETURN,
     GREEDY,
     KEYS,
-    RETURN,
     RUN,
     RUN_DIR,
     TEMPERATURE,
@@ -29,14 +30,14 @@ from udrl_show.display import panel
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=100, show_default=True,
-              help="Episodes to run.")  # fmt: skip
+              metavar="N", help="Number of episodes.")  # fmt: skip
 @TEMPERATURE
 @GREEDY
-@click.option("--desired-return", type=RETURN, help="Default: as in section 2.3.6.")
-@click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), help="Default: likewise.")
+@DESIRED_RETURN
+@DESIRED_HORIZON
 @WEIGHTS
-@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True,
-              help="Environments at once; 1 where a simulator runs only once.")  # fmt: skip
+@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True, metavar="N",
+              help="Environments to step at once; 1 if only one copy can run.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def evaluate(
     run_dir: Path,
@@ -49,7 +50,9 @@ def evaluate(
     envs: int,
     as_json: bool,
 ) -> int:
-    """Evaluate a trained agent, with the run's command or one of your own.
+    """Evaluate a trained agent.
+
+    Reports the mean return for the command of the run's evaluations, or for one of your own.
 
     Example: udrl evaluate runs/mine --desired-return 200 --desired-horizon 300
     """
@@ -72,7 +75,7 @@ def evaluate(
         return 0
     found = result.evaluation
     click.echo(
-        f"commanded return {return_text(result.desired_return)} within "
+        f"desired return {return_text(result.desired_return)} within "
         f"{result.desired_horizon} steps, "
         f"temperature {result.temperature:g}, weights version {agent.version}: mean return "
         f"{return_text(found.mean)} (95 % interval {return_text(found.ci95_low)} to "
@@ -86,7 +89,9 @@ def evaluate(
 @click.argument("run_dir", type=RUN_DIR)
 @click.argument("command_id", type=click.IntRange(0))
 def reproduce(run_dir: Path, command_id: int) -> int:
-    """Carry out one outstanding command of a run here, to see why it fails.
+    """Run one outstanding command of a run to debug a failure.
+
+    Executes it in this process and prints the traceback. The run is not changed.
 
     Example: udrl reproduce runs/mine 12000003
     """
@@ -96,8 +101,8 @@ def reproduce(run_dir: Path, command_id: int) -> int:
         traceback.print_exception(fault.__cause__)
         raise
     click.echo(
-        f"command {command_id} gave an episode of {episode.length} steps with return "
-        f"{episode.episode_return}; nothing was changed"
+        f"command {command_id}: episode of {episode.length} steps with return "
+        f"{episode.episode_return}; the run was not changed"
     )
     return 0
 
@@ -111,7 +116,9 @@ def reproduce(run_dir: Path, command_id: int) -> int:
 def status(
     run_dir: Path | None, connect: str | None, as_json: bool, keys: Path | None, run_id: str | None
 ) -> int:
-    """Say how a run is doing, by its directory or its endpoint.
+    """Show the status of a run.
+
+    Pass either RUN_DIR or --connect ENDPOINT.
 
     Example: udrl status runs/mine
     """

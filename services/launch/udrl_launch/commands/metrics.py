@@ -20,9 +20,9 @@ from udrl_show.prometheus import Exporter
 @click.argument("run_dir", type=RUN_DIR, required=False)
 @CONNECT
 @click.option("--port", type=click.IntRange(0, 65_535), default=9464, show_default=True,
-              help="Where Prometheus asks; 0: any that is free.")  # fmt: skip
+              metavar="PORT", help="Port to serve metrics on; 0 = any free port.")  # fmt: skip
 @click.option("--host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
-              help="Where Prometheus may ask; everybody who reaches it may read.")  # fmt: skip
+              help="Address to serve metrics on, without authentication.")  # fmt: skip
 @KEYS
 @RUN
 def metrics(
@@ -33,7 +33,9 @@ def metrics(
     keys: Path | None,
     run_id: str | None,
 ) -> int:
-    """Tell Prometheus how a run is doing, until stopped.
+    """Export metrics of a run to Prometheus.
+
+    Serves them over HTTP until stopped. Pass either RUN_DIR or --connect ENDPOINT.
 
     Example: udrl metrics --connect tcp/127.0.0.1:7447 --port 9464
     """
@@ -52,4 +54,4 @@ def _ask(where: Path | Address, keys: Path | None) -> Status | None:
     try:
         return status_from(where, keys)
     except UdrlError:
-        return None  # Prometheus is told that the run does not answer
+        return None  # reported as udrl_up 0

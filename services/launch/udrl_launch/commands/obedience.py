@@ -30,22 +30,22 @@ _NAME = Path(reports.FILE)
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
 @click.option("--episodes", type=click.IntRange(2, 100_000), default=100, show_default=True,
-              help="Episodes for each command.")  # fmt: skip
+              metavar="N", help="Episodes per command.")  # fmt: skip
 @click.option("--points", type=click.IntRange(2, 101), default=11, show_default=True,
-              help="Commanded returns, and commanded horizons.")  # fmt: skip
+              metavar="N", help="Number of desired returns, and of desired horizons.")  # fmt: skip
 @click.option("--desired-returns", type=RETURNS, metavar="LOW:HIGH",
-              help="Returns to command. Default: those of the replay buffer's episodes, the "
-              "lowest 5 % left out.")  # fmt: skip
-@click.option("--tolerance", type=click.FloatRange(0, 1e9),
-              help="How far a mean obtained return may be from its command where the agent obeys. "
-              "Default: 10 % of the range of the replay buffer's returns.")  # fmt: skip
+              help="Range of desired returns. Default: that of the replay buffer, without the "
+              "lowest 5 %.")  # fmt: skip
+@click.option("--tolerance", type=click.FloatRange(0, 1e9), metavar="NUMBER",
+              help="Largest difference between desired and mean obtained return that counts as "
+              "obeyed. Default: 10 % of the range of returns in the replay buffer.")  # fmt: skip
 @TEMPERATURE
 @GREEDY
 @WEIGHTS
 @click.option("--output", "-o", type=FILE, metavar="FILE",
-              help="The picture: .png, .svg or .pdf. Default: obedience.png in RUN_DIR, where "
+              help="Figure to write: .png, .svg or .pdf. Default: RUN_DIR/obedience.png, if "
               "matplotlib is installed.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the report as one JSON document.")
+@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def obedience(
     run_dir: Path,
     episodes: int,
@@ -58,7 +58,9 @@ def obedience(
     output: Path | None,
     as_json: bool,
 ) -> int:
-    """Measure which returns and horizons an agent delivers when they are commanded.
+    """Measure how well an agent follows its commands.
+
+    Asks for a range of returns and horizons, and reports what the agent obtains.
 
     Example: udrl obedience runs/mine
     """
@@ -98,10 +100,10 @@ def _keep(run_dir: Path, report: reports.Obedience, *, draws: bool) -> list[str]
             run_dir / _NAME.with_suffix(".csv"), obedience_text.Row, obedience_text.rows(report)
         )
     except (OSError, StoreError) as error:
-        return [f"the report is not kept in {run_dir}: {error}"]
+        return [f"the report cannot be written to {run_dir}: {error}"]
     try:
         if draws:
             draw(report, run_dir / _NAME.with_suffix(".png"))
     except ConfigError as error:
-        return [f"no picture: {error}"]
+        return [f"no figure: {error}"]
     return []

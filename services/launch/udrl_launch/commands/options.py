@@ -1,4 +1,4 @@
-"""Options that several commands have."""
+"""Options that several commands share."""
 
 import math
 import os
@@ -14,47 +14,61 @@ from udrl_inspect.address import Address
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 
-#: No return is beyond this.
+#: The largest absolute return that is accepted.
 _MOST = 1e9
 
 
 class _AbsolutePath(click.Path):
-    """A path that means the same wherever an environment goes to."""
+    """An absolute path, because an environment may change the working directory."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         if not str(value):
-            self.fail("'' is no path; name one, e.g. runs/mine", param, ctx)
+            self.fail("'' is not a path; expected e.g. runs/mine", param, ctx)
         return Path(os.fsdecode(super().convert(value, param, ctx))).absolute()
 
 
 FILE = _AbsolutePath(path_type=Path, dir_okay=False)
 FOLDER = _AbsolutePath(path_type=Path, file_okay=False)
 RUN_DIR = FOLDER
+RUN_DIR_OPTION = click.option(
+    "--run-dir", type=RUN_DIR, metavar="DIR",
+    help="Directory of the run. Default: a new one in ./runs.",
+)  # fmt: skip
+RESUME = click.option(
+    "--resume", is_flag=True, help="Resume the run in --run-dir, if there is one."
+)
+INSECURE = click.option(
+    "--insecure", is_flag=True, help="Allow listening beyond loopback without authentication."
+)
+ALLOW_INEXACT = click.option(
+    "--allow-inexact", is_flag=True,
+    help="Accept machines that round differently, and give up exact reproducibility.",
+)  # fmt: skip
 PARENT = click.option("--parent", type=int, hidden=True)
 PATIENCE = click.option("--patience", type=click.FloatRange(0), default=3.0, show_default=True,
-                         help="Seconds to look for the run.")  # fmt: skip
+                         metavar="SECONDS", help="How long to look for the run.")  # fmt: skip
 KEYS = click.option(
     "--keys", type=FOLDER, metavar="DIR",
-    help="Authenticate and encrypt with these keys (`udrl keys create DIR`); endpoints are then "
+    help="Use TLS with the keys in this directory (see `udrl keys create`). Endpoints are then "
     "tls/HOST:PORT.",
 )  # fmt: skip
 AUDIT = click.option(
     "--audit", type=click.FloatRange(0, 1), default=0.0, metavar="RATE",
-    help="Share of the episodes that a second actor makes again, to find out who lies.",
+    help="Share of episodes that a second actor repeats, to detect actors that deliver false ones.",
 )  # fmt: skip
 RUN = click.option(
-    "--run", "run_id", metavar="RUN_ID", help="Which run, where a router carries several."
+    "--run", "run_id", metavar="RUN_ID", help="Id of the run, if a router carries several."
 )
 METRICS_HOST = click.option(
     "--metrics-host", default="127.0.0.1", show_default=True, metavar="ADDRESS",
-    help="Where Prometheus may ask; everybody who reaches it may read.",
+    help="Address to serve metrics on, without authentication.",
 )  # fmt: skip
 
 
 def place(
     run_dir: Path | None, connect: str | None, run_id: str | None, keys: Path | None
 ) -> Path | Address:
-    """Return where a run is that a command looks at: its directory, or an address.
+    """Return the directory or the address of the run that a command inspects.
 
     Raises:
         ConfigError: neither or both are given, or the endpoint or the keys cannot be used.
@@ -73,22 +87,22 @@ CONNECT = click.option(
 )
 WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
-    help="Which of the versions that the run keeps.",
+    help="Weights version, among those that the run keeps.",
 )  # fmt: skip
 
 
 TEMPERATURE = click.option(
-    "--temperature", type=click.FloatRange(0, 1000),
-    help="Of the action distribution; 0: take its mode. Default: as the run's evaluations.",
+    "--temperature", type=click.FloatRange(0, 1000), metavar="NUMBER",
+    help="Sampling temperature; 0 = most likely action. Default: as in the run's evaluations.",
 )  # fmt: skip
 GREEDY = click.option(
     "--greedy", is_flag=True,
-    help="The same as --temperature 0. Agents that learned with sampled actions may do far worse.",
+    help="Same as --temperature 0. Agents trained with sampled actions may do much worse.",
 )  # fmt: skip
 
 
 class _Return(click.ParamType):  # type: ignore[type-arg]
-    """A return that can be asked for."""
+    """A desired return."""
 
     name = "float"
 
@@ -105,10 +119,18 @@ class _Return(click.ParamType):  # type: ignore[type-arg]
 
 
 RETURN = _Return()
+DESIRED_RETURN = click.option(
+    "--desired-return", type=RETURN, metavar="R",
+    help="Desired return. Default: as in the run's evaluations.",
+)  # fmt: skip
+DESIRED_HORIZON = click.option(
+    "--desired-horizon", type=click.IntRange(1, 2**31 - 1), metavar="H",
+    help="Desired horizon in steps. Default: as in the run's evaluations.",
+)  # fmt: skip
 
 
 class _Returns(click.ParamType):  # type: ignore[type-arg]
-    """A range of returns that can be asked for: ``-100:250``."""
+    """A range of desired returns: ``-100:250``."""
 
     name = "range"
 
@@ -151,7 +173,7 @@ def version(text: str) -> int | Literal["latest", "best"]:
     """Return what ``--weights`` says.
 
     Raises:
-        ConfigError: neither a word that it knows, nor a number.
+        ConfigError: it is neither ``latest`` nor ``best`` nor a number.
     """
     if text == "latest" or text == "best":
         return text  # type: ignore[return-value]

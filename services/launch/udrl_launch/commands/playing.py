@@ -8,9 +8,10 @@ from udrl.evaluation import return_text
 from udrl_inspect.agents import evaluation_commands, load_agent
 from udrl_inspect.greedy import caution
 from udrl_launch.commands.options import (
+    DESIRED_HORIZON,
+    DESIRED_RETURN,
     FILE,
     GREEDY,
-    RETURN,
     RUN_DIR,
     TEMPERATURE,
     WEIGHTS,
@@ -26,25 +27,23 @@ from udrl_show.window import KEYS_HELP, Window
 
 @click.command()
 @click.argument("run_dir", type=RUN_DIR)
-@click.option("--desired-return", type=RETURN, metavar="R", help="Default: as in section 2.3.6.")
-@click.option("--desired-horizon", type=click.IntRange(1, 2**31 - 1), metavar="H",
-              help="In how many steps. Default: likewise.")  # fmt: skip
+@DESIRED_RETURN
+@DESIRED_HORIZON
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=3, show_default=True,
-              help="Episodes to play.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1),
-              help="Of the first episode, one more for each that follows: command, weights and "
-              "seed decide an episode. Default: those of the run's closing "
-              "evaluation.")  # fmt: skip
+              metavar="N", help="Number of episodes.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), metavar="N",
+              help="Reset seed of the first episode; each further one adds 1. Default: the seeds "
+              "of the run's final evaluation.")  # fmt: skip
 @TEMPERATURE
 @GREEDY
 @WEIGHTS
 @click.option("--video", type=FILE, metavar="FILE",
-              help="Film them: FILE.mp4 or FILE.gif.")  # fmt: skip
+              help="Record a video: FILE.mp4 or FILE.gif.")  # fmt: skip
 @click.option(
     "--window", "opens_window", is_flag=True,
-    help=f"Watch, and change the command on the way. {KEYS_HELP.capitalize()}.",
+    help=f"Show the episodes in a window. Keys: {KEYS_HELP}.",
 )  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print a line of JSON for each episode.")
+@click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per episode.")
 def play(
     run_dir: Path,
     desired_return: float | None,
@@ -58,7 +57,9 @@ def play(
     opens_window: bool,
     as_json: bool,
 ) -> int:
-    """Give a trained agent an order, and watch.
+    """Play episodes with a command of your choice.
+
+    Prints the return of each, and can show them in a window or record a video.
 
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
@@ -73,12 +74,12 @@ def play(
         ),
         seed,
     )
-    told = commands[0]
+    command = commands[0]
     if not as_json:
         click.echo(
-            f"asked for a return of {return_text(told.desired_return)} within "
-            f"{told.desired_horizon} steps (temperature {told.temperature:g}, weights version "
-            f"{agent.version})"
+            f"desired return {return_text(command.desired_return)} within "
+            f"{command.desired_horizon} steps (temperature {command.temperature:g}, "
+            f"weights version {agent.version})"
         )
     screen = Window if opens_window else None
     obtained: list[float] = []
@@ -88,9 +89,9 @@ def play(
             report = {
                 "environment_seed": rollout.command.environment_seed,
                 "weights_version": agent.version,
-                "temperature": told.temperature,
-                "desired_return": told.desired_return,
-                "desired_horizon": told.desired_horizon,
+                "temperature": command.temperature,
+                "desired_return": command.desired_return,
+                "desired_horizon": command.desired_horizon,
                 "episode_return": rollout.episode_return,
                 "length": rollout.steps,
                 "terminated": rollout.terminated,
@@ -98,13 +99,13 @@ def play(
             }
             print_json(report)
         else:
-            ending = "" if rollout.terminated else ", cut by its time limit"
+            ending = "" if rollout.terminated else " (time limit reached)"
             click.echo(
-                f"seed {rollout.command.environment_seed}: obtained "
+                f"seed {rollout.command.environment_seed}: return "
                 f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
             )
-    if said := caution(agent, run_dir, told, obtained):
+    if said := caution(agent, run_dir, command, obtained):
         click.echo(said, err=True)
     if video is not None and not as_json:
-        click.echo(f"film: {shown(video)}")
+        click.echo(f"video: {shown(video)}")
     return 0

@@ -1,4 +1,4 @@
-"""``udrl runs`` and ``udrl plot``: all runs at once."""
+"""``udrl runs`` and ``udrl plot``: several runs at once."""
 
 import time
 from pathlib import Path
@@ -19,9 +19,11 @@ _HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path), default=Path("runs"))
-@click.option("--json", "as_json", is_flag=True, help="Print a line of JSON for each run.")
+@click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per run.")
 def runs(folder: Path, as_json: bool) -> int:
-    """List the runs in a folder (./runs), with their state and best return; the newest first.
+    """List runs, newest first.
+
+    Shows state and best return of the runs in FOLDER, which is ./runs by default.
 
     Example: udrl runs
     """
@@ -31,7 +33,7 @@ def runs(folder: Path, as_json: bool) -> int:
             print_json(summary)
         return 0
     if not found:
-        click.echo(f"no runs in {folder}; begin one: udrl train LunarLander-v3", err=True)
+        click.echo(f"no runs in {folder}; start one with: udrl train LunarLander-v3", err=True)
         return 0
     rows = [_HEAD, *([printable(cell) for cell in _cells(summary)] for summary in found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -60,14 +62,14 @@ def _cells(summary: Summary) -> tuple[str, ...]:
 @click.argument("run_dirs", metavar="RUN_DIR...", type=RUN_DIR, nargs=-1, required=True)
 @click.option("--output", "-o", type=FILE, metavar="FILE",
               default=Path("learning_curves.png"), show_default=True,
-              help="The picture: .png, .svg or .pdf.")  # fmt: skip
+              help="Figure to write: .png, .svg or .pdf.")  # fmt: skip
 @click.option("--x", type=click.Choice(["env_steps", "wall_s"]), default="env_steps",
-              show_default=True, help="What returns are drawn against.")  # fmt: skip
+              show_default=True, help="Quantity on the x-axis.")  # fmt: skip
 def plot(run_dirs: tuple[Path, ...], output: Path, x: Literal["env_steps", "wall_s"]) -> int:
-    """Draw the learning curves of several runs into one picture.
+    """Plot the learning curves of several runs.
 
     Example: udrl plot runs/one runs/other --output both.svg
     """
     curve.compare(run_dirs, output, x)
-    click.echo(f"picture: {output}")
+    click.echo(f"figure: {output}")
     return 0

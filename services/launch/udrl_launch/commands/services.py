@@ -1,4 +1,4 @@
-"""``udrl replay``, ``udrl learner``, ``udrl actor``: one service each."""
+"""``udrl replay``, ``udrl learner`` and ``udrl actor``: one service each."""
 
 import logging
 import os
@@ -13,7 +13,17 @@ import click
 from udrl.errors import ConfigError
 from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_launch.commands.options import AUDIT, KEYS, PARENT, PATIENCE, RUN, RUN_DIR
+from udrl_launch.commands.options import (
+    ALLOW_INEXACT,
+    AUDIT,
+    INSECURE,
+    KEYS,
+    PARENT,
+    PATIENCE,
+    RESUME,
+    RUN,
+    RUN_DIR_OPTION,
+)
 from udrl_launch.commands.settings import gather_settings, settings_options
 from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import (
@@ -42,14 +52,15 @@ def _as_service(parent: int | None, service: Callable[[threading.Event], None]) 
 @click.argument("env")
 @settings_options
 @click.option(
-    "--listen", metavar="ENDPOINT", help="Host the run's Zenoh endpoint, e.g. tcp/127.0.0.1:7447."
+    "--listen", metavar="ENDPOINT", help="Endpoint to listen on, e.g. tcp/127.0.0.1:7447."
 )
-@click.option("--connect", metavar="ENDPOINT", help="Use the router at this endpoint instead.")
-@click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
-@click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
-@click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@click.option("--connect", metavar="ENDPOINT",
+              help="Endpoint of an existing Zenoh router, instead of --listen.")  # fmt: skip
+@RUN_DIR_OPTION
+@RESUME
+@INSECURE
 @KEYS
-@click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@ALLOW_INEXACT
 @AUDIT
 @PARENT
 def replay(
@@ -65,7 +76,9 @@ def replay(
     parent: int | None,
     **given: Any,
 ) -> int:
-    """Start the replay service of a run: the only store, and its Zenoh endpoint.
+    """Start the replay service of a run.
+
+    It stores the run, and is what learner and actors connect to.
 
     Example: udrl replay LunarLander-v3 --listen tcp/127.0.0.1:7447 --run-dir runs/mine
     """
@@ -77,7 +90,7 @@ def replay(
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
 
     def service(stop: threading.Event) -> None:
-        log.info("the run's directory is %s", shown(run_dir))
+        log.info("run directory: %s", shown(run_dir))
         store = roles.open_run(
             run_dir, settings, go_on=resume, allow_inexact=allow_inexact, listen=listen,
             insecure=insecure, secure=keys is not None, check_environment=parent is None,
@@ -95,7 +108,7 @@ def replay(
     "--connect",
     metavar="ENDPOINT",
     required=True,
-    help="Where the run is, e.g. tcp/127.0.0.1:7447.",
+    help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.",
 )
 @KEYS
 @PATIENCE
@@ -105,6 +118,8 @@ def learner(
     connect: str, keys: Path | None, patience: float, run_id: str | None, parent: int | None
 ) -> int:
     """Start the learner of a run.
+
+    It trains the agent, and gets all settings from the run.
 
     Example: udrl learner --connect tcp/127.0.0.1:7447
     """
@@ -118,15 +133,17 @@ def learner(
     "--connect",
     metavar="ENDPOINT",
     required=True,
-    help="Where the run is, e.g. tcp/127.0.0.1:7447.",
+    help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.",
 )
-@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True,
+@click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True, metavar="N",
               help="Environments to step at once.")  # fmt: skip
-@click.option("--nice", type=click.IntRange(0, 19), default=0, help="Yield to other processes.")
+@click.option("--nice", type=click.IntRange(0, 19), default=0, show_default=True, metavar="N",
+              help="Niceness of the process, to yield to others.")  # fmt: skip
 @click.option("--hang-timeout", type=click.FloatRange(1), default=60.0, show_default=True,
-              help="Seconds of one round of steps after which the process ends.")  # fmt: skip
-@click.option("--first-index", type=click.IntRange(0), default=0, show_default=True,
-              help="Of its first environment, for simulators that need a port.")  # fmt: skip
+              metavar="SECONDS",
+              help="Exit if one round of environment steps takes longer than this.")  # fmt: skip
+@click.option("--first-index", type=click.IntRange(0), default=0, show_default=True, metavar="N",
+              help="Index of its first environment, for simulators that need a port.")  # fmt: skip
 @KEYS
 @PATIENCE
 @RUN
@@ -142,7 +159,9 @@ def actor(
     run_id: str | None,
     parent: int | None,
 ) -> int:
-    """Start an actor; the run tells it everything else.
+    """Start an actor for a run.
+
+    It runs episodes, and gets all settings from the run.
 
     Example: udrl actor --connect tcp/127.0.0.1:7447 --envs 16
     """

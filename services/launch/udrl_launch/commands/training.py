@@ -10,7 +10,15 @@ import click
 
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
-from udrl_launch.commands.options import AUDIT, KEYS, METRICS_HOST, RUN_DIR
+from udrl_launch.commands.options import (
+    ALLOW_INEXACT,
+    AUDIT,
+    INSECURE,
+    KEYS,
+    METRICS_HOST,
+    RESUME,
+    RUN_DIR_OPTION,
+)
 from udrl_launch.commands.settings import gather_settings, settings_options
 from udrl_launch.output import print_json
 from udrl_launch.paths import new_run_dir, shown
@@ -32,30 +40,31 @@ log = logging.getLogger("udrl")
 @click.command()
 @click.argument("env")
 @settings_options
-@click.option("--actors", type=int, help="Actor processes on this machine.")
-@click.option("--envs-per-actor", type=int, help="Environments that each actor steps at once.")
-@click.option("--hang-timeout", type=click.FloatRange(1),
-              help="Seconds of one round of steps after which an actor is started again.  "
-              "[default: 60]")  # fmt: skip
-@click.option("--run-dir", type=RUN_DIR, help="The run's directory. Default: a new one in ./runs.")
-@click.option("--resume", is_flag=True, help="Go on with the run in --run-dir, if there is one.")
-@click.option("--in-process", is_flag=True, help="All services in one process.")
+@click.option("--actors", type=int, metavar="N", help="Actor processes on this machine.")
+@click.option("--envs-per-actor", type=int, metavar="N",
+              help="Environments that each actor steps at once.")  # fmt: skip
+@click.option("--hang-timeout", type=click.FloatRange(1), metavar="SECONDS",
+              help="Restart an actor if one round of environment steps takes longer than this. "
+              "Default: 60.")  # fmt: skip
+@RUN_DIR_OPTION
+@RESUME
+@click.option("--in-process", is_flag=True, help="Run all services in one process.")
 @click.option(
     "--listen",
     metavar="ENDPOINT",
-    help="Endpoint, e.g. tcp/127.0.0.1:7447. Default: a free loopback port.",
+    help="Endpoint to listen on, e.g. tcp/127.0.0.1:7447. Default: a free loopback port.",
 )
-@click.option("--insecure", is_flag=True, help="Listen beyond loopback without authentication.")
+@INSECURE
 @KEYS
-@click.option("--allow-inexact", is_flag=True, help="Accept actors that round differently.")
+@ALLOW_INEXACT
 @AUDIT
-@click.option("--tensorboard", is_flag=True, help="Write event files into RUN_DIR/tensorboard.")
+@click.option("--tensorboard", is_flag=True,
+              help="Write TensorBoard event files to RUN_DIR/tensorboard.")  # fmt: skip
 @click.option("--metrics-port", type=click.IntRange(0, 65_535), metavar="PORT",
-              help="Tell Prometheus how the run is doing at this port.")  # fmt: skip
+              help="Serve metrics for Prometheus on this port; 0 = any free port.")  # fmt: skip
 @METRICS_HOST
-@click.option(
-    "--json", "as_json", is_flag=True, help="End with the final status as a line of JSON."
-)
+@click.option("--json", "as_json", is_flag=True,
+              help="Print the final status as one line of JSON.")  # fmt: skip
 def train(
     env: str,
     run_dir: Path | None,
@@ -72,12 +81,14 @@ def train(
     as_json: bool,
     **given: Any,
 ) -> int:
-    """Train an agent on this machine: replay, learner and actors.
+    """Train an agent on this machine.
+
+    Starts a replay service, a learner and actors, and restarts those that die.
 
     Example: udrl train LunarLander-v3 --max-env-steps 2M --seed 7
     """
     if resume and run_dir is None:
-        raise ConfigError("--resume needs --run-dir: the directory of the run to go on with")
+        raise ConfigError("--resume needs --run-dir, the directory of the run to resume")
     settings = gather_settings(env, given, run_dir, go_on=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
     log_to_stderr(logging.WARNING)
@@ -110,7 +121,7 @@ def train(
 
 
 def warn_of_idle_environments(settings: Settings) -> None:
-    """Warn if somebody asked for more environments than exploring can keep busy."""
+    """Warn if there are far more environments than exploration can keep busy."""
     config, _, fleet, left_open = settings
     if "n_episodes_per_iter" in left_open:
         return
@@ -125,7 +136,7 @@ def warn_of_idle_environments(settings: Settings) -> None:
 
 
 def _finish(run_dir: Path, status: Status) -> None:
-    """Write the weights and the picture, and say where everything is."""
+    """Draw the learning curve, and print the result and the paths of all files."""
     closing = status.closing_evaluation
     if not status.problem:
         click.echo(f"ended:          {status.ended_because}")
