@@ -1,12 +1,12 @@
-"""Settings: what a run is (:class:`Config`) and how far it goes (:class:`Budget`).
+"""Settings of a run (:class:`Config`) and its stopping criteria (:class:`Budget`).
 
-A run is a function of its :class:`Config`, which holds the paper's hyperparameters (Table 2) under
-the paper's names, the architecture, and the few choices that the paper leaves open. The
-:class:`Budget` says when to stop and may be changed when a run is resumed.
+A run is a function of its :class:`Config`: the paper's hyperparameters (Table 2) under the paper's
+names, the network, and the choices that the paper leaves open. The :class:`Budget` may change when
+a run is resumed.
 
-A ``Config`` is grouped (:mod:`udrl.setting_groups`), and flat outside: in files, on the command
-line, in messages and in stores every setting has a name of its own and no group (:func:`flat`,
-:func:`build`, :func:`change`).
+A ``Config`` has its settings in groups (:mod:`udrl.setting_groups`). Everywhere else, in files, on
+the command line, in messages and in stores, settings are flat: a unique name each, and no groups
+(:func:`flat`, :func:`build`, :func:`change`).
 """
 
 import difflib
@@ -35,14 +35,14 @@ from udrl.setting_groups import (
 )
 
 KeywordValue = bool | int | float | str
-# Lists and tables of these, and so on, a few levels deep: from a peer it could be thousands.
+# Lists and tables of these, to a limited depth: a peer could send thousands of levels.
 _Inner = KeywordValue | list[KeywordValue] | dict[str, KeywordValue]
 _Outer = KeywordValue | list[_Inner] | dict[str, _Inner]
 #: Keyword arguments for an environment.
 Keywords = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer]]
-#: Settings as they are sent and stored: by name, without their groups.
+#: Settings as they are sent and stored: by name, without groups.
 FlatSettings = dict[str, KeywordValue | list[int | str] | Keywords | None]
-#: Where a wrapper is found.
+#: The import path of a wrapper, with arguments if it needs any.
 Wrapper = Annotated[str, Meta(min_length=1, max_length=200)]
 
 Kind = TypeVar("Kind", bound=msgspec.Struct)
@@ -52,28 +52,28 @@ COMMANDS_PER_ITERATION = 1_000_000
 
 
 class Config(SettingsGroup, frozen=True, kw_only=True):
-    """What a run is. Two runs of equal ``Config`` on the same kind of hardware are bit-identical.
+    """Settings of a run. Runs of equal ``Config`` on the same kind of hardware are bit-identical.
 
     Attributes:
         environment: a Gymnasium id, registered or importable (``package.module:Env-v0``).
         environment_kwargs: keyword arguments for ``gymnasium.make``.
-        wrappers: what the environment is wrapped in, one after another, as
-            ``package.module:Wrapper``, or with arguments, ``package.module:Wrapper(size=8)``.
-        observe_time: whether the time that is left is observed too.
-        observe_previous: whether the previous action and reward are observed too.
-        max_episode_steps: time limit of an episode in steps; None: the environment's own.
-        max_train_steps: time limit of warm-up and exploratory episodes only; None: no other.
-        max_return: the greatest return that the environment can give, which caps the desired
-            return in evaluation (2.3.2); None: what the environment declares, if anything.
-        seed: the seed that every random stream is keyed by.
-        lead: how many iterations acting may run ahead of training; 0 is Algorithm 1 to the letter.
-        actions: of ``Box`` action spaces.
-        network: all that the acting graph is a function of, and its initialisation.
-        buffer: of the replay buffer.
-        commands: of warm-up and exploratory episodes.
-        training: of an iteration.
-        evaluation: of the agent.
-        arithmetic: of the learner.
+        wrappers: Gymnasium wrappers, applied in this order, as ``package.module:Wrapper`` or
+            ``package.module:Wrapper(size=8)``.
+        observe_time: whether the time left until the step limit is added to observations.
+        observe_previous: whether the previous action and reward are added to observations.
+        max_episode_steps: time limit of an episode in steps. None: the environment's own.
+        max_train_steps: shorter time limit of warm-up and exploratory episodes. None: none.
+        max_return: the highest possible return, which caps the desired return in evaluation
+            (2.3.2). None: as the environment declares, if it does.
+        seed: key of every random stream.
+        lead: iterations that acting may run ahead of training; 0 is Algorithm 1.
+        actions: settings of action spaces.
+        network: settings of the acting graph, and its initialisation.
+        buffer: settings of the replay buffer.
+        commands: settings of warm-up and exploratory episodes.
+        training: settings of the updates of an iteration.
+        evaluation: settings of evaluations.
+        arithmetic: settings of the learner's arithmetic.
     """
 
     environment: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -123,19 +123,18 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
 
 
 class Budget(SettingsGroup, frozen=True, kw_only=True):
-    """When a run ends: at the first iteration whose completion reaches one of these.
+    """Stopping criteria. A run ends after the first iteration that meets one of them.
 
     Attributes:
         max_env_steps: env steps of warm-up and exploratory episodes.
-        stop_return: mean return of an evaluation; None: never.
+        stop_return: mean return of an evaluation. None: no such criterion.
     """
 
     max_env_steps: Annotated[int, Meta(ge=1, le=2**53)] = 1_000_000
     stop_return: float | None = None
 
 
-#: Settings that may be left open, as ``auto``, and what they are until they are chosen
-#: (:mod:`udrl.fitting`).
+#: Settings that accept ``auto``, with placeholders until they are chosen (:mod:`udrl.fitting`).
 OPEN: Mapping[str, Any] = {
     "return_scale": 1.0,
     "horizon_scale": 1.0,
@@ -152,7 +151,7 @@ OPEN: Mapping[str, Any] = {
     "recent_size": 0,
 }
 
-#: What some settings need to have an effect.
+#: Conditions under which some settings have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
     "drop_previous": (lambda config: config.observe_previous, "observe_previous"),
@@ -166,18 +165,18 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
 
 
 def refuse_idle(config: Config, names: Iterable[str]) -> None:
-    """Raise :class:`ConfigError` for a setting that has no effect beside the others.
+    """Raise :class:`ConfigError` for a setting that has no effect with the others.
 
     Args:
         config: all settings.
-        names: those that somebody asked for.
+        names: the settings that were given explicitly.
     """
     for name in names:
         has_effect, need = _NEEDS.get(name, (lambda config: True, ""))
         if not has_effect(config):
             raise ConfigError(
                 f"{name} = {flat(config)[name]!r} has no effect: it needs {need}; leave it out, "
-                f"or set that too"
+                f"or set that as well"
             )
 
 
@@ -190,13 +189,13 @@ def preset_names() -> list[str]:
 
 
 def preset(name: str) -> dict[str, Any]:
-    """Return the settings of a shipped preset.
+    """Return the settings of a preset.
 
     Raises:
         ConfigError: there is no such preset.
     """
     if name not in preset_names():
-        raise ConfigError(f"preset {name!r}: there are {', '.join(preset_names())}")
+        raise ConfigError(f"unknown preset {name!r}: expected one of {', '.join(preset_names())}")
     text = (resources.files("udrl") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
@@ -218,7 +217,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``, VALUE as TOML; a bare word is a string.
+    """Return name and value of ``NAME=VALUE``. VALUE is TOML; a bare word is a string.
 
     Raises:
         ConfigError: there is no ``=``.
@@ -243,7 +242,7 @@ def _groups(kind: type[msgspec.Struct]) -> dict[str, type[SettingsGroup]]:
 
 @cache
 def setting_names(kind: type[msgspec.Struct]) -> tuple[str, ...]:
-    """Return the names of all settings of a kind, those in groups among them."""
+    """Return the names of all settings of a kind, including those in groups."""
     groups = _groups(kind)
     return tuple(
         name
@@ -253,7 +252,7 @@ def setting_names(kind: type[msgspec.Struct]) -> tuple[str, ...]:
 
 
 def flat(settings: msgspec.Struct) -> dict[str, Any]:
-    """Return all settings by name, side by side, as TOML and JSON have them."""
+    """Return all settings by name, without groups, as in TOML and JSON."""
     values: dict[str, Any] = {}
     for field, value in msgspec.to_builtins(settings).items():
         values |= value if field in _groups(type(settings)) else {field: value}
@@ -264,11 +263,11 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
     """Return settings of a kind, in their groups, after checking every value's type and range.
 
     Args:
-        kind: of settings.
-        values: by name, side by side; what is left out has its default.
+        kind: :class:`Config`, :class:`Budget` or a group.
+        values: settings by name, without groups. Missing ones have their defaults.
 
     Raises:
-        ConfigError: a name is unknown or a value impossible; the message says which.
+        ConfigError: a name is unknown or a value is invalid; the message names it.
     """
     refuse_unknown(values, setting_names(kind))
     given = {name: value for name, value in values.items() if name in kind.__struct_fields__}
@@ -283,7 +282,7 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
 
 
 def change(settings: Kind, **values: Any) -> Kind:
-    """Return settings with some changed, in whatever group they are.
+    """Return settings with some values changed, in any group.
 
     Raises:
         ConfigError: as :func:`build`.
@@ -292,19 +291,19 @@ def change(settings: Kind, **values: Any) -> Kind:
 
 
 def refuse_unknown(values: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    """Raise :class:`ConfigError` for a name that is not in ``known``, with the nearest that is."""
+    """Raise :class:`ConfigError` for a name that is not in ``known``, naming the closest match."""
     for name in values:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+            hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
             raise ConfigError(f"unknown setting {name!r}: {hint}")
 
 
 class Configured:
-    """Base of what is sent or stored with the settings of a run, which are flat there.
+    """Base of messages and records that contain the settings of a run, without groups.
 
     Attributes:
-        settings: they, by name; a struct declares it as ``msgspec.field(name="config")``.
+        settings: the settings by name. A struct declares it as ``msgspec.field(name="config")``.
     """
 
     __slots__ = ()
@@ -315,5 +314,5 @@ class Configured:
 
     @property
     def config(self) -> Config:
-        """The settings, grouped."""
+        """The settings in their groups."""
         return build(Config, self.settings)

@@ -1,7 +1,7 @@
-"""The settings of a run in groups, so that a part of the algorithm can be given its own alone.
+"""Groups of settings, so that each part of the algorithm takes only its own.
 
-A :class:`udrl.config.Config` holds one of each. The hyperparameters of Table 2 have the paper's
-names.
+A :class:`udrl.config.Config` has one group of each kind. The hyperparameters of Table 2 have the
+paper's names.
 """
 
 import math
@@ -23,7 +23,7 @@ Widths = Annotated[
 
 
 class SettingsGroup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all groups: every number is finite."""
+    """Base of all groups. Every number must be finite."""
 
     def __post_init__(self) -> None:
         for name, value in msgspec.structs.asdict(self).items():
@@ -32,7 +32,7 @@ class SettingsGroup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 def _floats(value: Any) -> Iterator[float]:
-    """Yield the floats in a value, however deep."""
+    """Yield all floats in a nested value."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, dict | list | tuple):
@@ -41,31 +41,31 @@ def _floats(value: Any) -> Iterator[float]:
 
 
 class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
-    """The network, and how it reads a command (section 3.2, Appendix B.2).
+    """The network, and its command input (section 3.2, Appendix B.2).
 
     Attributes:
-        behavior: a class of your own instead of the paper's network, as ``package.module:Class``
-            (:mod:`udrl.custom`); None: the paper's.
-        frame_stack: most recent observations that the network sees at once, one after another
-            along the first dimension; before an episode's first there is the first again.
+        behavior: a torch module in place of the paper's network, as ``package.module:Class``
+            (:mod:`udrl.custom`). None: the paper's network.
+        frame_stack: number of most recent observations in the input, concatenated along the first
+            dimension. At the start of an episode its first observation is repeated.
         memory: ``none``, or ``gru``: a gated recurrent unit between encoder and command, which
             remembers the episode so far (section 6).
-        memory_size: numbers that it remembers.
-        normalise_observations: whether numbers are read relative to their mean in the warm-up, in
-            units of their deviation there.
+        memory_size: units of the memory.
+        normalise_observations: whether vectors are normalised by their mean and deviation in the
+            warm-up.
         convolutions: channels of each convolutional layer, for images (3.2, B.2).
-        hidden: units of each fully connected layer; for vectors, the first is multiplied with the
-            embedded command (3.2).
-        activation: of the hidden layers.
+        hidden: units of each fully connected layer. For vectors, the output of the first is
+            multiplied with the embedded command (3.2).
+        activation: activation of the hidden layers.
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
         return_scale: factor on the desired return at the network's input.
-        horizon_scale: factor on the desired horizon at the network's input; 0: it is not read.
-        desired_horizon: what exploratory and evaluation commands ask for: ``mean``, the mean
-            length of the best episodes; or ``return``: as many steps as return, as an integer,
-            where each step gives a reward of 1 (TakeCover, 3.1).
-        baseline: what desired returns are relative to where the network reads them: ``none``, the
-            paper's; ``value``: what a learned value function expects; or ``action_value``: the
-            same, of what actions bring on average (:mod:`udrl.value`).
+        horizon_scale: factor on the desired horizon at the network's input. 0: it is ignored.
+        desired_horizon: horizon of exploratory and evaluation commands. ``mean``: the mean length
+            of the best episodes. ``return``: equal to the desired return, as an integer, for
+            environments with a reward of 1 per step (TakeCover, 3.1).
+        baseline: baseline of desired returns at the network's input. ``none``: none, as in the
+            paper. ``value``: a learned value function. ``action_value``: the same, with examples
+            labelled with the average outcome of their action (:mod:`udrl.value`).
     """
 
     behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -84,15 +84,16 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class ActionSettings(SettingsGroup, frozen=True, kw_only=True):
-    """How actions are read (:mod:`udrl.environments.action_conversions`).
+    """The action space (:mod:`udrl.environments.action_conversions`).
 
     Attributes:
-        action_mask: where it says which actions are allowed: ``info``, in ``info["action_mask"]``;
-            or the name of an entry of a ``Dict`` observation; None: all are, always.
-        action_bins: values that each dimension can take, evenly from the lowest to the highest;
-            None: as many as suit the number of dimensions.
-        action_low: the lowest value of dimensions for which the environment declares none.
-        action_high: the highest, likewise.
+        action_mask: where the environment provides its action mask: ``info`` for
+            ``info["action_mask"]``, or the name of an entry of a ``Dict`` observation. None: all
+            actions are allowed.
+        action_bins: values per dimension of a ``Box``, evenly spaced. None: chosen by the number of
+            dimensions.
+        action_low: lower bound for ``Box`` dimensions that declare none.
+        action_high: upper bound for ``Box`` dimensions that declare none.
     """
 
     action_mask: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -102,13 +103,13 @@ class ActionSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class BufferSettings(SettingsGroup, frozen=True, kw_only=True):
-    """Which episodes the replay buffer holds (section 2.3.1).
+    """The replay buffer (section 2.3.1).
 
     Attributes:
-        replay_size: episodes that it holds, those of the greatest returns.
-        recent_size: newest episodes that it holds besides, whatever they returned; 0 is the
-            paper's.
-        max_age: iterations after which an episode leaves; None, as in the paper: never.
+        replay_size: episodes with the highest returns that it holds.
+        recent_size: newest episodes that it holds in addition, whatever their return; 0 in the
+            paper.
+        max_age: iterations after which an episode leaves. None: never, as in the paper.
     """
 
     replay_size: Annotated[int, Meta(ge=1, le=1_000_000)] = 500
@@ -117,25 +118,24 @@ class BufferSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
-    """The episodes of an iteration, and what they are told (sections 2.3.1 and 2.3.4).
+    """The episodes of an iteration and their commands (sections 2.3.1 and 2.3.4).
 
     Attributes:
-        command_strategy: what exploratory commands ask for: ``uniform`` (2.3.4), ``ranked``,
+        command_strategy: how exploratory commands are chosen: ``uniform`` (2.3.4), ``ranked``,
             ``maximum``, or a class of your own as ``package.module:Class``
             (:mod:`udrl.strategies`).
         last_few: number of best episodes that exploratory commands are drawn from (2.3.4).
-        n_episodes_per_iter: exploratory episodes in an iteration.
-        held_actions: share of exploratory episodes in which random actions are held for some
-            steps, whatever the network says; 0 is the paper's.
-        held_rate: with what probability one begins at each step of such an episode; 0: there is
-            one in an episode.
-        hold_steps: steps that such an action is held for; with a ``held_rate`` at least n times as
-            many with probability 1 / n.
-        n_warm_up_episodes: episodes of random actions before the first iteration; with a
-            ``dataset`` as many as it has.
-        warm_up_hold: steps that a random action of the warm-up is held for; 1 is the paper's.
-        dataset: a Minari dataset whose episodes take the place of the warm-up's; None: none.
-        dataset_sha256: digest of these; empty: whatever they are when the run is created.
+        n_episodes_per_iter: exploratory episodes per iteration.
+        held_actions: share of exploratory episodes with held random actions; 0 in the paper.
+        held_rate: probability per step of such an episode that a held action begins. 0: there is
+            one per episode.
+        hold_steps: steps for which such an action is held. With a ``held_rate``, at least n times
+            as many with probability 1 / n.
+        n_warm_up_episodes: episodes with random actions before the first iteration. With a
+            ``dataset``, the number of its episodes.
+        warm_up_hold: steps for which each random action of the warm-up is held; 1 in the paper.
+        dataset: a Minari dataset to use in place of the warm-up. None: none.
+        dataset_sha256: digest of its episodes. Empty: set when the run is created.
     """
 
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
@@ -151,19 +151,19 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
-    """How an iteration trains (section 2.3.3).
+    """The updates of an iteration (section 2.3.3).
 
     Attributes:
         segments: ``trailing`` segments only (the paper's experiments) or ``all`` (2.3.3).
-        batch_size: examples in one update.
-        learning_rate: Adam's.
-        n_updates_per_iter: gradient steps in an iteration.
-        memory_window: with a ``memory``, consecutive steps of an episode that are trained on
-            together, so that what is remembered is learned over as many.
-        drop_previous: with ``observe_previous``, share of the examples without these, so that the
-            agent learns more than to copy itself.
-        return_lambda: with a ``baseline``, the lambda of the lambda-returns that examples are
-            labelled with: 1 for the observed return, 0 for one reward and the value after it.
+        batch_size: examples per update.
+        learning_rate: learning rate of Adam.
+        n_updates_per_iter: gradient steps per iteration.
+        memory_window: with a ``memory``, number of consecutive steps trained together (truncated
+            backpropagation through time).
+        drop_previous: with ``observe_previous``, share of examples that hide the previous action
+            and reward, so that the agent does not only learn to repeat itself.
+        return_lambda: with a ``baseline``, lambda of the lambda-returns that examples are labelled
+            with. 1: the observed return. 0: one reward and the value after it.
     """
 
     segments: Literal["trailing", "all"] = "trailing"
@@ -179,12 +179,12 @@ class EvaluationSettings(SettingsGroup, frozen=True, kw_only=True):
     """When and how the agent is evaluated (sections 2.3.6 and 3.2).
 
     Attributes:
-        eval_every: env steps between two evaluations.
-        eval_episodes: episodes in one evaluation.
-        eval_temperature: of the action distribution in evaluations (2.3.6): logits are divided by
-            it; 1 is the paper's, 0 takes the mode.
-        eval_seeds: reset seeds of evaluations: ``final``, in [1, 0.5M), or ``search``, in
-            [0.5M, 1M), for choosing hyperparameters (3.2).
+        eval_every: env steps between evaluations.
+        eval_episodes: episodes per evaluation.
+        eval_temperature: sampling temperature in evaluations (2.3.6), by which logits are divided;
+            1 in the paper. 0: the most likely action.
+        eval_seeds: reset seeds of evaluations: ``final`` in [1, 0.5M), or ``search`` in [0.5M, 1M),
+            for choosing hyperparameters (3.2).
     """
 
     eval_every: PositiveInt = 50_000
@@ -194,14 +194,14 @@ class EvaluationSettings(SettingsGroup, frozen=True, kw_only=True):
 
 
 class ArithmeticSettings(SettingsGroup, frozen=True, kw_only=True):
-    """What the learner computes on and in.
+    """Arithmetic of the learner.
 
     Attributes:
-        precision: what the learner's network computes in; weights, optimizer and acting are float32
-            always. ``auto``: bfloat16 if the machine that creates the run is fast in it.
-        training_threads: threads that the learner computes with on a CPU; everything else has one.
-        device: what the learner trains on; ``auto``: ``cuda`` if the machine that creates the run
-            has it.
+        precision: precision of the learner's network; weights, optimizer and acting are always
+            float32. ``auto``: bfloat16 if the machine that creates the run has instructions for it.
+        training_threads: threads of the learner on a CPU; everything else uses one.
+        device: device of the learner. ``auto``: ``cuda`` if the machine that creates the run has
+            a GPU.
     """
 
     precision: Literal["auto", "float32", "bfloat16"] = "float32"

@@ -1,8 +1,8 @@
-"""Section 2.3.4: what exploratory commands ask for, given the best episodes.
+"""Section 2.3.4: strategies that choose exploratory commands, given the best episodes.
 
-The paper asks for returns just above the best ones' mean, and calls for a study of other strategies
-(section 6). A strategy is a class of one method; a run names it with ``command_strategy``, one of
-:data:`STRATEGIES` or your own, importable as ``package.module:Class``::
+The paper asks for returns slightly above the mean of the best ones, and suggests to study other
+strategies (section 6). A strategy is a class with one method. The setting ``command_strategy``
+names it: one of :data:`STRATEGIES`, or your own, importable as ``package.module:Class``::
 
     class Patient:
         def __init__(self, config: Config) -> None: ...
@@ -20,36 +20,36 @@ from udrl.config import Config
 from udrl.errors import ConfigError
 from udrl.replay import Entry
 
-#: Greatest return and horizon that a command may have.
+#: Largest absolute return and horizon of a command.
 _MOST = 10**9
 
 
 class CommandStrategy(Protocol):
-    """What exploratory commands ask for; made once a run, from its settings."""
+    """Chooses exploratory commands. Created once per run, from its settings."""
 
     def __init__(self, config: Config) -> None: ...
 
     def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
-        """Return what one exploratory command asks for.
+        """Return the desired return and horizon of one exploratory command.
 
-        It must be a function of its arguments, or the run is not a function of its configuration.
+        The result must depend on the arguments alone, or the run is not reproducible.
 
         Args:
-            best: the ``last_few`` best episodes, least return first; at least one.
-            u: this command's own number, uniform in [0, 1).
+            best: the ``last_few`` best episodes, lowest return first; at least one.
+            u: uniform in [0, 1), different for each command.
 
         Returns:
-            Desired return and desired horizon (in steps; less than 1 counts as 1), both at most a
-            thousand million.
+            Desired return and desired horizon (in steps; values below 1 count as 1), both at most
+            1e9.
         """
         ...
 
 
 class Best(NamedTuple):
-    """What sections 2.3.4 and 2.3.6 say of the best episodes.
+    """Statistics of the best episodes (sections 2.3.4 and 2.3.6).
 
     Attributes:
-        mean: M, of their returns.
+        mean: M, the mean of their returns.
         deviation: S, the population standard deviation of their returns.
         horizon: their mean length, rounded to the nearest integer.
     """
@@ -60,7 +60,7 @@ class Best(NamedTuple):
 
     @classmethod
     def of(cls, episodes: Sequence[Entry]) -> "Best":
-        """Return it for some episodes, at least one."""
+        """Return the statistics of some episodes, at least one."""
         n = len(episodes)
         # fsum rounds once, so that the result does not depend on the order of summation.
         mean = math.fsum(e.episode_return for e in episodes) / n
@@ -75,7 +75,7 @@ def nearest(number: float) -> int:
 
 
 class Uniform:
-    """The paper's: returns uniform in [M, M + S], all with the best episodes' mean length."""
+    """The paper's strategy: returns uniform in [M, M + S], and the mean length."""
 
     def __init__(self, config: Config) -> None:
         pass
@@ -87,29 +87,29 @@ class Uniform:
 
 
 class Ranked:
-    """Do again what one of the best did, its return in its time; the better, the likelier.
+    """Ask for the return and length of one of the best episodes; better ones are more likely.
 
-    Orders that differ, each of which somebody has obeyed, keep agents from doing everything in one
-    way; and rare successes are repeated before they are many.
+    Diverse commands, each of which an episode has fulfilled, keep agents from doing everything in
+    one way, and rare successes are repeated before there are many.
     """
 
     def __init__(self, config: Config) -> None:
         pass
 
     def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
-        """Return the return and the length of one of the best.
+        """Return the return and length of one of the best episodes.
 
-        It is one of the k best of n with probability sqrt(k / n).
+        It is among the k best of n with probability sqrt(k / n).
         """
         chosen = best[-1 - int(u * u * len(best))]
         return chosen.episode_return, chosen.length
 
 
 class Maximum:
-    """Always the greatest return that the environment can give (``max_return``).
+    """Always ask for the highest possible return (``max_return``).
 
-    For tasks in which an agent delivers what is commanded and no more, such as balancing for so
-    many steps: there commands just above the best episodes make progress slow.
+    For tasks in which an agent delivers what is asked for and no more, such as balancing for a
+    number of steps. There, commands slightly above the best episodes make progress slow.
 
     Raises:
         ConfigError: ``max_return`` is not set.
@@ -118,13 +118,13 @@ class Maximum:
     def __init__(self, config: Config) -> None:
         if config.max_return is None:
             raise ConfigError(
-                "command_strategy = 'maximum' commands the greatest return possible, and "
-                "max_return is not set; set it, e.g. --set max_return=500"
+                "command_strategy = 'maximum' asks for the highest possible return, but max_return "
+                "is not set; set it, e.g. --set max_return=500"
             )
         self._max_return = config.max_return
 
     def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
-        """Return ``max_return`` and the best episodes' mean length."""
+        """Return ``max_return`` and the mean length of the best episodes."""
         return self._max_return, Best.of(best).horizon
 
 
@@ -139,7 +139,7 @@ def make_strategy(config: Config) -> CommandStrategy:
     """Return the strategy that ``command_strategy`` names.
 
     Raises:
-        ConfigError: there is none of that name, or it cannot be imported or made.
+        ConfigError: there is no strategy of that name, or it cannot be imported or created.
     """
     name = config.commands.command_strategy
     if name in STRATEGIES:
@@ -155,17 +155,17 @@ def make_strategy(config: Config) -> CommandStrategy:
         strategy: CommandStrategy = kind(config)
     except Exception as error:
         raise ConfigError(
-            f"command_strategy {name!r} cannot be made: {type(error).__name__}: {error}; name a "
-            f"class that is importable here (PYTHONPATH) and is made from a udrl.config.Config"
+            f"command_strategy {name!r} cannot be created: {type(error).__name__}: {error}; name a "
+            f"class that is importable here (PYTHONPATH) and takes a udrl.config.Config"
         ) from error
     return strategy
 
 
 def ask(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[float, int]:
-    """Return what a strategy asks for, checked: it may be anybody's code.
+    """Return the desired return and horizon of a strategy, checked.
 
     Raises:
-        ConfigError: it raised, or returned what no command can be.
+        ConfigError: it raised, or returned an invalid command.
     """
     name = type(strategy).__name__
     try:

@@ -104,7 +104,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_known_one() -> None:
 
 
 def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"'xyzzy': there are one, two"):
+    with pytest.raises(ConfigError, match=r"'xyzzy': expected one of one, two"):
         refuse_unknown({"xyzzy": 1}, ("one", "two"))
 
 
@@ -187,7 +187,7 @@ def test_the_preset_for_any_environment_leaves_settings_open() -> None:
 
 
 def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"'Pong': there are CartPole-v1, LunarLander-v3"):
+    with pytest.raises(ConfigError, match=r"'Pong': expected one of CartPole-v1, LunarLander-v3"):
         preset("Pong")
 
 
