@@ -1,7 +1,7 @@
 """Section 2.3.4: strategies that choose exploratory commands, given the best episodes.
 
-The paper asks for returns slightly above the mean of the best ones, and suggests to study other
-strategies (section 6). A strategy is a class with one method. The setting ``command_strategy``
+The paper's desired returns are slightly above the mean of the best ones. Section 6 suggests to
+study other strategies. A strategy is a class with one method. The setting ``command_strategy``
 names it: one of :data:`STRATEGIES`, or your own, importable as ``package.module:Class``::
 
     class Patient:
@@ -87,7 +87,7 @@ class Uniform:
 
 
 class Ranked:
-    """Ask for the return and length of one of the best episodes; better ones are more likely.
+    """Command the return and length of one of the best episodes; better ones are more likely.
 
     Diverse commands, each of which an episode has fulfilled, keep agents from doing everything in
     one way, and rare successes are repeated before there are many.
@@ -106,9 +106,9 @@ class Ranked:
 
 
 class Maximum:
-    """Always ask for the highest possible return (``max_return``).
+    """Always command the highest possible return (``max_return``).
 
-    For tasks in which an agent delivers what is asked for and no more, such as balancing for a
+    For tasks in which an agent delivers what is commanded and no more, such as balancing for a
     number of steps. There, commands slightly above the best episodes make progress slow.
 
     Raises:
@@ -118,7 +118,7 @@ class Maximum:
     def __init__(self, config: Config) -> None:
         if config.max_return is None:
             raise ConfigError(
-                "command_strategy = 'maximum' asks for the highest possible return, but max_return "
+                "command_strategy = 'maximum' commands the highest possible return, but max_return "
                 "is not set; set it, e.g. --set max_return=500"
             )
         self._max_return = config.max_return
@@ -178,7 +178,7 @@ def ask(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[flo
         ) from error
     if not abs(desired_return) <= _MOST or abs(desired_horizon) > _MOST:
         raise ConfigError(
-            f"command strategy {name} asks for a return of {desired_return} within "
+            f"command strategy {name} commands a return of {desired_return} within "
             f"{desired_horizon} steps; expected numbers up to {_MOST:,}"
         )
     return desired_return, max(1, desired_horizon)

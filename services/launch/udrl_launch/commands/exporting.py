@@ -46,8 +46,8 @@ def export(
         click.echo(f'folder: {folder}; in Python: udrl.load("{folder}")')
         if kept_of(agent, run_dir) is None:
             click.echo(
-                "The model card does not say which returns this agent can be asked for. Measure "
-                "them and export again, with: "
+                "The model card does not say which returns this agent can deliver. Measure them "
+                "and export again, with: "
                 f"udrl obedience {run_dir} --weights {agent.version}",
                 err=True,
             )

@@ -60,7 +60,7 @@ def obedience(
 ) -> int:
     """Measure how well an agent follows its commands.
 
-    Asks for a range of returns and horizons, and reports what the agent obtains.
+    Commands a range of returns and horizons, and reports the obtained ones.
 
     Example: udrl obedience runs/mine
     """
