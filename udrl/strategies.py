@@ -1,7 +1,7 @@
 """Section 2.3.4: strategies that choose exploratory commands, given the best episodes.
 
-The paper's desired returns are slightly above the mean of the best ones. Section 6 suggests to
-study other strategies. A strategy is a class with one method. The setting ``command_strategy``
+The paper's desired returns are slightly above the mean of the best ones. Section 6 suggests
+studying other strategies. A strategy is a class with one method. The setting ``command_strategy``
 names it: one of :data:`STRATEGIES`, or your own, importable as ``package.module:Class``::
 
     class Patient:
