@@ -35,7 +35,8 @@ _HEAD = """\
 
 Every command has `--help`. `udrl --version` prints the version. Results are written to standard
 output; progress, logs and errors to standard error. An error is one line that names the value, what
-was expected and the remedy. The [exit code](operations-reference.md#exit-codes) identifies the kind of error.
+was expected and the remedy. The [exit code](operations-reference.md#exit-codes) identifies the kind
+of error.
 
 `--set NAME=VALUE` and a file named by `--config` set any setting, including those without an option
 of their own: see [configuration](configuration.md).

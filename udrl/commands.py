@@ -18,7 +18,7 @@ from udrl.config import COMMANDS_PER_ITERATION, Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
-from udrl.setting_groups import Temperature
+from udrl.setting_groups import CommandSettings, Temperature
 from udrl.strategies import Best, CommandStrategy, ask, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
@@ -30,6 +30,8 @@ TRAINING_SEEDS = (1_000_000, 10_000_000)
 SEARCH_SEEDS = (500_000, 1_000_000)
 EVALUATION_SEEDS = (1, 500_000)
 
+#: Exploratory episodes of an iteration that is to have ``n_steps_per_iter``, at most.
+MOST_EPISODES = 1_000
 #: Within an iteration, the closing evaluation of a run that ends there has indices from here on.
 CLOSING = 500_000
 
@@ -127,6 +129,16 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return begun
 
 
+def episodes_due(settings: CommandSettings, buffer: ReplayBuffer) -> int:
+    """Return how many exploratory episodes an iteration has, given the buffer it is drawn from."""
+    least, steps = settings.n_episodes_per_iter, settings.n_steps_per_iter
+    newest = buffer.newest()
+    if steps is None or not newest:
+        return least
+    wanted = math.ceil(steps * len(newest) / sum(e.length for e in newest))
+    return max(least, min(wanted, MOST_EPISODES))
+
+
 class CommandSampler:
     """Draws the commands of a run, iteration by iteration.
 
@@ -168,7 +180,7 @@ class CommandSampler:
             ConfigError: the strategy cannot be imported, or asks for what cannot be.
         """
         best = buffer.best(self._settings.last_few)
-        n = self._settings.n_episodes_per_iter
+        n = episodes_due(self._settings, buffer)
         u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
         desired = [self._target.settle(*ask(self._strategy, best, number)) for number in u]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
@@ -193,12 +205,11 @@ class CommandSampler:
         """Return a warm-up or exploratory command again, apart from what it asked for."""
         iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
         kind: Kind = "explore" if iteration else "warm_up"
-        n = self._settings.n_episodes_per_iter if iteration else self._settings.n_warm_up_episodes
-        return self._commands(kind, iteration, 0, [(0.0, 0)] * n, TRAINING_SEEDS)[index]
+        return self._commands(kind, iteration, 0, [(0.0, 0)] * (index + 1), TRAINING_SEEDS)[index]
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's evaluation commands (section 2.3.6): return M, the same horizon."""
-        first = self._settings.n_episodes_per_iter
+        first = episodes_due(self._settings, buffer)
         return self._evaluation(iteration, first, buffer)
 
     def close(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:

@@ -145,10 +145,6 @@ OPEN: Mapping[str, Any] = {
     "held_actions": 1.0,
     "held_rate": 0.0,
     "hold_steps": 1,
-    "n_episodes_per_iter": 1,
-    "last_few": 1,
-    "replay_size": 1_000_000,
-    "recent_size": 0,
 }
 
 #: Conditions under which some settings have an effect.

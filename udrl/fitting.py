@@ -27,19 +27,11 @@ _HOLDS, _COUNT = (2, 8, 32), 3
 _RATE_BY_CHANCE, _RATE = 0.15, 0.05
 #: What the network reads well.
 _LEAST, _MOST = 0.1, 10.0
-#: Env steps in an iteration: if its episodes are like random ones, and at most.
-_USUAL_STEPS, _MOST_STEPS = 1_000, 5_000
-#: Fewest episodes of an iteration.
-_FEWEST_EPISODES = 5
 #: Fewest episodes and env steps of the warm-up: where a reward is rare, one must be found by chance
 #: before there is anything to learn from.
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000
-#: Best episodes that commands are drawn from, as a share of an iteration.
-_BEST = 0.3
 #: Lambda of the lambda-returns: they reach over a quarter of a random episode, at the least.
 _LEAST_LAMBDA, _REACH = 0.95, 4.0
-#: Iterations that each half of the replay buffer holds.
-_HALF = 6
 
 
 def fit(
@@ -74,13 +66,8 @@ def fit(
         hold, sample = _best_hold(config, generator)
     returns, length = sample.returns, sum(sample.lengths) / len(sample.lengths)
     reach = max(*map(abs, returns), max(returns) - min(returns), 0.0)
-    n_episodes = config.commands.n_episodes_per_iter
-    if "n_episodes_per_iter" in left_open:
-        longest = generator.spec.max_episode_steps
-        wanted = math.ceil(min(_USUAL_STEPS / length, _MOST_STEPS / longest))
-        n_episodes = max(wanted, _FEWEST_EPISODES)
     if episodes is None:
-        n_warm_up = max(n_episodes, _WARM_UP, math.ceil(_WARM_UP_STEPS / length))
+        n_warm_up = max(_WARM_UP, math.ceil(_WARM_UP_STEPS / length))
     baseline = "action_value" if sample.by_chance else "value"
     if config.training.segments == "all":
         baseline = "none"  # no other goes with them
@@ -96,10 +83,6 @@ def fit(
         "held_actions": 0.5 if sample.by_chance else 0.25,
         "held_rate": _RATE_BY_CHANCE if sample.by_chance else _RATE,
         "hold_steps": hold,
-        "n_episodes_per_iter": n_episodes,
-        "last_few": max(1, round(_BEST * n_episodes)),
-        "replay_size": _HALF * n_episodes,
-        "recent_size": _HALF * n_episodes,
     }
     return change(config, **{name: chosen[name] for name in left_open})
 

@@ -67,6 +67,11 @@ class ReplayBuffer:
         newest = set(heapq.nlargest(self._recent, (entry.id for entry in entries)))
         return [entry for entry in entries[:surplus] if entry.id in newest] + entries[surplus:]
 
+    def newest(self) -> Sequence[Entry]:
+        """Return the entries of the newest iteration of which it holds any."""
+        newest = max((entry.iteration for entry in self._entries), default=0)
+        return [entry for entry in self._entries if entry.iteration == newest]
+
     def best(self, n: int) -> Sequence[Entry]:
         """Return the last ``n`` entries, or all when there are fewer."""
         return self._entries[-n:]

@@ -126,6 +126,9 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
             (:mod:`udrl.strategies`).
         last_few: number of best episodes that exploratory commands are drawn from (2.3.4).
         n_episodes_per_iter: exploratory episodes per iteration.
+        n_steps_per_iter: exploratory env steps per iteration, roughly. An iteration has as many
+            episodes as this takes at the mean length of the newest ones, ``n_episodes_per_iter`` at
+            least. None, as in the paper: a fixed number.
         held_actions: share of exploratory episodes with held random actions; 0 in the paper.
         held_rate: probability per step of such an episode that a held action begins. 0: there is
             one per episode.
@@ -141,6 +144,7 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
     last_few: PositiveInt = 75
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20
+    n_steps_per_iter: PositiveInt | None = None
     held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
     held_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
     hold_steps: PositiveInt = 30

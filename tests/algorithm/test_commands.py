@@ -17,7 +17,7 @@ from udrl.commands import (
     Command,
     CommandSampler,
 )
-from udrl.config import Config, build
+from udrl.config import COMMANDS_PER_ITERATION, Config, build
 from udrl.environments import EnvironmentSpec
 from udrl.replay import Entry, ReplayBuffer
 from udrl.spaces import Vector
@@ -139,6 +139,39 @@ def test_commands_name_the_weights_of_the_schedule(lead: int, version: int) -> N
     sample, buffer = sampler(lead=lead), buffer_of([1.0])
     commands = sample.explore(5, buffer) + sample.evaluate(5, buffer)
     assert {command.weights_version for command in commands} == {version}
+
+
+def played(lengths: Sequence[Sequence[int]]) -> ReplayBuffer:
+    """A buffer of iterations of episodes of these lengths; all returns are different."""
+    entries = [
+        Entry(float(10 * i + k), i * COMMANDS_PER_ITERATION + k, length)
+        for i, iteration in enumerate(lengths)
+        for k, length in enumerate(iteration)
+    ]
+    return ReplayBuffer(settings().buffer, entries)
+
+
+@pytest.mark.parametrize(
+    ("newest", "expected"),
+    [([200, 200], 5), ([100], 10), ([13] * 5, 77), ([1] * 5, 1000), ([20, 60], 25)],
+)
+def test_an_iteration_has_as_many_episodes_as_its_steps_take(
+    newest: list[int], expected: int
+) -> None:
+    sample = sampler(n_episodes_per_iter=5, n_steps_per_iter=1000, last_few=2)
+    buffer = played([[7, 7, 7], newest])
+    commands = sample.explore(2, buffer)
+    assert len(commands) == expected
+    assert sample.evaluate(2, buffer)[0].index == expected
+
+
+def test_a_training_command_is_drawn_again_without_its_buffer() -> None:
+    sample = sampler(n_episodes_per_iter=5, n_steps_per_iter=1000)
+    for command in sample.explore(3, played([[20] * 9])):
+        again = sample.training_command(command.id)
+        assert again == msgspec.structs.replace(
+            command, desired_return=0.0, desired_horizon=again.desired_horizon
+        )
 
 
 def test_a_closing_evaluation_has_the_final_weights_and_fresh_seeds() -> None:

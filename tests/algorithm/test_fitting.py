@@ -71,33 +71,6 @@ def test_scales_are_one_over_what_is_usual(
     assert (network.return_scale, network.horizon_scale) == scales
 
 
-@pytest.mark.parametrize(
-    ("length", "limit", "expected"),
-    [
-        (20, 500, 10),  # 50 would be 1,000 steps, but up to 25,000
-        (20, 20, 50),
-        (1, 1, 1_000),
-        (300, 500, 5),
-        (9, 100, 50),
-    ],
-)
-def test_iterations_have_as_many_episodes_as_their_lengths_allow(
-    length: int, limit: int, expected: int
-) -> None:
-    settings = config(max_episode_steps=limit)
-    fitted = fit(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, length)))
-    assert fitted.commands.n_episodes_per_iter == expected
-    assert fitted.buffer.replay_size == fitted.buffer.recent_size == 6 * expected
-    assert fitted.commands.last_few == round(0.3 * expected)
-
-
-def test_the_buffer_follows_a_given_iteration() -> None:
-    settings = config(n_episodes_per_iter=7)
-    left_open = OPEN.keys() - {"n_episodes_per_iter"}
-    fitted = fit(settings, left_open, EpisodeGenerator(settings, 1), episodes((1.0, 10)))
-    assert (fitted.commands.n_episodes_per_iter, fitted.buffer.recent_size) == (7, 42)
-
-
 def test_what_is_given_stays() -> None:
     generator = EpisodeGenerator(config(), 1)
     given = config(return_scale=0.5, horizon_scale=0.5)
@@ -209,7 +182,6 @@ def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
         fitted = fit(endless, OPEN, generator)
     assert Endless.steps <= 60_000
     assert fitted.network.horizon_scale == 0.0005
-    assert fitted.commands.n_episodes_per_iter == 5
     assert fitted.commands.n_warm_up_episodes == 50
 
 

@@ -1,6 +1,7 @@
 """A run is a function of its configuration and seed."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,11 @@ from whole_run import digests, reference, small, toy
 
 Runner = Callable[..., Status]
 
-CASES = [(small, 4000), (toy, 400)]
+CASES = [
+    (small, 4000),
+    (toy, 400),
+    (partial(small, n_episodes_per_iter=2, n_steps_per_iter=300, last_few=2), 4000),
+]
 
 
 @pytest.mark.parametrize(("make", "budget"), CASES)

@@ -30,11 +30,11 @@ def test_without_a_preset_of_its_own_an_environment_gets_that_for_any() -> None:
 
 
 def test_a_setting_is_left_open_or_has_a_value() -> None:
-    settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["last_few=4"])
-    assert settings.left_open == OPEN.keys() - {"return_scale", "last_few"}
+    settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["warm_up_hold=4"])
+    assert settings.left_open == OPEN.keys() - {"return_scale", "warm_up_hold"}
     assert settings.config.network.return_scale == 0.5
-    assert gather("CartPole-v1", options={}, assignments=["last_few=auto"]).left_open == {
-        "last_few"
+    assert gather("CartPole-v1", options={}, assignments=["warm_up_hold=auto"]).left_open == {
+        "warm_up_hold"
     }
 
 

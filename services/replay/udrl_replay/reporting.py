@@ -7,6 +7,7 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
+from udrl.commands import episodes_due
 from udrl.digests import replay_digest
 from udrl.strategies import Best
 from udrl.targets import ReturnInTime
@@ -202,7 +203,7 @@ def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, no
         else None,
         exact=progress.exact,
         inexact_reason=progress.inexact_reason,
-        useful_concurrency=config.commands.n_episodes_per_iter * (config.lead + 1),
+        useful_concurrency=episodes_due(config.commands, run.buffer) * (config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
         waiting=waits.list(now),

@@ -122,9 +122,9 @@ def train(
 
 def warn_of_idle_environments(settings: Settings) -> None:
     """Warn if there are far more environments than exploration can keep busy."""
-    config, _, fleet, left_open = settings
-    if "n_episodes_per_iter" in left_open:
-        return
+    config, fleet = settings.config, settings.fleet
+    if config.commands.n_steps_per_iter is not None:
+        return  # the number of episodes is known once there are some
     useful = config.commands.n_episodes_per_iter * (config.lead + 1)
     asked_for = fleet.actors * (fleet.envs_per_actor or 1)
     if asked_for > 2 * useful:
