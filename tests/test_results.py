@@ -1,4 +1,4 @@
-"""What the pages of results show is made of the tables that lie beside them."""
+"""The figures and tables of the results pages are made from the CSV files beside them."""
 
 import re
 from pathlib import Path
@@ -17,6 +17,10 @@ EVERY = 50_000
 
 def name(folder: Path) -> str:
     return str(folder.relative_to(RESULTS))
+
+
+def anchor(heading: str) -> str:
+    return "#" + re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)
@@ -47,10 +51,32 @@ def test_sensitivity_has_100_episodes_a_point(table: Path) -> None:
     assert all(f"seed {seed}" in picture for seed in seeds)
 
 
-def test_the_pages_show_what_lies_there_and_the_other_way_round() -> None:
+def test_every_picture_is_shown_and_every_shown_file_exists() -> None:
     text = text_of("docs/results.md") + text_of("docs/experiments.md")
     shown = set(re.findall(r"\(results/([^)#]+)\)", text))
-    lie = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*.*") if path.is_file()}
-    pictures = {one for one in lie if one.endswith((".png", ".gif"))}
-    assert shown <= lie
+    present = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*.*") if path.is_file()}
+    pictures = {file for file in present if file.endswith((".png", ".gif"))}
+    assert shown <= present
     assert pictures <= shown
+
+
+def test_every_result_answers_its_question() -> None:
+    parts = re.split(r"^#{2,3} ", text_of("docs/results.md"), flags=re.MULTILINE)[1:]
+    results = [part for part in parts if not part.startswith("Summary")]
+    assert results
+    for result in results:
+        questions, answers = result.count("**Question.**"), result.count("**Answer.**")
+        assert (questions, answers) == (1, 1), result[:80]
+        assert result.index("**Question.**") < result.index("**Answer.**")
+
+
+def test_every_experiment_asks_a_question_that_the_contents_list() -> None:
+    page = text_of("docs/experiments.md")
+    contents, _, entries = page.partition("\n## ")
+    headings = re.findall(r"^### (.+)$", entries, flags=re.MULTILINE)
+    assert headings
+    assert all(heading.endswith("?") for heading in headings)
+    groups = re.findall(r"^## (.+)$", f"\n## {entries}", flags=re.MULTILINE)
+    listed = re.findall(r"\]\((#[^)]+)\)", contents)
+    expected = [*headings, *(group for group in groups if group != "How to read this page")]
+    assert sorted(listed) == sorted(anchor(heading) for heading in expected)
