@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,20 +35,34 @@ def text_of(page: str | Path) -> str:
 _INLINE = re.compile(r"`((?:[^`\n]|\n(?!\n))+)`")
 
 
+class Block(NamedTuple):
+    """What stands in a fence.
+
+    Attributes:
+        language: after its backticks; empty for output and drawings.
+        title: name of the file that the reader is to write; mostly empty.
+        text: what stands in it.
+    """
+
+    language: str
+    title: str
+    text: str
+
+
 class Page:
     """A page, taken apart.
 
     Attributes:
-        code: what stands in fences, each with its language.
+        blocks: what stands in fences.
         prose: all but that.
         inline: code in the prose, each on one line.
         words: the prose without it.
     """
 
     def __init__(self, page: str | Path) -> None:
-        self.code: list[tuple[str, str]] = []
+        self.blocks: list[Block] = []
         self.prose = re.sub(
-            r"^ *```(\w*)[^\n]*\n(.*?)^ *```$",
+            r'^ *```(\w*)(?: title="([^"\n]*)")?[^\n]*\n(.*?)^ *```$',
             self._keep,
             text_of(page),
             flags=re.DOTALL | re.MULTILINE,
@@ -57,8 +72,13 @@ class Page:
         ]
         self.words = _INLINE.sub("", self.prose)
 
+    @property
+    def code(self) -> list[tuple[str, str]]:
+        """What stands in fences, each with its language."""
+        return [(block.language, block.text) for block in self.blocks]
+
     def _keep(self, match: re.Match[str]) -> str:
-        self.code.append((match[1], match[2]))
+        self.blocks.append(Block(match[1], match[2] or "", match[3]))
         return ""
 
 

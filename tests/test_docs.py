@@ -247,12 +247,26 @@ def test_every_log_line_of_weight_is_documented() -> None:
         assert shown == "…" or shown in documented, f"{path}: {shown}"
 
 
+LITERALS = re.sub(r'"\s*\n?\s*f?"', "", " ".join(text_of(path) for path in SOURCES))
+
+
+def is_in_the_code(message: str) -> bool:
+    """Say whether the code has a message, in which … stands for what varies."""
+    pattern = r"[^\n]{1,80}?".join(re.escape(part) for part in message.split("…"))
+    return re.search(pattern, LITERALS) is not None
+
+
 def test_no_log_line_is_documented_that_is_not_there() -> None:
-    text = " ".join(text_of(path) for path in SOURCES)
-    literal = re.sub(r'"\s*\n?\s*f?"', "", text)
     for line in names(section("docs/operations-reference.md", "## Log lines"), "line"):
-        pattern = r"[^\n]{1,80}?".join(re.escape(part) for part in line.split("…"))
-        assert re.search(pattern, literal), line
+        assert is_in_the_code(line), line
+
+
+def test_messages_in_troubleshooting_are_those_of_the_code() -> None:
+    text = Page("docs/troubleshooting.md").prose
+    messages = {*names(text, "message"), *re.findall(r"\*\*`([^`]+)`\*\*", text)}
+    assert len(messages) > 12
+    for message in messages:
+        assert is_in_the_code(message), message
 
 
 def test_every_make_target_is_documented() -> None:

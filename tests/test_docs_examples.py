@@ -200,8 +200,9 @@ def is_there(dotted: str) -> bool:
 
 @each_page
 def test_code_named_in_the_documentation_exists(page: Path) -> None:
-    modules = {path.name for path in files("*.py")}
-    for name in Page(page).inline:
+    parts = Page(page)
+    modules = {path.name for path in files("*.py")} | {block.title for block in parts.blocks}
+    for name in parts.inline:
         if re.search(r"/\d|NAME", name):
             continue  # a key of the protocol, or a placeholder
         if "/" in name and _PATH.fullmatch(name):

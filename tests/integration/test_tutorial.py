@@ -1,0 +1,93 @@
+"""The tutorial, command by command, as a reader follows it."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.markdown import Page
+from udrl_inspect.inspection import read_status
+
+BLOCKS = Page("docs/tutorial.md").blocks
+
+#: What differs between machines in the output, and what stands for it.
+_MASKS = [
+    (r"(Command returns|Higher commands|This agent does not) .*", "VERDICT"),
+    (r"  obeyed$|, cut by its time limit$", ""),
+    (r"-[0-9a-f]{8}\b", "-ID"),
+    (r"-?\d[\d.,]*(?:[:e]-?\d+)*", "N"),
+]
+
+
+def commands(text: str) -> list[list[str]]:
+    return [shlex.split(line) for line in text.replace("\\\n", " ").splitlines()]
+
+
+def masked(output: str) -> list[str]:
+    """Return the lines of an output without numbers and what depends on them."""
+    lines = []
+    for line in output.splitlines():
+        for pattern, mask in _MASKS:
+            line = re.sub(pattern, mask, line)
+        lines.append(" ".join(line.split()))
+    return [line for line in lines if line not in ("", "...")]
+
+
+def follow(command: list[str], folder: Path) -> str:
+    """Run one command of the page, and return all that it prints."""
+    program = {"udrl": [sys.executable, "-m", "udrl_launch"], "python": [sys.executable]}
+    done = subprocess.run(
+        program[command[0]] + command[1:], cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, timeout=200, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{shlex.join(command)}:\n{done.stdout}"
+    return done.stdout
+
+
+def obedience(run_dir: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((run_dir / "obedience.json").read_text(encoding="utf-8"))
+    return report
+
+
+@pytest.mark.timeout(400)  # Two trainings: 26 s of one core.
+def test_the_page_runs_and_its_agents_are_as_it_says(tmp_path: Path) -> None:
+    printed = ""
+    for language, title, text in BLOCKS:
+        if title:
+            (tmp_path / title).write_text(text, encoding="utf-8")
+        elif language == "sh":
+            for command in commands(text):
+                if command[0] != "pip":
+                    printed = follow(command, tmp_path)
+        else:
+            lines = iter(masked(printed))
+            for line in masked(text):
+                assert line in lines, f"the page has {line!r}, printed is:\n{printed}"
+
+    first, second = (tmp_path / "runs" / name for name in ("first", "second"))
+    for run_dir, least in ((first, 9), (second, 12)):  # of 16; random play obtains 5.4
+        evaluation = read_status(run_dir).closing_evaluation
+        assert evaluation is not None
+        assert evaluation.mean > least
+    assert obedience(first)["all_returns"]["mean_absolute_error"] > 2
+    assert obedience(second)["all_returns"]["mean_absolute_error"] < 1
+    obeyed = obedience(second)["obeyed"]
+    assert obeyed["high"] - obeyed["low"] >= 6
+
+
+def test_the_page_has_files_commands_and_output() -> None:
+    assert [block.title for block in BLOCKS if block.title] == ["orchard.py", "act.py"]
+    assert {block.language for block in BLOCKS} == {"", "python", "sh"}
+
+
+def test_an_output_that_the_page_does_not_show_would_be_found() -> None:
+    shown = (
+        "ended:  spent 40 env steps\n...\n  5.2  21  6.20  obeyed\nCommand returns between 4 and 8."
+    )
+    assert masked(shown) == ["ended: spent N env steps", "N N N", "VERDICT"]
+    assert masked("spent 40") != masked("spend 40")
