@@ -14,7 +14,7 @@ EXTRAS = board,box2d,doom,play,plot,secure,train
 PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet \
 	--constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: train test test-slow test-browser test-compose lint format types bench chaos soak fuzz setup setup-dev clean
+.PHONY: train test test-slow test-browser test-compose lint format types docs bench chaos soak fuzz setup setup-dev clean
 
 train: setup  ## Train LunarLander until it is solved: a mean return of 200.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 200 $(ARGS)
@@ -43,6 +43,9 @@ format: setup-dev  ## Format the code.
 types: setup-dev  ## The type checker.
 	$(VENV)/bin/mypy
 
+docs: $(VENV)/.installed-docs  ## The documentation as a site, in build/site; a broken link is an error.
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict $(ARGS)
+
 bench: setup-dev  ## Speed: the whole system beside the limit of its parts (docs/performance.md).
 	$(VENV)/bin/python benchmarks/speed.py $(ARGS)
 
@@ -69,6 +72,10 @@ $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,minari,tensorboard,dev]'
+	touch $@
+
+$(VENV)/.installed-docs: $(VENV)/bin/python pyproject.toml constraints.txt
+	$(PIP_INSTALL) --editable '.[docs]'
 	touch $@
 
 clean:
