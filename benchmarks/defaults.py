@@ -46,9 +46,7 @@ TASKS = {
     "LunarLander": Task("LunarLander-v3", 200_000, {}),
     "LunarLanderSparse": Task("LunarLanderSparse-v3", 200_000, {}),
     "TaxiMasked": Task("Taxi-v4", 200_000, {"action_mask": "info"}),
-    "Pendulum": Task(
-        "Pendulum-v1", 300_000, {"observe_time": True, "normalise_observations": True}
-    ),
+    "Pendulum": Task("Pendulum-v1", 300_000, {"normalise_observations": True}),
     "MountainCarContinuous": Task(
         "MountainCarContinuous-v0", 300_000, {"normalise_observations": True}
     ),

@@ -70,14 +70,14 @@ def test_the_page_runs_and_its_agents_are_as_it_says(tmp_path: Path) -> None:
                 assert line in lines, f"the page has {line!r}, printed is:\n{printed}"
 
     first, second = (tmp_path / "runs" / name for name in ("first", "second"))
-    for run_dir, least in ((first, 9), (second, 12)):  # of 16; random play obtains 5.4
+    for run_dir in (first, second):
         evaluation = read_status(run_dir).closing_evaluation
         assert evaluation is not None
-        assert evaluation.mean > least
-    assert obedience(first)["all_returns"]["mean_absolute_error"] > 2
-    assert obedience(second)["all_returns"]["mean_absolute_error"] < 1
-    obeyed = obedience(second)["obeyed"]
-    assert obeyed["high"] - obeyed["low"] >= 6
+        assert evaluation.mean > 14  # of 16; random play obtains 5.4
+    ranges = [obedience(run_dir)["obeyed"] for run_dir in (first, second)]
+    least, most = (obeyed["high"] - obeyed["low"] for obeyed in ranges)
+    assert 2 < least < most
+    assert most > 8
 
 
 def test_the_page_has_files_commands_and_output() -> None:
