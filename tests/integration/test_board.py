@@ -1,4 +1,4 @@
-"""The board's server on real runs: what it tells, what it refuses, and how its stage obeys."""
+"""The board's server on real runs: its news, its refusals and its stage."""
 
 import json
 import os
@@ -18,6 +18,8 @@ from starlette.testclient import TestClient
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
+from test_spaces import SETTINGS
+from udrl.config import Config, build
 from udrl.errors import ConfigError, StoreError, Unreachable
 from udrl_board import app as board
 from udrl_board import source
@@ -48,15 +50,24 @@ def client(ended_run: Path) -> Iterator[TestClient]:
 # What it tells.
 
 
+def scripts(client: TestClient) -> list[str]:
+    """Return all scripts that the page loads, directly or through another one."""
+    found = re.findall(r'<script .*src="([^"]+)"', client.get("/").text)
+    for name in found:
+        imported = re.findall(r'^import .* from "\./([^"]+)"', client.get(name).text, re.MULTILINE)
+        found += [one for one in imported if one not in found]
+    return found
+
+
 def test_the_page_and_its_parts(client: TestClient) -> None:
     main = client.get("/")
     assert "<title>udrl board</title>" in main.text
     assert "default-src 'none'" in main.headers["content-security-policy"]
     assert main.headers["x-content-type-options"] == "nosniff"
-    for part in ("board.js", "board.css", "vendor/uplot/uPlot.esm.js", "vendor/uplot/LICENSE"):
+    for part in ("board.css", "vendor/uplot/LICENSE", *scripts(client)):
         assert client.get(f"/{part}").status_code == 200
     assert client.get("/../app.py").status_code == 404
-    assert "://" not in main.text.replace("http://www.w3.org", ""), "the page needs nobody else"
+    assert "://" not in main.text.replace("http://www.w3.org", ""), "the page is self-contained"
 
 
 def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
@@ -210,15 +221,15 @@ def test_a_token_is_asked_for_and_becomes_a_cookie(ended_run: Path) -> None:
         known = {"cookie": cookie}
         with client.websocket_connect("/stage", headers=known) as socket:
             socket.send_text("{}")
-            assert "not an order" in socket.receive_json()["problem"]
+            assert "invalid request" in socket.receive_json()["problem"]
 
 
 # The stage.
 
 
-def begin(**changes: Any) -> dict[str, Any]:
+def start(**changes: Any) -> dict[str, Any]:
     usual = {
-        "do": "begin", "desired_return": 30.0, "desired_horizon": 40, "seed": 5,
+        "do": "start", "desired_return": 30.0, "desired_horizon": 40, "seed": 5,
         "temperature": 1.0, "version": "latest",
     }  # fmt: skip
     return usual | changes
@@ -249,11 +260,12 @@ def played(run_dir: Path, *options: object) -> dict[str, Any]:
 def test_the_stage_shows_the_episode_that_play_shows(client: TestClient, ended_run: Path) -> None:
     with client.websocket_connect("/stage") as socket:
         for temperature in (1.0, 0.0):
-            socket.send_json(begin(temperature=temperature))
+            socket.send_json(start(temperature=temperature))
             first = next(moments(socket))
             assert (first["step"], first["action"], first["over"]) == (0, None, False)
             assert first["picture"].startswith(b"\xff\xd8"), "a JPEG"
             assert sum(first["probabilities"]) == pytest.approx(1)
+            assert first["actions"] == [{"name": "", "values": ["push left", "push right"]}]
             last = ending(socket)
             expected = played(
                 ended_run, "--seed", 5, "--desired-return", 30, "--desired-horizon", 40,
@@ -261,87 +273,110 @@ def test_the_stage_shows_the_episode_that_play_shows(client: TestClient, ended_r
             )  # fmt: skip
             assert last["obtained"] == expected["episode_return"]
             assert last["step"] == expected["length"]
-            assert (last["asked_return"], last["asked_horizon"]) == (30.0, 40)
+            assert (last["commanded_return"], last["commanded_horizon"]) == (30.0, 40)
             assert last["version"] == load_agent(ended_run).version
 
 
-def test_pause_step_and_another_order_on_the_way(client: TestClient) -> None:
+def test_pause_step_and_another_command_on_the_way(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         seen = moments(socket)
-        socket.send_json(begin(paused=True))
+        socket.send_json(start(paused=True))
         assert next(seen)["paused"]
         for step in (1, 2):
             socket.send_json({"do": "step"})
             moment = next(seen)
             assert (moment["step"], moment["desired_return"]) == (step, 30.0 - step)
         socket.send_json(
-            {"do": "tell", "desired_return": 90.0, "desired_horizon": 70, "temperature": 0.0}
+            {"do": "change", "desired_return": 90.0, "desired_horizon": 70, "temperature": 0.0}
         )
         told = next(seen)
         assert (told["desired_return"], told["desired_horizon"]) == (90.0, 70)
-        assert (told["step"], told["was_told"], told["temperature"]) == (2, True, 0.0)
+        assert (told["step"], told["is_changed"], told["temperature"]) == (2, True, 0.0)
         socket.send_json({"do": "pause", "paused": False})
         last = ending(socket)
-        assert last["was_told"]
+        assert last["is_changed"]
         assert last["desired_return"] == 90.0 - (last["step"] - 2)
+
+
+def test_speed_changes_no_episode_and_delays_no_request(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udrl_board.stage.fps_of", lambda env: 1 / 16)
+    with client.websocket_connect("/stage") as socket:
+        socket.send_json(start())
+        assert next(moments(socket))["step"] == 0
+        # The next step is due in 16 seconds.
+        socket.send_json({"do": "pause", "paused": True})
+        assert next(moments(socket))["step"] <= 1
+        monkeypatch.setattr("udrl_board.stage.fps_of", lambda env: 50.0)
+        obtained = []
+        for speed in (4, 64):
+            socket.send_json({"do": "speed", "speed": speed})
+            socket.send_json(start())
+            obtained.append(ending(socket)["obtained"])
+        assert obtained[0] == obtained[1]
 
 
 def test_a_checkpoint_of_the_run_can_be_chosen(client: TestClient, ended_run: Path) -> None:
     kept = client.get("/news").json()["contents"]["versions"]
     assert len(kept) > 1
     with client.websocket_connect("/stage") as socket:
-        socket.send_json(begin(version=kept[0], paused=True))
+        socket.send_json(start(version=kept[0], paused=True))
         assert next(moments(socket))["version"] == kept[0]
-        socket.send_json(begin(version=10**9, paused=True))
+        socket.send_json(start(version=10**9, paused=True))
         assert "not kept" in next(moments(socket))["problem"]
-        socket.send_json(begin(paused=True))
+        socket.send_json(start(paused=True))
         assert next(moments(socket))["version"] == max(kept)
 
 
 @pytest.mark.parametrize(
-    "order",
-    ["", "[]", '{"do": "fly"}', '{"do": "begin"}', json.dumps(begin(desired_return="much")),
-     json.dumps(begin(seed=-1)), json.dumps(begin(temperature=-1.0)),
-     json.dumps(begin(surplus=1, desired_horizon=2**40))],
+    "request_",
+    ["", "[]", '{"do": "fly"}', '{"do": "start"}', json.dumps(start(desired_return="much")),
+     json.dumps(start(seed=-1)), json.dumps(start(temperature=-1.0)),
+     json.dumps(start(surplus=1, desired_horizon=2**40))],
 )  # fmt: skip
-def test_what_is_no_order_is_said_to_be_none(client: TestClient, order: str) -> None:
+def test_invalid_requests(client: TestClient, request_: str) -> None:
     with client.websocket_connect("/stage") as socket:
-        socket.send_text(order)
-        assert "not an order" in socket.receive_json()["problem"]
-        socket.send_json(begin(paused=True))
+        socket.send_text(request_)
+        assert "invalid request" in socket.receive_json()["problem"]
+        socket.send_json(start(paused=True))
         assert next(moments(socket))["step"] == 0
 
 
-def test_orders_before_an_episode_has_begun_do_nothing(client: TestClient) -> None:
+def test_requests_before_an_episode_do_nothing(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
-        for order in ({"do": "step"}, {"do": "pause", "paused": True}):
-            socket.send_json(order)
-        socket.send_json(begin(paused=True))
+        for request in (
+            {"do": "step"},
+            {"do": "pause", "paused": True},
+            {"do": "speed", "speed": 2},
+        ):
+            socket.send_json(request)
+        socket.send_json(start(paused=True))
         assert next(moments(socket))["step"] == 0
 
 
-def test_who_leaves_amid_a_flood_of_orders_leaves_the_board_free(client: TestClient) -> None:
+def test_leaving_amid_a_flood_of_requests_frees_the_stage(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         for _ in range(300):
-            socket.send_json(begin())
+            socket.send_json(start())
     assert client.get("/news").status_code == 200
     with client.websocket_connect("/stage") as socket:
-        socket.send_json(begin(paused=True))
+        socket.send_json(start(paused=True))
         assert next(moments(socket))["step"] == 0
 
 
-def test_a_refused_order_does_not_end_the_episode(client: TestClient) -> None:
+def test_a_refused_request_does_not_end_the_episode(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         seen = moments(socket)
-        socket.send_json(begin(paused=True))
+        socket.send_json(start(paused=True))
         next(seen)
-        socket.send_json({"do": "tell", "desired_return": 1e12, "desired_horizon": 1})
+        socket.send_json({"do": "change", "desired_return": 1e12, "desired_horizon": 1})
         assert next(seen)["is_over"] is False
         socket.send_json({"do": "step"})
         assert next(seen)["step"] == 1
 
 
-def test_whatever_a_picture_raises_is_told(
+def test_an_exception_of_a_picture_is_shown(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(rollout: object) -> None:
@@ -349,58 +384,56 @@ def test_whatever_a_picture_raises_is_told(
 
     monkeypatch.setattr("udrl.rollout.Rollout.picture", broken)
     with client.websocket_connect("/stage") as socket:
-        socket.send_json(begin())
+        socket.send_json(start())
         trouble = next(moments(socket))
         assert "no light" in trouble["problem"]
         assert trouble["is_over"]
 
 
-def test_after_a_failure_an_episode_can_begin(
+def test_after_a_failure_an_episode_can_start(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with client.websocket_connect("/stage") as socket:
         with monkeypatch.context() as patch:
             patch.setattr("udrl.rollout.Rollout.picture", lambda rollout: 1 / 0)
-            socket.send_json(begin())
+            socket.send_json(start())
             assert next(moments(socket))["is_over"]
-        socket.send_json(begin())
+        socket.send_json(start())
         assert ending(socket)["over"]
 
 
-def test_what_an_order_does_not_name_stays_as_it_is(client: TestClient) -> None:
+def test_what_a_change_does_not_name_stays_as_it_is(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
-        socket.send_json(begin(paused=True, desired_return=33.0, desired_horizon=44))
+        socket.send_json(start(paused=True, desired_return=33.0, desired_horizon=44))
         next(moments(socket))
-        socket.send_json({"do": "tell", "temperature": 0.0})
-        told = next(moments(socket))
-        asked = ("desired_return", "desired_horizon", "temperature")
-        assert [told[name] for name in asked] == [33.0, 44, 0.0]
-        assert told["was_told"]
+        socket.send_json({"do": "change", "temperature": 0.0})
+        moment = next(moments(socket))
+        command = [moment["desired_return"], moment["desired_horizon"], moment["temperature"]]
+        assert command == [33.0, 44, 0.0]
+        assert moment["is_changed"]
 
 
-def test_who_gives_no_orders_leaves_the_stage_to_others(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_idle_stage_is_closed(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     with client.websocket_connect("/stage") as socket:
-        socket.send_json(begin(paused=True))
+        socket.send_json(start(paused=True))
         next(moments(socket))
         monkeypatch.setattr(board, "IDLE_S", 0.05)
         socket.send_json({"do": "step"})
         next(moments(socket))
         with pytest.raises(WebSocketDisconnect) as left:
             socket.receive_json()
-        assert "Nobody gave an order" in left.value.reason
+        assert "without a request" in left.value.reason
 
 
 def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board, "MOST_STAGES", 1)
     with client.websocket_connect("/stage") as first:
-        first.send_json(begin(paused=True))
+        first.send_json(start(paused=True))
         next(moments(first))
         with client.websocket_connect("/stage") as second:
-            assert "try later" in second.receive_json()["problem"]
+            assert "try again later" in second.receive_json()["problem"]
     with client.websocket_connect("/stage") as third:
-        third.send_json(begin(paused=True))
+        third.send_json(start(paused=True))
         assert next(moments(third))["step"] == 0
 
 
@@ -411,10 +444,25 @@ def test_an_environment_without_pictures_is_played_all_the_same(
 
     run(toy(), 200, run_dir=tmp_path / "toy")
     with page(tmp_path / "toy") as client, client.websocket_connect("/stage") as socket:
-        socket.send_json(begin(desired_return=1.0, desired_horizon=1, temperature=0.0))
+        socket.send_json(start(desired_return=1.0, desired_horizon=1, temperature=0.0))
         last = ending(socket)
         assert last["picture"] is False
         assert last["step"] in (1, 2)
+
+
+def test_actions_of_several_components(run: Callable[..., Status], tmp_path: Path) -> None:
+    run(build(Config, SETTINGS), 400, run_dir=tmp_path / "nested")
+    with page(tmp_path / "nested") as client, client.websocket_connect("/stage") as socket:
+        socket.send_json(start(desired_horizon=8))
+        first = next(moments(socket))
+        components = {one["name"]: one["values"] for one in first["actions"]}
+        assert components["door"] == ["1", "2", "3"]
+        assert components["hands[1]"] == ["off", "on"]
+        assert components["legs[0]"][0] == "-1"
+        assert len(first["probabilities"]) == sum(map(len, components.values()))
+        last = ending(socket)
+        assert len(last["action"]) == len(components)
+        assert last["actions"] is None
 
 
 # Behind a proxy.
@@ -450,20 +498,20 @@ def test_a_proxy_may_show_the_board_under_a_path(ended_run: Path, host: str) -> 
         assert main.url == f"{HUB}{UNDER}/"
         assert "<title>udrl board</title>" in main.text
         (cookie,) = client.cookies.jar
-        assert cookie.path == UNDER, "nobody else behind the proxy gets it"
+        assert cookie.path == UNDER, "no other page behind the proxy gets it"
         for part in re.findall(r'(?:src|href)="([^"#]+)"', main.text):
             assert client.get(main.url.join(part), headers=own).status_code == 200
         assert client.get(main.url.join("news"), headers=own).status_code == 200
         stage = str(main.url.join("stage")).replace("https", "wss")
         with client.websocket_connect(stage, headers=own) as socket:
-            socket.send_json(begin(paused=True))
+            socket.send_json(start(paused=True))
             assert next(moments(socket))["step"] == 0
         strange = client.get(f"{UNDER}/news", headers={"origin": "https://evil.example"})
         assert strange.status_code == 403
         assert "--allow-origin https://evil.example" in strange.text
 
 
-def test_a_proxy_that_nobody_allowed_is_told_how(ended_run: Path) -> None:
+def test_the_page_of_an_unknown_proxy_says_how_to_allow_it(ended_run: Path) -> None:
     board = make_app(Feed(Directory(ended_run)))
     with TestClient(Proxy(board, "127.0.0.1"), base_url=HUB) as client:
         answer = client.get(f"{UNDER}/news", headers={"origin": HUB})

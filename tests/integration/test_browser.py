@@ -1,6 +1,7 @@
-"""The board in a real browser: it shows a live run, obeys orders, and needs nobody else."""
+"""The board in a real browser: it shows a live run, takes commands, and is self-contained."""
 
 import os
+import re
 import shutil
 import signal
 import threading
@@ -15,6 +16,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from test_spaces import SETTINGS
 from test_take_cover import TAKE_COVER
 from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
@@ -116,11 +118,16 @@ PAUSE_AT_ONCE = """() => {
 }"""
 
 
-def order(page: Page, desired_return: float, horizon: int = 4, seed: int = 1) -> None:
+def start(page: Page, desired_return: float, horizon: int = 4, seed: int = 1) -> None:
     page.get_by_label("Desired return", exact=True).fill(str(desired_return))
     page.get_by_label("Desired horizon, steps", exact=True).fill(str(horizon))
     page.get_by_label("Seed").fill(str(seed))
-    page.get_by_role("button", name="Begin an episode").click()
+    page.get_by_role("button", name="Start episode").click()
+
+
+def fact(page: Page, name: str, facts: str = "#moment") -> Any:
+    """Return the value of a number with a name."""
+    return page.locator(f"{facts} div").filter(has=page.get_by_text(name, exact=True)).locator("dd")
 
 
 def rows(page: Page) -> Any:
@@ -137,13 +144,14 @@ def test_a_live_run_appears_and_its_curve_grows(
     page = pages(url)
     other = pages(url)
     for one in (page, other):
-        expect(one.get_by_role("status").first).to_contain_text("running; exact", timeout=SOON)
+        expect(one.get_by_role("status").first).to_have_text("Running", timeout=SOON)
         expect(one.locator("#curve canvas")).to_be_visible(timeout=SOON)
         expect(one.locator("#actor-table tbody tr")).to_have_count(1)
+        assert one.locator("#details").get_attribute("open") is None
         heads = one.locator("#actor-table th").all_text_contents()
         cells = one.locator("#actor-table tbody td").all_text_contents()
-        told = dict(zip(heads, cells, strict=True))
-        assert (told["re-runs"], told["failures"], told["environments"]) == ("0", "0", "16")
+        shown = dict(zip(heads, cells, strict=True))
+        assert (shown["re-runs"], shown["failures"], shown["environments"]) == ("0", "0", "16")
     for _ in range(3):
         points = page.locator("#curve").get_attribute("data-points")
         grown = page.locator(f'#curve[data-points]:not([data-points="{points}"])')
@@ -151,16 +159,20 @@ def test_a_live_run_appears_and_its_curve_grows(
         now = page.locator("#curve").get_attribute("data-points")
         assert int(now or 0) > int(points or 0) > 0
     expect(page.locator("#buffer circle").first).to_be_visible()
-    expect(page.locator("#buffer .asked").first).to_be_visible()
+    expect(page.locator("#buffer .explored").first).to_be_visible()
     zoomed = read_after_zooming(page)
     points = page.locator("#curve").get_attribute("data-points")
     page.mouse.move(0, 0)
     expect(page.locator(f'#curve:not([data-points="{points}"])')).to_be_visible(timeout=SOON)
     assert read_at_the_end(page) == zoomed
+    page.get_by_role("button", name="Reset zoom").click()
+    assert read_at_the_end(page) != zoomed
+    expect(page.get_by_role("button", name="Reset zoom")).to_be_hidden()
 
 
 def read_at_the_end(page: Page) -> str:
     """Return what the cursor reads at the right end of the curve."""
+    page.locator("#curve").scroll_into_view_if_needed()
     box = page.locator("#curve .u-over").bounding_box()
     assert box is not None
     page.mouse.move(box["x"] + box["width"] - 1, box["y"] + 20)
@@ -186,12 +198,15 @@ def test_a_command_is_given_and_obeyed(
 ) -> None:
     page = pages(board(obedient))
     expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
-    page.get_by_label("greedy").check()
-    for number, told in enumerate((3, 1, 4, 0, 2), start=1):
-        order(page, told)
+    page.get_by_label("Greedy").check()
+    for number, commanded in enumerate((3, 1, 4, 0, 2), start=1):
+        start(page, commanded)
         expect(rows(page)).to_have_count(number, timeout=SOON)
         cells = rows(page).first.locator("td").all_text_contents()
-        assert cells[2:6] == [str(told), "4", str(told), "4"]
+        assert cells[:4] == [str(commanded), str(commanded), "4", "4"]
+        expect(page.locator("#outcome")).to_have_text(
+            f"Commanded {commanded} in 4 steps; obtained {commanded} in 4 steps."
+        )
         expect(page.locator("#obeyed circle")).to_have_count(number)
     expect(page.locator("#no-picture")).to_contain_text("draws no pictures")
 
@@ -218,7 +233,7 @@ def test_keyboard_only(
         page.keyboard.type(text)
 
     page.keyboard.press("Tab")
-    page.keyboard.press("Enter")  # skip to commanding
+    page.keyboard.press("Enter")  # skip to the command
     tab_to("desired-return-slider")
     before = page.locator("#desired-return").input_value()
     page.keyboard.press("ArrowLeft")
@@ -227,44 +242,47 @@ def test_keyboard_only(
     type_into("desired-horizon", "4")
     tab_to("greedy")
     page.keyboard.press("Space")
-    tab_to("begin")
+    tab_to("start")
     page.keyboard.press("Enter")
     expect(rows(page)).to_have_count(1, timeout=SOON)
-    assert rows(page).first.locator("td").all_text_contents()[4] == "2"
+    assert rows(page).first.locator("td").all_text_contents()[1] == "2"
 
 
-def test_an_order_is_changed_on_the_way(
+def test_a_command_is_changed_during_the_episode(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     page = pages(board(ended_run))
     expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
     page.evaluate(PAUSE_AT_ONCE)
-    order(page, 400, 400)
-    expect(page.get_by_role("button", name="Go on")).to_be_visible(timeout=SOON)
-    step = page.locator("#moment dd").first
+    start(page, 400, 400)
+    expect(page.get_by_role("button", name="Resume")).to_be_visible(timeout=SOON)
+    step, change = fact(page, "step"), page.get_by_role("button", name="Change command")
+    expect(page.locator(".primary")).to_have_text("Resume")
     at = int(step.inner_text())
     page.get_by_role("button", name="Step").click()
     expect(step).to_have_text(str(at + 1))
     page.get_by_label("Desired return", exact=True).fill("77")
-    page.get_by_role("button", name="Change the command now").click()
-    expect(page.locator("#moment dd").nth(2)).to_have_text("77")
+    expect(page.locator(".primary")).to_have_text("Change command")
+    change.click()
+    expect(fact(page, "desired return now")).to_have_text("77")
+    expect(page.locator(".primary")).to_have_text("Resume")
     expect(page.locator("#picture")).to_be_visible()
-    # Enter in a field tells the episode too, and does not throw it away.
+    # Enter in a field changes the command too, and does not start another episode.
     page.get_by_label("Desired horizon, steps", exact=True).fill("55")
     page.keyboard.press("Enter")
-    expect(page.locator("#moment dd").nth(3)).to_have_text("55 steps")
-    expect(page.locator("#map .left")).to_have_count(1)
-    # Nothing is told that is no number, and sampling instead changes nothing else.
+    expect(fact(page, "desired horizon now")).to_have_text("55 steps")
+    expect(page.locator("#map .active")).to_have_count(1)
+    # What is no number changes nothing; neither does another temperature.
     page.get_by_label("Desired return", exact=True).fill("")
-    page.get_by_role("button", name="Change the command now").click()
-    page.get_by_label("greedy").check()
+    change.click()
+    page.get_by_label("Greedy").check()
     page.get_by_role("button", name="Step").click()
     expect(step).to_have_text(str(at + 2))
-    expect(page.locator("#moment dd").nth(2)).to_have_text("76")
-    page.get_by_role("button", name="Go on").click()
+    expect(fact(page, "desired return now")).to_have_text("76")
+    page.get_by_role("button", name="Resume").click()
     expect(rows(page)).to_have_count(1, timeout=SOON)
-    expect(rows(page).first).to_contain_text("greedy, told anew on the way")
-    expect(page.locator("#map .left")).to_have_count(0)
+    expect(rows(page).first).to_contain_text("greedy, command changed")
+    expect(page.locator("#map .active")).to_have_count(0)
 
 
 @pytest.mark.parametrize("settings", [LANDER | {"max_episode_steps": 120}, TAKE_COVER])
@@ -284,7 +302,7 @@ def test_the_agent_is_watched_in_its_world(
         expect(horizon).to_have_value("60")
     else:
         horizon.fill("60")
-    page.get_by_role("button", name="Begin an episode").click()
+    page.get_by_role("button", name="Start episode").click()
     picture = page.locator("#picture")
     expect(picture).to_be_visible(timeout=SOON)
     expect(rows(page)).to_have_count(1, timeout=60_000)
@@ -293,7 +311,7 @@ def test_the_agent_is_watched_in_its_world(
     assert height > 100
 
 
-def test_the_map_is_clicked_and_says_what_was_never_seen(
+def test_the_map_is_clicked_and_says_whether_there_are_similar_episodes(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     url = board(ended_run)
@@ -302,16 +320,20 @@ def test_the_map_is_clicked_and_says_what_was_never_seen(
     seen = page.request.get(f"{url}news").json()["contents"]
     page.get_by_label("Desired return", exact=True).fill(str(seen["returns"][0]))
     page.get_by_label("Desired horizon, steps", exact=True).fill(str(seen["lengths"][0]))
-    expect(page.locator("#unseen")).to_contain_text("has episodes like this")
+    expect(page.locator("#similar")).to_have_text("The buffer has similar episodes.")
     box = page.locator("#map svg").bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + 0.15 * box["width"], box["y"] + 0.1 * box["height"])
-    expect(page.locator("#unseen")).to_contain_text("no episode like this")
+    expect(page.locator("#similar")).to_contain_text("No similar episodes")
     chosen = [
         float(page.locator(f"#desired-{what}").input_value()) for what in ("return", "horizon")
     ]
-    assert chosen[0] < min(seen["returns"])
-    assert chosen[1] >= max(seen["lengths"])
+    # On CartPole a return is a length: few points of the plane are possible.
+    assert chosen[0] < chosen[1]
+    expect(page.locator("#map .chosen.outside")).to_have_count(0)
+    page.get_by_label("Desired return", exact=True).fill("100000")
+    expect(page.locator("#similar")).to_contain_text("This command is outside the map.")
+    expect(page.locator("#map .chosen.outside")).to_have_count(1)
 
 
 def test_the_map_shows_which_returns_the_agent_obeys(
@@ -348,7 +370,7 @@ def test_the_server_dies_and_comes_back(
     assert first.stdout is not None
     page = pages(first.stdout.readline().split()[1])
     expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
-    order(page, 1)
+    start(page, 1)
     expect(rows(page)).to_have_count(1, timeout=SOON)
     first.kill()
     expect(page.get_by_role("alert")).to_contain_text("does not answer", timeout=SOON)
@@ -356,7 +378,7 @@ def test_the_server_dies_and_comes_back(
     assert second.stdout is not None
     assert second.stdout.readline()
     expect(page.get_by_role("alert")).to_be_hidden(timeout=SOON)
-    order(page, 1)
+    start(page, 1)
     expect(rows(page)).to_have_count(2, timeout=SOON)
 
 
@@ -372,12 +394,12 @@ def test_the_cursor_reads_the_curve(
     box = curve.bounding_box()
     assert box is not None
     curve.hover(position={"x": box["width"] - 2, "y": 20})
-    expect(said).to_contain_text(f"closing evaluation {closing.mean:,.1f}".removesuffix(".0"))
+    expect(said).to_contain_text(f"final evaluation {closing.mean:,.1f}".removesuffix(".0"))
     page.mouse.move(0, 0)
     expect(said).to_have_text(summary)
 
 
-def test_a_run_that_failed_says_why_and_what_helps(
+def test_a_failed_run_says_why_and_how_to_resume(
     board: Callable[..., str], pages: Callable[..., Page], run: Callable[..., Status],
     tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -385,31 +407,33 @@ def test_a_run_that_failed_says_why_and_what_helps(
     with pytest.raises(RunFailed):
         run(small(environment="flaky_environments:Cursed-v0"), 2000, run_dir=run_dir)
     page = pages(board(run_dir))
-    expect(page.get_by_role("status").first).to_contain_text("failed", timeout=SOON)
+    expect(page.get_by_role("status").first).to_have_text("Failed", timeout=SOON)
     expect(page.get_by_role("alert")).to_contain_text("reproduce it with: udrl reproduce")
     again = f"udrl train flaky_environments:Cursed-v0 --run-dir {run_dir} --resume"
-    expect(page.locator("#no-actors")).to_contain_text(f"When the cause is mended: {again}")
+    expect(page.locator("#next")).to_contain_text(
+        f"Resume the run when the cause is fixed: {again}"
+    )
 
 
-def test_a_run_that_was_stopped_says_how_it_goes_on(
+def test_a_stopped_run_says_how_to_resume(
     cli: Callable[..., Cli], board: Callable[..., str], pages: Callable[..., Page], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
     process = cli(*arguments(SMALL, 10_000_000, run_dir), "--actors", "1")
     wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 2, "some iterations")
     page = pages(board(run_dir))
-    expect(page.get_by_role("status").first).to_contain_text("running", timeout=SOON)
+    expect(page.get_by_role("status").first).to_contain_text("Running", timeout=SOON)
     process.process.send_signal(signal.SIGINT)
     process.finish()
-    expect(page.get_by_role("status").first).to_contain_text("stopped", timeout=SOON)
-    expect(page.locator("#no-actors")).to_have_text(
-        "Nobody works on this run. It goes on where it was: "
+    expect(page.get_by_role("status").first).to_contain_text("Stopped", timeout=SOON)
+    expect(page.locator("#next")).to_have_text(
+        "No process is running this run. Resume it: "
         f"udrl train CartPole-v1 --run-dir {run_dir} --resume"
     )
     expect(page.get_by_role("alert")).to_be_hidden()
 
 
-def test_who_lied_is_named(
+def test_quarantined_actors_are_named(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -422,6 +446,64 @@ def test_who_lied_is_named(
     )
 
 
+def test_presets_are_commands_of_the_buffer(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
+) -> None:
+    url = board(ended_run)
+    page = pages(url)
+    buttons = page.locator("#presets button")
+    expect(buttons).to_have_text(["Best", "Longest", "Worst and quick"], timeout=SOON)
+    seen = page.request.get(f"{url}news").json()["contents"]
+    field = page.get_by_label("Desired return", exact=True)
+    expected = (seen["desired_return"], max(seen["returns"]))
+    for button, wanted in zip(("Best", "Longest"), expected, strict=True):
+        page.get_by_role("button", name=button, exact=True).click()
+        assert float(field.input_value()) == pytest.approx(wanted, abs=0.051)
+    page.get_by_role("button", name="Worst and quick").click()
+    lowest = sorted(seen["returns"])
+    assert float(field.input_value()) <= lowest[round(0.1 * (len(lowest) - 1))]
+
+
+def test_actions_of_several_components_have_names(
+    board: Callable[..., str], pages: Callable[..., Page], run: Callable[..., Status],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    run(build(Config, SETTINGS | {"action_bins": 9}), 400, run_dir=tmp_path / "nested")
+    page = pages(board(tmp_path / "nested"))
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    page.evaluate(PAUSE_AT_ONCE)
+    start(page, 3, 8)
+    expect(page.get_by_role("button", name="Resume")).to_be_visible(timeout=SOON)
+    bars = page.locator("#actions .bars")
+    expect(bars).to_have_count(3)
+    expect(bars.first.locator(".value")).to_have_text(["1", "2", "3"])
+    shares = bars.first.locator(".share").all_text_contents()
+    assert 98 <= sum(int(share.split()[0]) for share in shares) <= 102
+    expect(bars.nth(2)).to_contain_text("hands[1]")
+    histograms = page.locator("#actions .histogram")
+    expect(histograms).to_have_count(2)
+    expect(histograms.first.locator("rect")).to_have_count(9)
+    expect(histograms.first).to_contain_text("legs[0]: most likely")
+    page.get_by_role("button", name="Resume").click()
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    expect(fact(page, "last action")).to_have_text(re.compile(r"^[123](, (on|off)){2}(, \S+){2}$"))
+
+
+def test_on_a_phone_the_picture_and_pause_are_seen_together(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
+) -> None:
+    page = pages(board(ended_run), viewport={"width": 400, "height": 800})
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    start(page, 50, 50)
+    expect(page.locator("#picture")).to_be_visible(timeout=SOON)
+    page.evaluate("scrollTo(0, 0)")
+    picture, pause = (page.locator(f"#{name}").bounding_box() for name in ("picture", "pause"))
+    assert picture is not None
+    assert pause is not None
+    assert picture["y"] >= 0
+    assert pause["y"] + pause["height"] <= 800
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [400, 1200])
 def test_it_is_accessible_and_fits(
@@ -432,8 +514,10 @@ def test_it_is_accessible_and_fits(
         bypass_csp=True,  # the checker is put into the page
     )  # fmt: skip
     expect(page.locator("#curve canvas")).to_be_visible(timeout=SOON)
-    order(page, 50, 50)
+    start(page, 50, 50)
     expect(rows(page)).to_have_count(1, timeout=SOON)
+    page.locator("#details summary").click()
+    expect(page.locator("#loss canvas")).to_be_visible()
     found = Axe().run(page)
     assert found.violations_count == 0, found.generate_report()
     assert page.evaluate("document.documentElement.scrollWidth") <= width

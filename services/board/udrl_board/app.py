@@ -1,4 +1,4 @@
-"""The board's web server: a page, what is new for it, and a stage for each that wants one."""
+"""The board's web server: the page, its news, and a stage for every viewer."""
 
 import asyncio
 import contextlib
@@ -25,17 +25,18 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from udrl_board.feed import Feed
-from udrl_board.stage import Moment, Order, Stage, Trouble
+from udrl_board.stage import Stage
+from udrl_board.stage_messages import Moment, StageProblem, StageRequest
 
 log = logging.getLogger("udrl")
 
 #: Stages at a time; each has an environment of its own.
 MOST_STAGES = 8
-#: Bytes of an order; the server is told.
+#: Bytes of a request; the web server checks.
 MOST_BYTES = 4096
-#: Seconds without an order after which a stage on which nobody acts is for others.
+#: Seconds without a request after which an idle stage is closed.
 IDLE_S = 300.0
-#: Seconds that a picture may take to be sent; who is slower is not there any more.
+#: Seconds that a picture may take to be sent; a slower viewer is disconnected.
 _SEND_S = 20.0
 
 
@@ -183,11 +184,11 @@ class _Board:
         return Response(msgspec.json.encode(news), media_type="application/json")
 
     async def stage(self, socket: WebSocket) -> None:
-        """Let somebody give orders, and show what comes of them."""
+        """Take a viewer's requests, and show the episodes."""
         await socket.accept()
         if self._stages >= MOST_STAGES:
-            problem = f"{MOST_STAGES} others are watching an agent, which is the most; try later"
-            await socket.send_text(msgspec.json.encode(Trouble(problem=problem)).decode())
+            problem = f"all {MOST_STAGES} stages are in use; try again later"
+            await socket.send_text(msgspec.json.encode(StageProblem(problem=problem)).decode())
             await socket.close(1013)
             return
         self._stages += 1
@@ -202,25 +203,25 @@ class _Board:
 
 
 async def _listen(socket: WebSocket, stage: Stage) -> None:
-    """Pass on orders until whoever gives them leaves."""
+    """Pass on requests until the viewer leaves."""
     while True:
         try:
             text = await asyncio.wait_for(socket.receive_text(), IDLE_S)
         except TimeoutError:
             if stage.is_acting:
                 continue
-            await socket.close(1001, f"Nobody gave an order for {IDLE_S:.0f} seconds")
+            await socket.close(1001, f"Closed after {IDLE_S:.0f} seconds without a request")
             return
         except (WebSocketDisconnect, KeyError):  # a binary message has no text
             return
         problem = ""
         try:
-            if not stage.order(msgspec.json.decode(text, type=Order)):
-                problem = "too many orders at once"
+            if not stage.request(msgspec.json.decode(text, type=StageRequest)):
+                problem = "too many requests at once"
         except (msgspec.ValidationError, msgspec.DecodeError) as error:
-            problem = f"not an order: {error}"
+            problem = f"invalid request: {error}"
         if problem:
-            await socket.send_text(msgspec.json.encode(Trouble(problem=problem)).decode())
+            await socket.send_text(msgspec.json.encode(StageProblem(problem=problem)).decode())
 
 
 #: What sending raises when the socket, the server's end of it, or the loop is no more.
@@ -229,22 +230,22 @@ _GONE = (
     anyio.BrokenResourceError, anyio.ClosedResourceError,
 )  # fmt: skip
 
-Sender = Callable[[Moment | Trouble, bytes | None], None]
+Sender = Callable[[Moment | StageProblem, bytes | None], None]
 
 
 def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
-    """Return what a stage's thread shows its moments with; it waits until they are sent."""
+    """Return what shows a stage's moments; it waits until they are sent."""
 
-    async def send(news: Moment | Trouble, picture: bytes | None) -> None:
+    async def send(news: Moment | StageProblem, picture: bytes | None) -> None:
         await socket.send_text(msgspec.json.encode(news).decode())
         if picture is not None:
             await socket.send_bytes(picture)
 
-    def show(news: Moment | Trouble, picture: bytes | None) -> None:
+    def show(news: Moment | StageProblem, picture: bytes | None) -> None:
         sending: Awaitable[None] = asyncio.wait_for(send(news, picture), _SEND_S)
         try:
             asyncio.run_coroutine_threadsafe(sending, loop).result(_SEND_S + 1)  # type: ignore[arg-type]
         except _GONE as error:
-            raise ConnectionError(f"nobody watches: {error}") from error
+            raise ConnectionError(f"the viewer has left: {error}") from error
 
     return show

@@ -1,18 +1,29 @@
-// Lines against env steps, drawn by uPlot: lines with bands, a cursor that reads them, zoom by dragging.
+// Lines against env steps, drawn by uPlot: bands, a cursor that reads the lines, zoom by dragging.
+import { labels } from "./format.js";
+import { made, say } from "./page.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
-import { labels } from "./page.js";
 
 const MOST_POINTS = 1500;
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const faded = (name, share) => `color-mix(in srgb, ${colour(name)} ${share}%, transparent)`;
 
-// Every n-th row, the last one always: a chart has a thousand pixels.
+// Every n-th row, and always the last one: a chart has about a thousand pixels.
 export function thin(rows) {
   const n = Math.ceil(rows.length / MOST_POINTS);
   return n < 2 ? rows : rows.filter((_, i) => (rows.length - 1 - i) % n === 0);
 }
 
-// One sorted axis for rows that were measured at different env steps; what a row lacks is undefined.
+// The mean of every value and up to n - 1 before it.
+export function smooth(values, n) {
+  let sum = 0;
+  return values.map((value, i) => {
+    sum += value - (i >= n ? values[i - n] : 0);
+    return sum / Math.min(i + 1, n);
+  });
+}
+
+// One sorted axis for rows that were measured at different env steps; missing values are undefined.
 export function merge(...tables) {
   const at = new Map();
   for (const [rows, x, columns] of tables)
@@ -27,28 +38,20 @@ export function merge(...tables) {
 }
 
 export class Chart {
-  // lines: [{colour, width?, dash?, points?, hollow?}]; bands: [[upper, lower, colour]] by the lines' numbers;
-  // legend: [[label, colour, "line" | "dot" | "band"]].
-  constructor(place, said, lines, { bands = [], legend = [] } = {}) {
+  // lines: [{colour, width?, dash?, points?, hollow?, pale?, quiet?}], quiet: without a dot at the cursor;
+  // bands: [[upper, lower, colour]] by the lines' numbers.
+  constructor(place, said, lines, bands = []) {
     Object.assign(this, { place, said, lines, bands });
     this.height = place.classList.contains("small") ? 150 : 300;
     this.data = [[], ...lines.map(() => [])];
-    if (legend.length) place.before(this.legend(legend));
-    new ResizeObserver(() => this.resize()).observe(place);
+    this.reset = made("button", { type: "button", className: "reset", textContent: "Reset zoom", hidden: true });
+    this.reset.addEventListener("click", () => this.plot.setData(this.data));
+    place.before(this.reset);
+    new ResizeObserver(() => (this.plot ? this.resize() : this.redraw())).observe(place);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
   }
 
-  legend(entries) {
-    const list = Object.assign(document.createElement("ul"), { className: "legend" });
-    for (const [label, name, kind] of entries) {
-      const item = Object.assign(document.createElement("li"), { textContent: label });
-      item.prepend(Object.assign(document.createElement("span"), { className: `swatch ${kind} ${name}` }));
-      list.append(item);
-    }
-    return list;
-  }
-
-  // summary: what is said below; read(i): what is said of the i-th place, under the cursor.
+  // summary: the text below; read(i): the text for the i-th place, under the cursor.
   show(xs, columns, summary, read) {
     this.data = [xs, ...columns];
     this.place.dataset.points = xs.length;
@@ -56,28 +59,38 @@ export class Chart {
     if (!xs.length) return;
     if (this.plot) this.update();
     else this.redraw();
-    this.say(this.plot.cursor.idx);
+    this.say(this.plot?.cursor.idx);
   }
 
-  // A part that somebody dragged open stays open.
+  isZoomed(xs) {
+    const { min, max } = this.plot.scales.x;
+    return min > xs[0] || max < xs.at(-1);
+  }
+
+  // A part that was zoomed into stays.
   update() {
-    const { min, max } = this.plot.scales.x, shown = this.plot.data[0];
-    const isWhole = min <= shown[0] && max >= shown.at(-1);
-    this.plot.setData(this.data, isWhole);
-    if (!isWhole) this.plot.setScale("x", { min, max });
+    const { min, max } = this.plot.scales.x, isZoomed = this.isZoomed(this.plot.data[0]);
+    this.plot.setData(this.data, !isZoomed);
+    if (isZoomed) this.plot.setScale("x", { min, max });
   }
 
   say(place) {
-    const text = place == null ? this.summary : this.read(place);
-    if (this.said.textContent !== text) this.said.textContent = text;
+    say(this.said, place == null ? this.summary : this.read(place));
   }
 
   resize() {
-    this.plot?.setSize({ width: this.place.clientWidth, height: this.height });
+    if (this.place.clientWidth) this.plot.setSize({ width: this.place.clientWidth, height: this.height });
+  }
+
+  // The cursor reads of every line its last value there, which may be older.
+  lastAt(plot, line, place) {
+    if (line === 0) return place;
+    while (place >= 0 && plot.data[line][place] == null) place--;
+    return place >= 0 && plot.data[0][place] >= plot.scales.x.min ? place : null;
   }
 
   redraw() {
-    if (!this.data[0].length) return;
+    if (!this.data[0].length || !this.place.clientWidth) return;
     this.plot?.destroy();
     const axis = {
       stroke: colour("faint"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") },
@@ -92,7 +105,7 @@ export class Chart {
         series: [
           {},
           ...this.lines.map((line) => ({
-            stroke: colour(line.colour),
+            stroke: line.pale ? faded(line.colour, 35) : colour(line.colour),
             width: line.width ?? 1,
             dash: line.dash,
             spanGaps: true,
@@ -100,13 +113,25 @@ export class Chart {
             points: { show: line.points ?? line.hollow ?? false, size: line.hollow ? 12 : 5, width: line.hollow ? 2 : 1, fill: colour("card") },
           })),
         ],
-        bands: this.bands.map(([upper, lower, name]) => ({ series: [upper + 1, lower + 1], fill: `color-mix(in srgb, ${colour(name)} 22%, transparent)` })),
+        bands: this.bands.map(([upper, lower, name]) => ({ series: [upper + 1, lower + 1], fill: faded(name, 22) })),
         legend: { show: false },
-        cursor: { y: false, points: { fill: (_, line) => colour(this.lines[line - 1].colour), size: 7 } },
-        hooks: { setCursor: [(plot) => this.say(plot.cursor.idx)] },
+        cursor: {
+          y: false,
+          dataIdx: (plot, line, place) => this.lastAt(plot, line, place),
+          points: {
+            show: (_, line) => (line && !this.lines[line - 1].quiet ? made("div") : undefined),
+            fill: (_, line) => colour(this.lines[line - 1].colour),
+            size: 7,
+          },
+        },
+        hooks: {
+          setCursor: [(plot) => this.say(plot.cursor.idx)],
+          setScale: [(plot, key) => { if (key === "x" && this.plot === plot) this.reset.hidden = !this.isZoomed(plot.data[0]); }],
+        },
       },
       this.data,
       this.place,
     );
+    this.reset.hidden = true;
   }
 }

@@ -1,35 +1,57 @@
-// What every script of the page needs: its elements, numbers as people read them, lists of facts.
+// Elements of the page: find them, fill them, make new ones.
+const SVG = "http://www.w3.org/2000/svg";
+
 export const $ = (id) => document.getElementById(id);
 
-// Numbers below ten with three digits, others with one after the point; or with as many there as are wanted.
-export const number = (x, digits) =>
-  x == null
-    ? "–"
-    : x.toLocaleString("en", digits === undefined && Math.abs(x) < 10 ? { maximumSignificantDigits: 3 } : { maximumFractionDigits: digits ?? 1 });
-
-// Numbers of an axis in the largest unit that fits, with as many digits as tell them apart.
-export function labels(values) {
-  const most = Math.max(...values.map(Math.abs));
-  const [unit, suffix] = most >= 1e6 ? [1e6, "M"] : most >= 1e4 ? [1e3, "K"] : [1, ""];
-  const whole = (x, digits) => Math.abs(x * 10 ** digits - Math.round(x * 10 ** digits)) < 1e-6;
-  const digits = [0, 1, 2, 3].find((d) => values.every((v) => whole(v / unit, d))) ?? 4;
-  return values.map((v) => (v === 0 ? "0" : `${(v / unit).toFixed(digits)}${suffix}`));
+// Set a text only if it is new: screen readers announce every change.
+export function say(element, text) {
+  if (element.textContent !== text) element.textContent = text;
 }
 
-// The least of 1, 2, 5, 10, 20, ... times a power of ten that is not less.
-export function nice(x) {
-  const power = 10 ** Math.floor(Math.log10(x));
-  return [1, 2, 5, 10].map((m) => m * power).find((s) => s >= x * (1 - 1e-9));
+export const made = (name, properties = {}) => Object.assign(document.createElement(name), properties);
+
+export function svg(name, attributes = {}, text = "") {
+  const element = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  if (text) element.textContent = text;
+  return element;
 }
 
 export function facts(list, entries) {
   list.replaceChildren(
     ...entries.map(([name, value]) => {
-      const pair = document.createElement("div"), term = document.createElement("dt"), said = document.createElement("dd");
-      term.textContent = name;
-      said.textContent = value;
-      pair.append(term, said);
+      const pair = made("div");
+      pair.append(made("dt", { textContent: name }), made("dd", { textContent: value }));
       return pair;
+    }),
+  );
+}
+
+export const lines = (list, texts) => list.replaceChildren(...texts.map((textContent) => made("li", { textContent })));
+
+// The path of a mark with its middle at (x, y).
+const SHAPES = {
+  line: (x, y, r) => `M${x - r},${y}h${2 * r}`,
+  band: (x, y, r) => `M${x - r},${y - 5}h${2 * r}v10h${-2 * r}Z`,
+  dot: (x, y, r) => `M${x - r},${y}a${r},${r} 0 1,0 ${2 * r},0a${r},${r} 0 1,0 ${-2 * r},0`,
+  cross: (x, y, r) => `M${x - r},${y - r}l${2 * r},${2 * r}m0,${-2 * r}l${-2 * r},${2 * r}`,
+  diamond: (x, y, r) => `M${x},${y - r}l${r},${r}l${-r},${r}l${-r},${-r}Z`,
+  right: (x, y, r) => `M${x},${y}l${-r},${-r}v${2 * r}Z`,
+  left: (x, y, r) => `M${x},${y}l${r},${-r}v${2 * r}Z`,
+  up: (x, y, r) => `M${x},${y}l${-r},${r}h${2 * r}Z`,
+  down: (x, y, r) => `M${x},${y}l${-r},${-r}h${2 * r}Z`,
+};
+
+export const mark = (shape, x, y, r, name) => svg("path", { class: `mark ${name}`, d: SHAPES[shape](x, y, r) });
+
+// entries: [[label, shape, class]].
+export function legend(list, entries) {
+  list.replaceChildren(
+    ...entries.map(([label, shape, name]) => {
+      const item = made("li"), picture = svg("svg", { width: 22, height: 14, "aria-hidden": "true" });
+      picture.append(mark(shape, 11, 7, { line: 11, band: 9, dot: 4 }[shape] ?? 5, name));
+      item.append(picture, label);
+      return item;
     }),
   );
 }

@@ -1,0 +1,72 @@
+// The replay buffer: the part of its plane to show, similar episodes, and commands that it suggests.
+import { count } from "./format.js";
+
+const CELLS = 36;
+// Names of the three presets, for environments in which they have better ones.
+const PRESETS = [[/^LunarLander/, ["Land", "Hover", "Crash quickly"]], [/./, ["Best", "Longest", "Worst and quick"]]];
+
+const sorted = (numbers) => numbers.toSorted((a, b) => a - b);
+const quantile = (numbers, q) => sorted(numbers)[Math.round(q * (numbers.length - 1))];
+
+const padded = (low, high) => {
+  if (!(high > low)) [low, high] = [low - 1, high + 1];
+  const room = 0.1 * (high - low);
+  return [low - room, high + room];
+};
+
+// Ranges of returns and lengths. Accidents, which are few low returns and few long episodes, would
+// leave no room for the others: they are outside.
+export function ranges({ returns, lengths }, more = []) {
+  const far = (numbers) => 0.25 * (quantile(numbers, 0.9) - quantile(numbers, 0.1)) || Infinity;
+  const low = quantile(returns, 0.1) - far(returns), high = quantile(lengths, 0.9) + far(lengths);
+  const xs = [...returns.filter((r) => r >= low), ...more.map(([r]) => r)];
+  const ys = [...lengths.filter((l) => l <= high), ...more.map(([, h]) => h)];
+  const [bottom, top] = padded(Math.min(...ys), Math.max(...ys));
+  return [padded(Math.min(...xs), Math.max(...xs)), [Math.max(0, bottom), top]];
+}
+
+export function outside({ returns, lengths }, plane) {
+  const n = returns.filter((r, i) => !plane.has(r, lengths[i])).length;
+  return n ? ` ${count(n, "episode is", "episodes are")} outside the map.` : "";
+}
+
+// The cells of the plane that have episodes in them, or next to them.
+export class Similar {
+  constructor({ returns, lengths }, xs, ys) {
+    Object.assign(this, { xs, ys });
+    this.cells = new Set();
+    returns.forEach((r, i) => {
+      const [x, y] = this.cell(r, lengths[i]);
+      for (const dx of [-1, 0, 1]) for (const dy of [-1, 0, 1]) this.cells.add(`${x + dx},${y + dy}`);
+    });
+  }
+
+  cell(r, length) {
+    const part = (value, [low, high]) => Math.floor(((value - low) / (high - low)) * CELLS);
+    return [part(r, this.xs), part(length, this.ys)];
+  }
+
+  has(r, length) {
+    return this.cells.has(this.cell(r, length).join());
+  }
+
+  // Shade the cells that have none.
+  shade(plane) {
+    const [w, h] = [(this.xs[1] - this.xs[0]) / CELLS, (this.ys[1] - this.ys[0]) / CELLS];
+    for (let i = 0; i < CELLS; i++)
+      for (let j = 0; j < CELLS; j++)
+        if (!this.cells.has(`${i},${j}`)) plane.cell(this.xs[0] + i * w, this.ys[0] + j * h, w, h, "unseen");
+  }
+}
+
+// Commands that the buffer has examples of: [[name, return, horizon]], each once.
+export function presets(contents, environment) {
+  const { returns, lengths } = contents;
+  const episodes = returns.map((r, i) => [r, lengths[i]]);
+  const longest = episodes.toSorted(([r, l], [s, m]) => m - l || s - r)[0];
+  const low = quantile(returns, 0.1);
+  const worst = episodes.filter(([r]) => r <= low).toSorted(([r, l], [s, m]) => l - m || r - s)[0];
+  const names = PRESETS.find(([pattern]) => pattern.test(environment))[1];
+  const found = [[contents.desired_return, contents.desired_horizon], longest, worst].map((pair, i) => [names[i], ...pair]);
+  return found.filter(([, r, h], i) => found.findIndex(([, s, g]) => s === r && g === h) === i);
+}
