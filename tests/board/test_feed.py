@@ -1,4 +1,4 @@
-"""What the page is told, and how seldom the run is asked for it."""
+"""The news for the page, and how often the run is queried."""
 
 from collections import Counter
 from typing import Any
@@ -41,40 +41,40 @@ def evaluation(number: int) -> EvaluationStatus:
     )  # fmt: skip
 
 
-class Told:
-    """A run that has got so far, and counts what it is asked."""
+class CountingSource:
+    """A run after some iterations, which counts the queries."""
 
     def __init__(self, iterations: int) -> None:
         self.iterations = iterations
         self.page = 1000
-        self.asked: Counter[str] = Counter()
+        self.queries: Counter[str] = Counter()
         self.is_gone = False
         self.is_doubtful = False
         self.report: Obedience | InvalidData | None = None
 
-    def _ask(self, what: str) -> None:
-        self.asked[what] += 1
+    def _query(self, what: str) -> None:
+        self.queries[what] += 1
         if self.is_gone:
-            raise Unreachable("nobody answers")
+            raise Unreachable("no reply")
 
     def place(self) -> Place:
         return Place("runs/mine", "tcp/127.0.0.1:7447")
 
     def doubt(self) -> str:
-        return "of an earlier moment" if self.is_doubtful else ""
+        return "out of date" if self.is_doubtful else ""
 
     def hello(self) -> Hello:
-        self._ask("hello")
+        self._query("hello")
         return HELLO
 
     def status(self) -> Status:
-        self._ask("status")
+        self._query("status")
         # Only this is read of it here; tests of the whole system have whole ones.
         fields: dict[str, Any] = dict.fromkeys(Status.__struct_fields__)
         return Status(**fields | {"iteration": self.iterations - 1, "run_id": "run"})
 
     def history(self, after: int) -> History:
-        self._ask("history")
+        self._query("history")
         numbers = list(range(after + 1, self.iterations))
         page = numbers[: self.page]
         return History(
@@ -84,7 +84,7 @@ class Told:
         )
 
     def contents(self) -> Contents:
-        self._ask("contents")
+        self._query("contents")
         return Contents(
             iteration=self.iterations - 1, returns=(1.0,), lengths=(1,), iterations=(0,),
             desired_return=1.0, desired_horizon=1, return_std=0.0, desired_returns=(),
@@ -112,8 +112,8 @@ class Clock:
 
 
 @pytest.fixture
-def run() -> Told:
-    return Told(5)
+def run() -> CountingSource:
+    return CountingSource(5)
 
 
 @pytest.fixture
@@ -122,11 +122,11 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def feed(run: Told, clock: Clock) -> Feed:
+def feed(run: CountingSource, clock: Clock) -> Feed:
     return Feed(run, clock)
 
 
-def test_a_new_page_is_told_everything(feed: Feed) -> None:
+def test_a_new_page_gets_everything(feed: Feed) -> None:
     news = feed.news()
     assert news.hello == HELLO
     assert [i.iteration for i in news.iterations] == [0, 1, 2, 3, 4]
@@ -136,7 +136,7 @@ def test_a_new_page_is_told_everything(feed: Feed) -> None:
     assert msgspec.json.decode(msgspec.json.encode(news))["iterations"]
 
 
-def test_a_page_that_knows_something_is_told_the_rest(feed: Feed, run: Told, clock: Clock) -> None:
+def test_a_page_gets_what_it_lacks(feed: Feed, run: CountingSource, clock: Clock) -> None:
     feed.news()
     run.iterations = 8
     clock.now += FRESH_S
@@ -149,32 +149,32 @@ def test_a_page_that_knows_something_is_told_the_rest(feed: Feed, run: Told, clo
     assert (again.iterations, again.evaluations, again.contents) == ([], [], None)
 
 
-def test_however_many_look_the_run_is_asked_once_a_second(
-    feed: Feed, run: Told, clock: Clock
+def test_the_run_is_queried_once_a_second_for_any_number_of_pages(
+    feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     for _ in range(10):
         feed.news()
-    assert run.asked == {"hello": 1, "status": 1, "history": 1, "contents": 1}
+    assert run.queries == {"hello": 1, "status": 1, "history": 1, "contents": 1}
     clock.now += FRESH_S
     for _ in range(10):
         feed.news(4, "run")
     # The buffer has not changed since.
-    assert run.asked == {"hello": 1, "status": 2, "history": 2, "contents": 1}
+    assert run.queries == {"hello": 1, "status": 2, "history": 2, "contents": 1}
 
 
-def test_a_long_history_is_fetched_page_by_page(feed: Feed, run: Told) -> None:
+def test_a_long_history_is_fetched_page_by_page(feed: Feed, run: CountingSource) -> None:
     run.iterations, run.page = 100, 7
     assert [i.iteration for i in feed.news().iterations] == list(range(100))
 
 
-def test_when_nobody_answers_the_page_keeps_what_it_knows(
-    feed: Feed, run: Told, clock: Clock
+def test_without_a_reply_the_page_keeps_what_it_has(
+    feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     feed.news()
     run.is_gone = True
     clock.now += FRESH_S
     news = feed.news(4, "run")
-    assert (news.status, news.iterations, news.problem) == (None, [], "nobody answers")
+    assert (news.status, news.iterations, news.problem) == (None, [], "no reply")
     assert len(feed.news().iterations) == 5
     run.is_gone, run.iterations = False, 6
     clock.now += FRESH_S
@@ -182,27 +182,25 @@ def test_when_nobody_answers_the_page_keeps_what_it_knows(
     assert (news.problem, [i.iteration for i in news.iterations]) == ("", [5])
 
 
-def test_the_page_is_told_where_the_run_is_and_what_to_doubt(
-    feed: Feed, run: Told, clock: Clock
-) -> None:
+def test_the_page_gets_the_place_and_doubts(feed: Feed, run: CountingSource, clock: Clock) -> None:
     assert feed.news().place == Place("runs/mine", "tcp/127.0.0.1:7447")
     run.is_doubtful = True
     clock.now += FRESH_S
     news = feed.news(4, "run")
     assert news.status is not None
-    assert news.problem == "of an earlier moment"
+    assert news.problem == "out of date"
 
 
 @pytest.mark.parametrize(("after", "run_id"), [(77, "run"), (2, "another"), (2, "")])
-def test_a_page_of_another_run_is_told_everything(feed: Feed, after: int, run_id: str) -> None:
+def test_a_page_of_another_run_gets_everything(feed: Feed, after: int, run_id: str) -> None:
     news = feed.news(after, run_id)
     assert news.hello == HELLO
     assert len(news.iterations) == 5
     assert news.contents is not None
 
 
-def test_a_run_that_came_back_from_a_backup_is_told_anew(
-    feed: Feed, run: Told, clock: Clock
+def test_a_run_restored_from_a_backup_is_sent_again(
+    feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     feed.news()
     run.iterations = 3
@@ -224,7 +222,7 @@ def report(run_id: str = "run", *, obeys: bool) -> Obedience:
 
 
 @pytest.mark.parametrize("obeys", [True, False])
-def test_what_the_agent_obeys_is_told(run: Told, clock: Clock, obeys: bool) -> None:
+def test_the_report_on_obedience(run: CountingSource, clock: Clock, obeys: bool) -> None:
     feed = Feed(run, clock)
     assert feed.news().obeyed is None
     run.report = report(obeys=obeys)
@@ -239,7 +237,7 @@ def test_what_the_agent_obeys_is_told(run: Told, clock: Clock, obeys: bool) -> N
     assert feed.news().obeyed is None
 
 
-def test_a_damaged_report_hides_nothing_else(run: Told, clock: Clock) -> None:
+def test_a_damaged_report_hides_nothing_else(run: CountingSource, clock: Clock) -> None:
     run.report = InvalidData("obedience.json: damaged; delete it")
     news = Feed(run, clock).news()
     assert news.problem == "obedience.json: damaged; delete it"

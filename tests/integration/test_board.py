@@ -109,7 +109,7 @@ def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_pat
         stored = Stored(run_dir)
         assert served.hello().run_id == directory.hello().run_id == stored.hello().run_id
         assert served.status().actors
-        assert directory.status().actors, "a directory that is served is asked, not read"
+        assert directory.status().actors, "the service of a directory is queried"
         first = served.history(-1).iterations[:3]
         assert first == directory.history(-1).iterations[:3] == stored.history(-1).iterations[:3]
         assert served.contents().returns
@@ -125,7 +125,7 @@ def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_pat
         assert directory.weights("latest") == stored.weights("latest")
 
 
-def test_a_service_that_hangs_is_not_waited_for_again_and_again(
+def test_a_service_that_hangs_is_not_queried_again_at_once(
     cli: Callable[..., Cli], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = tmp_path / "run"
@@ -139,13 +139,13 @@ def test_a_service_that_hangs_is_not_waited_for_again_and_again(
         os.kill(service, signal.SIGSTOP)
         try:
             assert directory.status().actors == ()
-            assert "what the run's file says, not what its service does: " in directory.doubt()
+            assert "the board shows the run's file: " in directory.doubt()
 
-            def ask(*_: object) -> None:
-                raise AssertionError("it is asked again at once")
+            def query(*_: object) -> None:
+                raise AssertionError("it is queried again at once")
 
             with monkeypatch.context() as patch:
-                patch.setattr(Served, "_ask", ask)
+                patch.setattr(Served, "_query", query)
                 assert directory.status().actors == ()
         finally:
             os.kill(service, signal.SIGCONT)

@@ -1,1 +1,1 @@
-"""The board: a page in the browser that shows a run, and lets its agent be told what to do."""
+"""The board: a page in the browser that shows a run and commands its agent."""

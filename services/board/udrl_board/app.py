@@ -87,7 +87,7 @@ def make_app(
 
 
 class _Guard:
-    """Lets in who knows the token and calls the board by a name of its own, and no other page."""
+    """Admits requests that have the token and one of the board's names, from its own page."""
 
     def __init__(
         self, app: ASGIApp, *, hosts: tuple[str, ...], token: str, origins: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""What the page is told: asked of the run once a second at most, however many look at the page."""
+"""News for the page; the run is queried at most once a second, however many pages are open."""
 
 import threading
 import time
@@ -15,21 +15,21 @@ from udrl_inspect.obedience_text import summary
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Status
 
-#: Seconds that an answer is good for.
+#: Seconds between two queries.
 FRESH_S = 1.0
-#: Pages of history in one go; the rest comes with the next.
+#: Pages of history in one query; the rest comes with the next.
 _PAGES = 20
 
 Answer = TypeVar("Answer")
 
 
 class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
-    """What ``udrl obedience`` found.
+    """The report of ``udrl obedience``.
 
     Attributes:
-        low: least return of the range in which the agent obeys; None: there is no such range.
-        high: greatest return of it; likewise.
-        answer: in two sentences: what can be commanded, and what to command for the most.
+        low: least return of the range that the agent delivers; None: there is no such range.
+        high: greatest return of it, or None.
+        answer: a summary in two sentences.
         weights_version: of the agent that was measured.
     """
 
@@ -40,7 +40,7 @@ class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, report: Obedience) -> "Obeyed":
-        """Return what the page shows of a report."""
+        """Return the part of a report that the page shows."""
         found = report.obeyed
         return cls(
             low=None if found is None else found.low,
@@ -51,19 +51,18 @@ class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class News(msgspec.Struct, frozen=True, kw_only=True):
-    """What is new for a page.
+    """News for a page.
 
     Attributes:
-        software: version of udrl that the board is of.
+        software: the board's version of udrl.
         place: where the run is.
-        hello: the run's specification; None: the page has it.
-        status: how the run is doing; None: nobody can say now.
-        iterations: completed after the one that the page named.
+        hello: the run's specification; None if the page has it.
+        status: of the run; None if it is unknown.
+        iterations: completed since the page's last.
         evaluations: made in these.
-        contents: the replay buffer; None: the page has it.
-        obeyed: what ``udrl obedience`` found; None: it was not run.
-        problem: why something cannot be said now, or may be of an earlier moment; empty: nothing
-            is wrong.
+        contents: of the replay buffer; None if the page has them.
+        obeyed: the report of ``udrl obedience``; None if there is none.
+        problem: why something is missing or may be out of date; empty if nothing is.
     """
 
     software: str
@@ -78,10 +77,10 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Feed:
-    """Knows a run, as fresh as :data:`FRESH_S`.
+    """Holds the state of a run, at most :data:`FRESH_S` old.
 
     Args:
-        source: asked for it.
+        source: of the state.
         clock: seconds.
     """
 
@@ -89,7 +88,7 @@ class Feed:
         self.source = source
         self._clock = clock
         self._lock = threading.Lock()
-        self._asked_at = float("-inf")
+        self._queried_at = float("-inf")
         self._hello: Hello | None = None
         self._status: Status | None = None
         self._contents: Contents | None = None
@@ -100,18 +99,18 @@ class Feed:
         self._problem = ""
 
     def news(self, after: int = -1, run_id: str = "") -> News:
-        """Return what is new for a page.
+        """Return the news for a page.
 
         Args:
-            after: the last iteration that it knows; -1: none.
-            run_id: of the run that it knows.
+            after: the last iteration that the page has; -1: none.
+            run_id: of the run that the page shows.
         """
         with self._lock:
-            if self._clock() - self._asked_at >= FRESH_S:
-                self._ask()
-                self._asked_at = self._clock()
+            if self._clock() - self._queried_at >= FRESH_S:
+                self._query()
+                self._queried_at = self._clock()
             known = self._iterations
-            # The page may be older than this board, and know of another run.
+            # The page may be older than this board, and show another run.
             same = self._hello is not None and run_id == self._hello.run_id
             first = after + 1 if same and after < len(known) else 0
             contents = self._contents
@@ -129,7 +128,7 @@ class Feed:
                 problem=self._problem,
             )
 
-    def _ask(self) -> None:
+    def _query(self) -> None:
         self._problem = ""
         try:
             self._status = self.source.status()
@@ -137,7 +136,7 @@ class Feed:
                 self._hello, self._contents = self.source.hello(), None
                 self._iterations, self._evaluations = [], []
             if self._iterations and self._status.iteration < self._iterations[-1].iteration:
-                self._iterations, self._evaluations = [], []  # the run came back from a backup
+                self._iterations, self._evaluations = [], []  # the run was restored from a backup
             for _ in range(_PAGES):
                 page = self.source.history(len(self._iterations) - 1)
                 self._iterations += page.iterations
@@ -152,7 +151,7 @@ class Feed:
             report = self.source.obedience()
             if report is not None and report.run_id == self._status.run_id:
                 self._obeyed = Obeyed.of(report)
-        except InvalidData as error:  # all else is known
+        except InvalidData as error:  # the rest is there
             self._problem = str(error)
         except UdrlError as error:
             self._status = None

@@ -1,4 +1,4 @@
-"""Where the board knows things from: a replay service, or the file of a run that nobody serves."""
+"""Sources of the board: a replay service, or the file of a run without one."""
 
 import logging
 import threading
@@ -34,18 +34,18 @@ log = logging.getLogger("udrl")
 Answer = TypeVar("Answer")
 Wanted = int | Literal["latest", "best"]
 
-#: Seconds that an answer may take; who looks at a page does not wait for longer.
+#: Seconds that a reply may take.
 _ANSWER_S = 3.0
-#: Seconds for which a service that did not answer is not asked again.
+#: Seconds for which a service that did not reply gets no further request.
 _SILENT_S = 10.0
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where a run is, for the commands that the page names; empty: unknown.
+    """The place of a run, for the shell commands that the page shows; empty: unknown.
 
     Attributes:
         run_dir: its directory on the board's machine.
-        endpoint: that services of the run connect to.
+        endpoint: to which services of the run connect.
     """
 
     run_dir: str = ""
@@ -53,14 +53,14 @@ class Place(msgspec.Struct, frozen=True):
 
 
 class Source(Protocol):
-    """What can be asked about a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
+    """A source of a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
 
     def place(self) -> Place:
-        """Return where the run is."""
+        """Return the place of the run."""
         ...
 
     def doubt(self) -> str:
-        """Return why answers may be of an earlier moment; empty: they are of now."""
+        """Return why replies may be out of date; empty: they are not."""
         ...
 
     def hello(self) -> Hello:
@@ -68,15 +68,15 @@ class Source(Protocol):
         ...
 
     def status(self) -> Status:
-        """Return how the run is doing."""
+        """Return the status of the run."""
         ...
 
     def history(self, after: int) -> History:
-        """Return what came of the iterations after one, or the first of them."""
+        """Return the iterations after one, or the first of them."""
         ...
 
     def contents(self) -> Contents:
-        """Return what the replay buffer holds."""
+        """Return the contents of the replay buffer."""
         ...
 
     def weights(self, version: Wanted) -> Weights:
@@ -84,16 +84,16 @@ class Source(Protocol):
         ...
 
     def obedience(self) -> Obedience | None:
-        """Return the report of ``udrl obedience`` on the run; None: there is none here."""
+        """Return the report of ``udrl obedience`` on the run, or None."""
         ...
 
     def close(self) -> None:
-        """Let go of what is held."""
+        """Release all resources."""
         ...
 
 
 class Stored:
-    """A run by its directory alone; what is read is of the moment.
+    """A run that is read from its directory.
 
     Args:
         run_dir: its directory.
@@ -107,7 +107,7 @@ class Stored:
         return Place(str(self._run_dir))
 
     def doubt(self) -> str:
-        """Return nothing: there is no other moment."""
+        """Return nothing: the file is always up to date."""
         return ""
 
     def hello(self) -> Hello:
@@ -116,16 +116,16 @@ class Stored:
             return store.fact("hello", Hello)
 
     def status(self) -> Status:
-        """Return how the run was doing when it was last worked on."""
+        """Return the status that the run last had."""
         return read_status(self._run_dir)
 
     def history(self, after: int) -> History:
-        """Return what came of the iterations after one, or the first of them."""
+        """Return the iterations after one, or the first of them."""
         with closing(Store(self._run_dir, read_only=True)) as store:
             return history(store, after)
 
     def contents(self) -> Contents:
-        """Return what the replay buffer holds."""
+        """Return the contents of the replay buffer."""
         with closing(Store(self._run_dir, read_only=True)) as store:
             return contents(read_run(self._run_dir, store))
 
@@ -135,15 +135,15 @@ class Stored:
         return Weights(version=agent.version, weights=agent.weights)
 
     def obedience(self) -> Obedience | None:
-        """Return the report that its directory holds."""
+        """Return the report in its directory, or None."""
         return kept(self._run_dir)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resources are held."""
 
 
 class Served:
-    """A run by the replay service that answers for it; connects again after it did not.
+    """A run that its replay service is queried for; reconnects after a failure.
 
     Args:
         address: where it is.
@@ -160,7 +160,7 @@ class Served:
         return Place("", self._address.endpoint)
 
     def doubt(self) -> str:
-        """Return nothing: who does not answer raises."""
+        """Return nothing: without a reply, methods raise."""
         return ""
 
     def hello(self) -> Hello:
@@ -169,22 +169,22 @@ class Served:
             return self._connected()[1]
 
     def status(self) -> Status:
-        """Return how the run is doing."""
-        return self._ask(lambda asker: asker.ask(verbs.STATUS, StatusRequest()))
+        """Return the status of the run."""
+        return self._query(lambda asker: asker.ask(verbs.STATUS, StatusRequest()))
 
     def history(self, after: int) -> History:
-        """Return what came of the iterations after one, or the first of them."""
+        """Return the iterations after one, or the first of them."""
         request = HistoryRequest(after=after)
-        return self._ask(lambda asker: asker.ask(verbs.HISTORY, request))
+        return self._query(lambda asker: asker.ask(verbs.HISTORY, request))
 
     def contents(self) -> Contents:
-        """Return what the replay buffer holds."""
-        return self._ask(lambda asker: asker.ask(verbs.CONTENTS, ContentsRequest()))
+        """Return the contents of the replay buffer."""
+        return self._query(lambda asker: asker.ask(verbs.CONTENTS, ContentsRequest()))
 
     def weights(self, version: Wanted) -> Weights:
         """Return a weights version that is kept."""
         request = WeightsRequest(version=version)
-        return self._ask(lambda asker: asker.ask(verbs.WEIGHTS, request))
+        return self._query(lambda asker: asker.ask(verbs.WEIGHTS, request))
 
     def obedience(self) -> Obedience | None:
         """Return nothing: it is in the run's directory, which may be on another machine."""
@@ -196,11 +196,11 @@ class Served:
             self._line = None
             self._stack.close()
 
-    def _ask(self, question: Callable[[Asker], Answer]) -> Answer:
+    def _query(self, query: Callable[[Asker], Answer]) -> Answer:
         with self._lock:
             asker, _ = self._connected()
             try:
-                return question(asker)
+                return query(asker)
             except Unreachable:
                 self._disconnect()
                 raise
@@ -212,17 +212,17 @@ class Served:
         return self._line
 
     def _disconnect(self) -> None:
-        """Leave the router; whoever asks does not wait until a service that hangs has noticed."""
+        """Leave the router, without waiting for a service that hangs."""
         self._line, stack = None, self._stack.pop_all()
         threading.Thread(target=stack.close, name="leaving", daemon=True).start()
 
 
 class Directory:
-    """A run by its directory: asked where it is served, read where it is not.
+    """A run by its directory: its replay service if there is one, else its file.
 
     Args:
         run_dir: its directory.
-        keys_dir: folder with the keys that an observer proves its role with.
+        keys_dir: folder with an observer's keys.
     """
 
     def __init__(self, run_dir: Path, keys_dir: Path | None = None) -> None:
@@ -239,33 +239,33 @@ class Directory:
         return Place(str(self._run_dir), served_at(self._run_dir) or "")
 
     def doubt(self) -> str:
-        """Return that the replay service does not answer, if it is there and does not."""
+        """Return that the replay service does not reply, if there is one and it does not."""
         if served_at(self._run_dir) is None or not self._is_silent():
             return ""
-        return f"What is shown is what the run's file says, not what its service does: {self._why}"
+        return f"The replay service does not reply; the board shows the run's file: {self._why}"
 
     def hello(self) -> Hello:
         """Return the run's specification."""
         return self._stored.hello()
 
     def status(self) -> Status:
-        """Return how the run is doing, or was when it was last worked on."""
-        return self._ask(lambda source: source.status())
+        """Return the status of the run, or the one that it last had."""
+        return self._query(lambda source: source.status())
 
     def history(self, after: int) -> History:
-        """Return what came of the iterations after one, or the first of them."""
-        return self._ask(lambda source: source.history(after))
+        """Return the iterations after one, or the first of them."""
+        return self._query(lambda source: source.history(after))
 
     def contents(self) -> Contents:
-        """Return what the replay buffer holds."""
-        return self._ask(lambda source: source.contents())
+        """Return the contents of the replay buffer."""
+        return self._query(lambda source: source.contents())
 
     def weights(self, version: Wanted) -> Weights:
         """Return a weights version that is kept."""
-        return self._ask(lambda source: source.weights(version))
+        return self._query(lambda source: source.weights(version))
 
     def obedience(self) -> Obedience | None:
-        """Return the report that its directory holds."""
+        """Return the report in its directory, or None."""
         return self._stored.obedience()
 
     def close(self) -> None:
@@ -275,16 +275,16 @@ class Directory:
                 self._served[1].close()
                 self._served = None
 
-    def _ask(self, question: Callable[[Source], Answer]) -> Answer:
+    def _query(self, query: Callable[[Source], Answer]) -> Answer:
         served = None if self._is_silent() else self._service()
         if served is not None:
             try:
-                return question(served)
+                return query(served)
             except Refused as error:
-                log.debug("%s is read, since it refuses: %s", self._run_dir, error)
+                log.debug("reading %s, since the replay service refused: %s", self._run_dir, error)
             except (PeerError, ConfigError) as error:
                 self._silent_since, self._why = time.monotonic(), str(error)
-        return question(self._stored)
+        return query(self._stored)
 
     def _is_silent(self) -> bool:
         return time.monotonic() - self._silent_since < _SILENT_S
