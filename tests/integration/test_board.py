@@ -91,6 +91,21 @@ def test_news_of_what_the_agent_obeys(ended_run: Path, tmp_path: Path) -> None:
     assert (found["answer"], found["weights_version"]) == (summary(report), agent.version)
 
 
+def test_several_runs(ended_run: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(ended_run, tmp_path / "other"))
+    app = make_app(Feed(Directory(ended_run)), Feed(Directory(other)))
+    with TestClient(app, base_url="http://127.0.0.1") as client:
+        rows = client.get("/runs").json()
+        assert [row["place"]["run_dir"] for row in rows] == [str(ended_run), str(other)]
+        assert all(row["evaluations"] and row["status"]["state"] == "ended" for row in rows)
+        for number, run_dir in (("0", ended_run), ("1", other), ("7", ended_run), ("x", ended_run)):
+            news = client.get("/news", params={"number": number}).json()
+            assert news["place"]["run_dir"] == str(run_dir)
+        with client.websocket_connect("/stage?number=1") as socket:
+            socket.send_json(start(paused=True))
+            assert next(moments(socket))["step"] == 0
+
+
 @pytest.mark.parametrize("after", ["x", "1.5", "--1", "9" * 40])
 def test_bad_questions(client: TestClient, after: str) -> None:
     answer = client.get("/news", params={"after": after})

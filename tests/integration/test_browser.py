@@ -433,6 +433,23 @@ def test_a_stopped_run_says_how_to_resume(
     expect(page.get_by_role("alert")).to_be_hidden()
 
 
+def test_several_runs_are_compared(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, obedient: Path
+) -> None:
+    page = pages(board(ended_run, obedient))
+    runs = page.locator("#run-table tbody tr")
+    expect(runs).to_have_count(2, timeout=SOON)
+    assert runs.nth(1).locator("td").all_text_contents()[1:3] == ["Obedience-v0", "Ended"]
+    expect(page.locator("#all canvas")).to_be_visible()
+    expect(page.locator("#title")).to_have_text("CartPole-v1")
+    runs.nth(1).get_by_role("link").click()
+    expect(page.locator("#title")).to_have_text("Obedience-v0", timeout=SOON)
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    start(page, 3)
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    expect(page.locator("#no-picture")).to_contain_text("draws no pictures")
+
+
 def test_quarantined_actors_are_named(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
 ) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import hmac
 import logging
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from concurrent.futures import CancelledError
 from importlib import resources
 from pathlib import Path
@@ -51,8 +51,7 @@ _HEADERS = {
 
 
 def make_app(
-    feed: Feed,
-    *,
+    *feeds: Feed,
     hosts: tuple[str, ...] = (),
     token: str = "",
     origins: tuple[str, ...] = (),
@@ -60,7 +59,7 @@ def make_app(
     """Return the web application.
 
     Args:
-        feed: what it shows.
+        feeds: of the runs that it shows.
         hosts: names that it may be called by; empty: any. A page of elsewhere whose name leads here
             (DNS rebinding) is refused by it.
         token: what a browser must know; empty: nothing.
@@ -68,16 +67,18 @@ def make_app(
             ``https://hub.example``.
     """
     static = Path(str(resources.files("udrl_board"))) / "static"
-    board = _Board(feed)
+    board = _Board(feeds)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         yield
-        feed.source.close()
+        for feed in feeds:
+            feed.source.close()
 
     return Starlette(
         routes=[
             Route("/news", board.news),
+            Route("/runs", board.runs),
             WebSocketRoute("/stage", board.stage),
             Mount("/", StaticFiles(directory=static, html=True)),
         ],
@@ -170,9 +171,20 @@ class _Guard:
 class _Board:
     """What the routes do."""
 
-    def __init__(self, feed: Feed) -> None:
-        self._feed = feed
+    def __init__(self, feeds: Sequence[Feed]) -> None:
+        self._feeds = feeds
         self._stages = 0
+
+    def _feed(self, connection: HTTPConnection) -> Feed:
+        """Return the feed of the run that a page shows; the first, if there is no such run."""
+        number = connection.query_params.get("number", "")
+        known = {str(k): feed for k, feed in enumerate(self._feeds)}
+        return known.get(number, self._feeds[0])
+
+    async def runs(self, request: Request) -> Response:
+        """Answer with all runs of the board."""
+        rows = [await run_in_threadpool(feed.summary) for feed in self._feeds]
+        return Response(msgspec.json.encode(rows), media_type="application/json")
 
     async def news(self, request: Request) -> Response:
         """Answer what is new after an iteration."""
@@ -180,7 +192,7 @@ class _Board:
         if not re.fullmatch(r"-?\d{1,18}", text):
             return PlainTextResponse(f"after={text[:40]!r}: expected an iteration", 400)
         run_id = request.query_params.get("run", "")
-        news = await run_in_threadpool(self._feed.news, int(text), run_id)
+        news = await run_in_threadpool(self._feed(request).news, int(text), run_id)
         return Response(msgspec.json.encode(news), media_type="application/json")
 
     async def stage(self, socket: WebSocket) -> None:
@@ -192,7 +204,7 @@ class _Board:
             await socket.close(1013)
             return
         self._stages += 1
-        stage = Stage(self._feed.source, _sender(socket, asyncio.get_running_loop()))
+        stage = Stage(self._feed(socket).source, _sender(socket, asyncio.get_running_loop()))
         stage.start()
         try:
             await _listen(socket, stage)

@@ -26,7 +26,7 @@ _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
 
 
 @click.command()
-@click.argument("run_dir", type=RUN_DIR, required=False)
+@click.argument("run_dirs", metavar="RUN_DIR...", type=RUN_DIR, nargs=-1)
 @CONNECT
 @click.option("--port", type=click.IntRange(0, 65_535), default=0, show_default=True,
               metavar="PORT", help="Port to serve on; 0 = any free port.")  # fmt: skip
@@ -45,7 +45,7 @@ _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
 @KEYS
 @RUN
 def board(
-    run_dir: Path | None,
+    run_dirs: tuple[Path, ...],
     connect: str | None,
     port: int,
     host: str,
@@ -55,13 +55,13 @@ def board(
     keys: Path | None,
     run_id: str | None,
 ) -> int:
-    """Watch a run and command its agent in the browser.
+    """Watch runs and command their agents in the browser.
 
-    Pass either RUN_DIR or --connect ENDPOINT.
+    Pass either RUN_DIR or --connect ENDPOINT. With several directories, the page compares the runs.
 
     Example: udrl board runs/mine --open
     """
-    where = place(run_dir, connect, run_id, keys)
+    where = place(run_dirs[0] if run_dirs else None, connect, run_id, keys)
     try:
         import uvicorn
 
@@ -72,8 +72,11 @@ def board(
         raise ConfigError(
             f'the board needs {error.name}; install it with: pip install "udrl[board]"'
         ) from error
-    source: Source = Directory(where, keys) if isinstance(where, Path) else Served(where)
-    source.hello()  # is there a run?
+    sources: list[Source] = [Directory(run_dir, keys) for run_dir in run_dirs]
+    if not isinstance(where, Path):
+        sources = [Served(where)]
+    for source in sources:
+        source.hello()  # is there a run?
     is_local = _is_loopback(host)
     called = tuple(map(_host_of, origins))
     if origins or not is_local:
@@ -84,8 +87,8 @@ def board(
         )
     log_to_stderr(logging.WARNING)
     app = make_app(
-        Feed(source), hosts=(*_LOOPBACK, host, *called) if is_local else (), token=token or "",
-        origins=origins,
+        *map(Feed, sources), hosts=(*_LOOPBACK, host, *called) if is_local else (),
+        token=token or "", origins=origins,
     )  # fmt: skip
     with _listening(host, port) as listener:
         shown = socket.gethostname() if host in _EVERYWHERE else host

@@ -76,6 +76,20 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
     problem: str
 
 
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """A run in a list of several.
+
+    Attributes:
+        place: where the run is.
+        status: of the run; None if it is unknown.
+        evaluations: so far.
+    """
+
+    place: Place
+    status: Status | None
+    evaluations: list[EvaluationStatus]
+
+
 class Feed:
     """Holds the state of a run, at most :data:`FRESH_S` old.
 
@@ -106,9 +120,7 @@ class Feed:
             run_id: of the run that the page shows.
         """
         with self._lock:
-            if self._clock() - self._queried_at >= FRESH_S:
-                self._query()
-                self._queried_at = self._clock()
+            self._refresh()
             known = self._iterations
             # The page may be older than this board, and show another run.
             same = self._hello is not None and run_id == self._hello.run_id
@@ -127,6 +139,19 @@ class Feed:
                 obeyed=self._obeyed,
                 problem=self._problem,
             )
+
+    def summary(self) -> RunSummary:
+        """Return the run's row in a list of several."""
+        with self._lock:
+            self._refresh()
+            return RunSummary(
+                place=self._place, status=self._status, evaluations=list(self._evaluations)
+            )
+
+    def _refresh(self) -> None:
+        if self._clock() - self._queried_at >= FRESH_S:
+            self._query()
+            self._queried_at = self._clock()
 
     def _query(self) -> None:
         self._problem = ""

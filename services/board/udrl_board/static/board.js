@@ -1,10 +1,11 @@
 // Gets the run's news from the board's server once a second, and shows it.
 import { outside, ranges } from "./buffer.js";
-import { command, number } from "./format.js";
+import { command, count, number } from "./format.js";
 import { Learning } from "./learning.js";
 import { $, legend, say } from "./page.js";
 import { Plane } from "./plane.js";
 import { commands, showRun } from "./run.js";
+import { compare, shown } from "./runs.js";
 import { Stage } from "./stage.js";
 
 const EVERY_MS = 1000;
@@ -29,7 +30,7 @@ function showContents(contents) {
   const newest = Math.max(...contents.iterations), oldest = Math.min(...contents.iterations);
   const evaluation = [contents.desired_return, contents.desired_horizon];
   buffer.draw(() => {
-    buffer.axes(...ranges(contents, [evaluation]));
+    buffer.axes(...ranges(contents));
     contents.returns.forEach((r, i) => {
       const youth = newest > oldest ? (contents.iterations[i] - oldest) / (newest - oldest) : 1;
       buffer.dot(r, contents.lengths[i], { class: "episode", opacity: 0.25 + 0.6 * youth });
@@ -39,7 +40,7 @@ function showContents(contents) {
   });
   const held = known.status?.buffer, recent = known.hello?.config.recent_size;
   const best = held ? `The ${number(held.episodes)} best episodes have returns from ${number(held.return_min)} to ${number(held.return_max)}${recent ? `; the newest ${number(recent)} are shown too` : ""}. ` : "";
-  say($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${number(pairs.length)} exploratory ${pairs.length === 1 ? "command is" : "commands are"} outstanding.${outside(contents, buffer)}`);
+  say($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${count(pairs.length, "exploratory command is", "exploratory commands are")} outstanding.${outside(contents, buffer)}`);
 }
 
 function showObeyed() {
@@ -54,7 +55,7 @@ function showObeyed() {
 async function update() {
   const after = known.iterations.at(-1)?.iteration ?? -1;
   const run = encodeURIComponent(known.hello?.run_id ?? "");
-  const response = await fetch(`news?after=${after}&run=${run}`, { signal: AbortSignal.timeout(LONGEST_MS) });
+  const response = await fetch(`news?number=${shown}&after=${after}&run=${run}`, { signal: AbortSignal.timeout(LONGEST_MS) });
   if (!response.ok) throw new Error(await response.text());
   const news = await response.json();
   if (news.hello) Object.assign(known, { hello: news.hello, iterations: [], evaluations: [] });
@@ -92,3 +93,4 @@ async function updateForever() {
 }
 
 updateForever();
+compare();

@@ -14,9 +14,26 @@ const padded = (low, high) => {
   return [low - room, high + room];
 };
 
-// Ranges of returns and lengths. Accidents, which are few low returns and few long episodes, would
-// leave no room for the others: they are outside.
-export function ranges({ returns, lengths }, more = []) {
+// Commands that the buffer has examples of: that of evaluations, the longest episode, the shortest of the worst.
+function suggestions(contents) {
+  const episodes = contents.returns.map((r, i) => [r, contents.lengths[i]]);
+  const low = quantile(contents.returns, 0.1);
+  const longest = episodes.toSorted(([r, l], [s, m]) => m - l || s - r)[0];
+  const worst = episodes.filter(([r]) => r <= low).toSorted(([r, l], [s, m]) => l - m || r - s)[0];
+  return [[contents.desired_return, contents.desired_horizon], longest, worst];
+}
+
+// The same with names, each once: [[name, return, horizon]].
+export function presets(contents, environment) {
+  const names = PRESETS.find(([pattern]) => pattern.test(environment))[1];
+  const found = suggestions(contents).map((pair, i) => [names[i], ...pair]);
+  return found.filter(([, r, h], i) => found.findIndex(([, s, g]) => s === r && g === h) === i);
+}
+
+// Ranges of returns and lengths. A few very low returns or very long episodes would leave no room
+// for the others: unless they are suggested, they are outside.
+export function ranges(contents) {
+  const { returns, lengths } = contents, more = suggestions(contents);
   const far = (numbers) => 0.25 * (quantile(numbers, 0.9) - quantile(numbers, 0.1)) || Infinity;
   const low = quantile(returns, 0.1) - far(returns), high = quantile(lengths, 0.9) + far(lengths);
   const xs = [...returns.filter((r) => r >= low), ...more.map(([r]) => r)];
@@ -57,16 +74,4 @@ export class Similar {
       for (let j = 0; j < CELLS; j++)
         if (!this.cells.has(`${i},${j}`)) plane.cell(this.xs[0] + i * w, this.ys[0] + j * h, w, h, "unseen");
   }
-}
-
-// Commands that the buffer has examples of: [[name, return, horizon]], each once.
-export function presets(contents, environment) {
-  const { returns, lengths } = contents;
-  const episodes = returns.map((r, i) => [r, lengths[i]]);
-  const longest = episodes.toSorted(([r, l], [s, m]) => m - l || s - r)[0];
-  const low = quantile(returns, 0.1);
-  const worst = episodes.filter(([r]) => r <= low).toSorted(([r, l], [s, m]) => l - m || r - s)[0];
-  const names = PRESETS.find(([pattern]) => pattern.test(environment))[1];
-  const found = [[contents.desired_return, contents.desired_horizon], longest, worst].map((pair, i) => [names[i], ...pair]);
-  return found.filter(([, r, h], i) => found.findIndex(([, s, g]) => s === r && g === h) === i);
 }

@@ -33,7 +33,7 @@ export class CommandForm {
     const isFirst = !this.contents;
     this.contents = contents;
     this.follows = hello.config.desired_horizon === "return";
-    const [xs, ys] = ranges(contents, [[contents.desired_return, contents.desired_horizon]]);
+    const [xs, ys] = ranges(contents);
     this.step = nice((xs[1] - xs[0]) / 200);
     Object.assign($("desired-return-slider"), { step: this.step, min: rounded(Math.floor(xs[0] / this.step) * this.step, this.step), max: rounded(Math.ceil(xs[1] / this.step) * this.step, this.step) });
     Object.assign($("desired-horizon-slider"), { min: 1, max: Math.max(2, Math.round(ys[1])) });

@@ -53,7 +53,7 @@ export class Learning {
       ...(closing ? [["final evaluation", "dot", "evaluation hollow"]] : []),
       [`exploratory episodes, mean of ${WINDOW} iterations`, "line", "explored"],
       ["of each iteration", "line", "explored pale"],
-      ["commanded returns", "band", "commanded"],
+      ["commanded returns", "band", "commanded band"],
       ...(target == null ? [] : [[`target: ${number(target)}`, "line", "target"]]),
     ]);
     const { xs, column } = merge(

@@ -2,7 +2,7 @@
 import { count, evaluated, number, time } from "./format.js";
 import { $, facts, lines, made, say } from "./page.js";
 
-const STATES = { running: "Running", closing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
+export const STATES = { running: "Running", closing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
 
 // Shell commands for this run, with what the board knows of its place.
 export function commands({ place, status }) {
@@ -21,6 +21,7 @@ export function commands({ place, status }) {
 export function showRun(known) {
   const { status, hello } = known;
   say($("title"), status.environment);
+  say($("run-name"), status.run_id);
   document.title = `${status.environment} · udrl board`;
   // Why a run failed is said in the alert, with the command that helps.
   const cause = status.state === "failed" ? "" : status.ended_because;
@@ -39,7 +40,6 @@ export function showRun(known) {
   ]);
   const { commands: c, episodes: e } = status;
   facts($("internals"), [
-    ["run", status.run_id],
     ["seed", String(hello?.config.seed ?? "")],
     ["results", status.exact ? "exact" : "not exact"],
     ["iteration", number(status.iteration)],

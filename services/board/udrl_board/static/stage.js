@@ -4,6 +4,7 @@ import { CommandForm } from "./command.js";
 import { Episodes } from "./episodes.js";
 import { command as text, count, number } from "./format.js";
 import { $, facts, say } from "./page.js";
+import { shown } from "./runs.js";
 
 export class Stage {
   constructor() {
@@ -63,7 +64,7 @@ export class Stage {
   }
 
   connect() {
-    const url = new URL("stage", location.href);
+    const url = new URL(`stage?number=${shown}`, location.href);
     url.protocol = url.protocol.replace("http", "ws");
     this.socket = new WebSocket(url);
     this.socket.binaryType = "blob";
