@@ -35,7 +35,8 @@ export class Actions {
 
 class Bars {
   constructor(name, values) {
-    this.element = made("ul", { className: "bars", ariaLabel: name || "Probabilities of the next action" });
+    this.element = made("ul", { className: "bars" });
+    this.element.setAttribute("aria-label", name || "Probabilities of the next action");
     if (name) this.element.append(made("li", { className: "component", textContent: name }));
     this.rows = values.map((value) => {
       const row = made("li"), track = made("span", { className: "track" }), bar = made("span", { className: "bar" }), share = made("span", { className: "share" });
