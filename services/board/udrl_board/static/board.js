@@ -18,14 +18,13 @@ const learning = new Learning();
 const stage = new Stage();
 const buffer = new Plane($("buffer"), { x: "return", y: "length, steps", label: "Returns and lengths of the episodes in the replay buffer", describedBy: "buffer-said" });
 
-legend($("buffer-legend"), [
-  ["episode, newer ones darker", "dot", "episode"],
-  ["outstanding exploratory command", "cross", "explored"],
-  ["command of evaluations", "diamond", "chosen"],
-]);
-
 function showContents(contents) {
   if (!contents.returns.length) return;
+  legend($("buffer-legend"), [
+    ["episode, newer ones darker", "dot", "episode"],
+    ["outstanding exploratory command", "cross", "explored"],
+    ["command of evaluations", "diamond", "chosen"],
+  ]);
   const pairs = contents.desired_returns.map((r, i) => [r, contents.desired_horizons[i]]);
   const newest = Math.max(...contents.iterations), oldest = Math.min(...contents.iterations);
   const evaluation = [contents.desired_return, contents.desired_horizon];

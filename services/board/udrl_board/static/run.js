@@ -66,7 +66,7 @@ function showProgress({ env_steps, max_env_steps, wall_s, time_left_s, stop_retu
 function showScore({ evaluation, closing_evaluation, stop_return }) {
   const shown = closing_evaluation ?? evaluation;
   $("score").classList.toggle("reached", Boolean(shown && stop_return != null && shown.mean >= stop_return));
-  say($("score-value"), shown ? number(shown.mean) : "–");
+  say($("score-value"), shown ? number(shown.mean) : "");
   const target = stop_return == null ? "" : `, target ${number(stop_return)}`;
   const what = closing_evaluation ? "final evaluation" : "last evaluation";
   say($("score-said"), shown
@@ -77,17 +77,17 @@ function showScore({ evaluation, closing_evaluation, stop_return }) {
 function showAlerts(known) {
   const { status } = known, { service, resume } = commands(known);
   const hints = {
-    running: `No actor is connected. Start one: ${service("actor")}`,
-    closing: `No actor is connected, and the final evaluation is missing. Start one: ${service("actor")}`,
     stopped: `No process is running this run. Resume it: ${resume()}`,
     ended: `Continue training: ${resume(" --max-env-steps MORE")}`,
     failed: `Resume the run when the cause is fixed: ${resume()}`,
   };
+  const isActive = status.state === "running" || status.state === "closing";
   const isMissing = status.waiting.some((w) => w.why.includes("no learner is here"));
-  const hint = status.actors.length ? "" : hints[status.state];
+  const hint = hints[status.state] ?? "";
   $("next").hidden = !hint;
   say($("next"), hint);
   lines($("alerts"), [
+    ...(isActive && !status.actors.length ? [`No actor is connected. Start one: ${service("actor")}`] : []),
     ...(isMissing ? [`No learner is connected. Start one: ${service("learner")}`] : []),
     ...(status.exact ? [] : [`The results are not exact: ${status.inexact_reason}`]),
   ]);

@@ -26,7 +26,9 @@ export class Stage {
   }
 
   know(known) {
+    const isFirst = !this.form.contents;
     this.form.know(known);
+    if (isFirst && this.form.contents) say($("no-picture"), "Start an episode to watch the agent.");
     this.buttons();
   }
 
