@@ -88,8 +88,10 @@ def _bins(
 
 def _declared(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     """Return names that the environment gives: as Atari games do, or in its metadata."""
-    meanings: Callable[[], list[str]] | None = getattr(env.unwrapped, "get_action_meanings", None)
     try:
+        meanings: Callable[[], list[str]] | None = getattr(
+            env.unwrapped, "get_action_meanings", None
+        )
         found = meanings() if callable(meanings) else env.metadata.get("action_names", ())
         return tuple(str(name).lower().replace("_", " ") for name in found)
     except Exception:  # noqa: BLE001 - a foreign environment's, and names are a convenience

@@ -75,7 +75,7 @@ export class Chart {
   }
 
   say(place) {
-    say(this.said, place == null ? this.summary : this.read(place));
+    say(this.said, place == null || place >= this.data[0].length ? this.summary : this.read(place));
   }
 
   resize() {
