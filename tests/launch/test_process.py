@@ -117,7 +117,7 @@ def test_forked_child_has_its_signals_for_itself() -> None:
 def test_service_that_does_not_listen_is_abandoned() -> None:
     code, said = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
-    assert "did not end in 3 s and is abandoned" in said
+    assert "did not stop within 3 s; exiting" in said
 
 
 @pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])

@@ -71,7 +71,7 @@ class Signals:
         self.received = signal.Signals(number)
         self._stop.set()
         if not self._ended.wait(self._grace_s):
-            log.warning("the service did not end in %.0f s and is abandoned", self._grace_s)
+            log.warning("the service did not stop within %.0f s; exiting", self._grace_s)
             sys.stderr.flush()
             os._exit(128 + number)
 

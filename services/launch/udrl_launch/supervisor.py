@@ -163,7 +163,7 @@ class Supervisor:
                 self._first_done = now
             if code == 0 or self._first_done is not None:
                 if code != 0:
-                    log.warning("%s %s when all was done", child.name, how_it_ended(code))
+                    log.warning("%s %s after the run was complete", child.name, how_it_ended(code))
                 child.done = True
                 continue
             work = self.work.get(child.arguments[0] if child.arguments else "", 0)
@@ -176,7 +176,7 @@ class Supervisor:
                 )
                 failure.exit_code = code if code in FINAL_CODES else failure.exit_code
                 raise failure
-            log.warning("%s %s and is started again", child.name, how_it_ended(code))
+            log.warning("%s %s and is restarted", child.name, how_it_ended(code))
             child.start()
 
     @property

@@ -130,7 +130,7 @@ def warn_of_idle_environments(settings: Settings) -> None:
     if asked_for > 2 * useful:
         log.warning(
             "%d environments, but at most %d episodes can run at once (n_episodes_per_iter x "
-            "(lead + 1)); but for warm-up and evaluations the others will be idle",
+            "(lead + 1)); the others are idle except during warm-up and evaluations",
             asked_for, useful,
         )  # fmt: skip
 
