@@ -41,8 +41,10 @@ STATUS = Status(
 def test_line_says_all_that_a_user_watches() -> None:
     text = line(STATUS)
     for part in (
-        "iteration 7", "12,345 env steps (9,876/s)", "42.0 ± 1.0 at 10,000", "1.0 / 2.0 / 3.0",
-        "weights 6 (lag 1)", "left 1:01:40", "learner l waits for actors: iteration 7 (2.5 s)",
+        "iteration 7", "12,345 of 100,000 env steps (9,876/s)",
+        "evaluation mean return 42.0 ± 1.0 at 10,000 env steps",
+        "replay buffer lowest return 1.0, mean 2.0, highest 3.0", "weights version 6 (lag 1)",
+        "1:01:40 left", "learner l waits for actors: iteration 7 (2.5 s)",
     ):  # fmt: skip
         assert part in text
 
@@ -53,7 +55,8 @@ def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
     with console.capture() as capture:
         console.print(panel(stopping))
     for text in (line(stopping), capture.get()):
-        assert "left at most 1:01:40" in text
+        assert "at most 1:01:40 left" in text
+    assert "target         mean return 200.0 in an evaluation" in capture.get()
 
 
 def test_what_a_terminal_would_obey_is_written_out() -> None:
@@ -77,7 +80,7 @@ def test_line_before_anything_is_known() -> None:
     text = line(
         msgspec.structs.replace(STATUS, evaluation=None, buffer=empty, time_left_s=None, waiting=())
     )
-    assert "evaluation none yet; buffer empty" in text
+    assert "evaluation none yet; replay buffer empty" in text
     assert "left" not in text
     assert "waits" not in text
 
@@ -91,7 +94,7 @@ def test_panel_names_the_quarantined_and_what_is_audited() -> None:
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
         console.print(panel(watched))
-    assert "25 % of the episodes; 31 agreed, 4 open, 1 disputed" in capture.get()
+    assert "25 % of the episodes; 31 agreed; 4 open; 1 disputed" in capture.get()
     assert "actor-9: its episode of command 7 differs" in capture.get()
 
 
@@ -100,7 +103,7 @@ def test_why_a_run_ended_is_told() -> None:
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
         console.print(panel(ended))
-    assert "because     reached return 100" in capture.get()
+    assert "because        reached return 100" in capture.get()
     assert "; reached return 100" in line(ended)
     assert "because" not in line(STATUS)
 
@@ -109,7 +112,7 @@ def test_advice_is_shown_beside_the_numbers() -> None:
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
         console.print(panel(msgspec.structs.replace(STATUS, advice="return_scale = 0.025: ...")))
-    assert "advice      return_scale = 0.025: ..." in capture.get()
+    assert "advice         return_scale = 0.025: ..." in capture.get()
 
 
 def test_small_returns_are_told_apart() -> None:
@@ -121,17 +124,64 @@ def test_small_returns_are_told_apart() -> None:
         ),
         buffer=BufferStatus(episodes=3, return_min=0.0, return_mean=0.0123, return_max=1.0),
     )  # fmt: skip
-    assert "0.05 ± 0.0098 at 10,000; buffer 0.0 / 0.0123 / 1.0" in line(small)
+    text = line(small)
+    assert "0.05 ± 0.0098 at 10,000 env steps" in text
+    assert "lowest return 0.0, mean 0.0123, highest 1.0" in text
 
 
-@pytest.mark.parametrize("width", [40, 120])
-def test_panel_fits_its_terminal(width: int) -> None:
+def shown(status: Status, width: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width)
     with console.capture() as capture:
-        console.print(panel(STATUS))
-    lines = capture.get().splitlines()
+        console.print(panel(status))
+    return [row.rstrip() for row in capture.get().splitlines()]
+
+
+@pytest.mark.parametrize("width", [40, 50, 80, 120])
+def test_panel_fits_its_terminal(width: int) -> None:
+    lines = shown(STATUS, width)
     assert max(map(len, lines)) <= width
-    assert "42.0 ± 1.0" in " ".join(capture.get().split())
+    assert "mean return 42.0 ± 1.0" in "\n".join(lines)
+
+
+def test_a_number_and_its_label_are_on_one_line() -> None:
+    assert shown(STATUS, 50) == [
+        "run            run",
+        "environment    CartPole-v1",
+        "state          running",
+        "progress       ━         12 % of 100,000 env steps",
+        "env steps      12,345; 9,876 per second;",
+        "               100 more in evaluations",
+        "iteration      7",
+        "evaluation     mean return 42.0 ± 1.0",
+        "               at 10,000 env steps",
+        "replay buffer  lowest return 1.0; mean 2.0;",
+        "               highest 3.0",
+        "weights        version 6; loss 0.500;",
+        "               lag 1 version and 0.25 s",
+        "actors         0 with 0 environments;",
+        "               0 of at most 60 episodes running",
+        "time           1:01 elapsed; 1:01:40 left",
+        "waiting        learner l for actors:",
+        "               iteration 7 (2.5 s)",
+    ]
+    assert len(shown(STATUS, 80)) == 12  # a line each
+    assert "replay buffer  lowest return 1.0; mean 2.0; highest 3.0" in shown(STATUS, 80)
+
+
+def test_a_long_name_is_not_cut() -> None:
+    run_id = "cartpole-v1-seed7-20261130-103400-1a2b3c4d"
+    text = "\n".join(shown(msgspec.structs.replace(STATUS, run_id=run_id), 50))
+    assert run_id in "".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("steps", "percent"), [(0, 0), (99_999, 99), (100_000, 100), (120_000, 100)]
+)
+def test_progress_is_that_of_the_budget(steps: int, percent: int) -> None:
+    lines = shown(msgspec.structs.replace(STATUS, env_steps=steps), 80)
+    (progress,) = [row for row in lines if row.startswith("progress")]
+    assert progress.endswith(f" {percent} % of 100,000 env steps")
+    assert ("━" * 20 in progress) == (percent == 100)
 
 
 def test_pipe_gets_plain_lines_and_none_twice() -> None:
@@ -180,7 +230,7 @@ def test_panel_ends_with_the_closing_evaluation_and_takes_names_as_they_are() ->
     console = Console(width=100, file=io.StringIO())
     with console.capture() as capture:
         console.print(panel(closed))
-    assert "closing     77.0 ± 1.0" in capture.get()
+    assert "final evaluation  mean return 77.0 ± 1.0" in capture.get()
     assert "actor [/x] for learner: [bold]" in capture.get()
 
 

@@ -1,11 +1,15 @@
-"""Live progress: a panel in a terminal, plain lines everywhere else. It goes to standard error."""
+"""Live progress on standard error: a panel in a terminal, plain lines everywhere else."""
 
+import math
 import time
+from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
+from rich.measure import Measurement
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
@@ -14,10 +18,20 @@ from udrl_proto.reports import EvaluationStatus, Status, Waiting
 from udrl_proto.text import printable
 
 _PLAIN_EVERY_S = 5.0
+#: Characters of the progress bar; fewer in a narrow terminal.
+_BAR_WIDTH = 20
+#: States as they are shown.
+_STATES = {
+    "running": "running",
+    "closing": "final evaluation",
+    "ended": "ended",
+    "failed": "failed",
+    "stopped": "stopped",
+}
 
 
 class Display:
-    """Shows the status of a run while it goes on."""
+    """Shows the status of a run while it trains."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True)
@@ -56,24 +70,25 @@ class Display:
 
 
 def _can_be_redrawn(console: Console) -> bool:
-    """Say whether a panel can be drawn over; colours that are forced make no terminal of a log."""
+    """Return whether a panel can be redrawn; forced colours do not make a log a terminal."""
     return console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
 
 
 def line(status: Status) -> str:
     """Return a status in one line."""
     parts = [
-        f"{status.state}: iteration {status.iteration}",
-        f"{status.env_steps:,} env steps ({status.env_steps_per_s:,.0f}/s)",
+        f"{_STATES[status.state]}: iteration {status.iteration}",
+        f"{status.env_steps:,} of {status.max_env_steps:,} env steps "
+        f"({status.env_steps_per_s:,.0f}/s)",
         f"evaluation {evaluation(status.evaluation)}",
-        f"buffer {returns(status)}",
-        f"weights {status.weights_version} (lag {status.weights_lag})",
+        f"replay buffer {', '.join(returns(status))}",
+        f"weights version {status.weights_version} (lag {status.weights_lag})",
     ]
     if status.time_left_s is not None:
-        parts.append(f"left {time_left(status)}")
+        parts.append(time_left(status))
     if status.ended_because:
         parts.append(status.ended_because)
-    parts += [f"{w.who} waits for {w.on}: {w.why} ({w.seconds:.1f} s)" for w in _long(status)]
+    parts += map(_waiting, _long(status))
     return printable("; ".join(parts))
 
 
@@ -81,42 +96,119 @@ def panel(status: Status) -> Table:
     """Return a status as a table."""
     table = Table(show_header=False, box=None, padding=(0, 1), pad_edge=False)
     table.add_column(style="dim", no_wrap=True)
-    table.add_column()
-    rows = {
-        "run": f"{status.run_id} ({status.state}{'' if status.exact else ', NOT exact'})",
-        "iteration": f"{status.iteration}",
-        "env steps": f"{status.env_steps:,} of {status.max_env_steps:,} "
-        f"({status.env_steps_per_s:,.0f}/s; evaluation steps {status.eval_env_steps:,})",
-        "evaluation": evaluation(status.evaluation),
-        **({"closing": evaluation(status.closing_evaluation)} if status.closing_evaluation else {}),
-        "buffer": returns(status),
-        "weights": f"version {status.weights_version}, lag {status.weights_lag} versions, "
-        f"{status.weights_lag_s:.2f} s"
-        + (f", loss {status.loss:.3f}" if status.loss is not None else ""),
-        "actors": f"{len(status.actors)} with {sum(a.environments for a in status.actors)} "
-        f"environments, {sum(a.running for a in status.actors)} of at most "
-        f"{status.useful_concurrency} episodes under way",
-        "time": f"{duration(status.wall_s)}"
-        + (f", left {time_left(status)}" if status.time_left_s is not None else ""),
-    }
+    table.add_column(overflow="fold")
+
+    def add(name: str, *phrases: str) -> None:
+        table.add_row(name, Phrases(phrases))
+
+    exact = "" if status.exact else ", NOT exact"
+    add("run", status.run_id)
+    add("environment", status.environment)
+    add("state", f"{_STATES[status.state]}{exact}")
+    table.add_row("progress", _progress(status))
+    if status.stop_return is not None:
+        add("target", f"mean return {return_text(status.stop_return)} in an evaluation")
+    steps = [f"{status.env_steps:,}", f"{status.env_steps_per_s:,.0f} per second"]
+    if status.eval_env_steps:
+        steps.append(f"{status.eval_env_steps:,} more in evaluations")
+    add("env steps", *_separated(steps))
+    add("iteration", f"{status.iteration:,}")
+    add("evaluation", *_evaluation(status.evaluation))
+    if status.closing_evaluation:
+        add("final evaluation", *_evaluation(status.closing_evaluation))
+    add("replay buffer", *_separated(returns(status)))
+    weights = [f"version {status.weights_version:,}"]
+    if status.loss is not None:
+        weights.append(f"loss {status.loss:.3f}")
+    lag = _counted(status.weights_lag, "version")
+    weights.append(f"lag {lag} and {status.weights_lag_s:.2f} s")
+    add("weights", *_separated(weights))
+    running = sum(a.running for a in status.actors)
+    add(
+        "actors",
+        f"{len(status.actors)} with",
+        f"{_counted(sum(a.environments for a in status.actors), 'environment')};",
+        f"{running} of at most {_counted(status.useful_concurrency, 'episode')} running",
+    )
+    times = [f"{duration(status.wall_s)} elapsed"]
+    if status.time_left_s is not None:
+        times.append(time_left(status))
+    add("time", *_separated(times))
     if status.audit.rate:
         audit = status.audit
-        rows["audit"] = (
-            f"{100 * audit.rate:g} % of the episodes; {audit.agreed} agreed, {audit.open} open, "
-            f"{audit.disputed} disputed"
+        add(
+            "audit",
+            f"{100 * audit.rate:g} % of the episodes;",
+            *_separated(
+                [f"{audit.agreed} agreed", f"{audit.open} open", f"{audit.disputed} disputed"]
+            ),
         )
     if status.ended_because:
-        rows["because"] = status.ended_because
+        add("because", status.ended_because)
     if status.advice:
-        rows["advice"] = status.advice
-    for name, value in rows.items():
-        table.add_row(name, Text(printable(value)))
+        add("advice", status.advice)
     for actor in status.quarantined:
-        table.add_row("quarantined", Text(printable(f"{actor.id}: {actor.why}")))
+        add("quarantined", f"{actor.id}: {actor.why}")
     for wait in _long(status):
-        said = f"{wait.who} for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
-        table.add_row("waiting", Text(printable(said)))
+        add("waiting", f"{wait.who} for {wait.on}:", f"{wait.why} ({wait.seconds:.1f} s)")
     return table
+
+
+class Phrases:
+    """Text that is wrapped between phrases, and within a phrase only if it is wider than a line.
+
+    Args:
+        phrases: separated by spaces when they share a line.
+    """
+
+    def __init__(self, phrases: Iterable[str]) -> None:
+        self._phrases = [printable(phrase) for phrase in phrases]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        lines = wrapped(self._phrases, options.max_width)
+        yield Text("\n".join(lines), overflow="fold")
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        words = [word for phrase in self._phrases for word in phrase.split()]
+        shortest = max(map(len, words), default=0)
+        longest = len(" ".join(self._phrases))
+        return Measurement(shortest, longest).with_maximum(options.max_width)
+
+
+def wrapped(phrases: Iterable[str], width: int) -> list[str]:
+    """Return phrases as lines of at most ``width`` characters, if every phrase is that short."""
+    lines: list[str] = []
+    for phrase in phrases:
+        if lines and len(lines[-1]) + 1 + len(phrase) <= width:
+            lines[-1] += f" {phrase}"
+        else:
+            lines.append(phrase)
+    return lines
+
+
+def _separated(phrases: Sequence[str]) -> list[str]:
+    """Return phrases with a semicolon after each but the last."""
+    return [f"{phrase};" for phrase in phrases[:-1]] + list(phrases[-1:])
+
+
+def _progress(status: Status) -> Table:
+    """Return a bar and a percentage of the budget of env steps."""
+    row = Table.grid(padding=(0, 1))
+    row.add_column()
+    row.add_column(no_wrap=True)
+    done = min(1.0, status.env_steps / status.max_env_steps) if status.max_env_steps else 0.0
+    bar = ProgressBar(total=1.0, completed=done, width=_BAR_WIDTH)
+    row.add_row(bar, f"{math.floor(100 * done)} % of {status.max_env_steps:,} env steps")
+    return row
+
+
+def _counted(number: int, noun: str) -> str:
+    """Return a number with its noun."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
+def _waiting(wait: Waiting) -> str:
+    return f"{wait.who} waits for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
 
 
 def _long(status: Status) -> list[Waiting]:
@@ -125,24 +217,33 @@ def _long(status: Status) -> list[Waiting]:
 
 def evaluation(result: EvaluationStatus | None) -> str:
     """Return an evaluation as mean and the half width of its 95 % interval."""
+    return " ".join(_evaluation(result))
+
+
+def _evaluation(result: EvaluationStatus | None) -> list[str]:
     if result is None:
-        return "none yet"
+        return ["none yet"]
     half = (result.ci95_high - result.ci95_low) / 2
-    return f"{return_text(result.mean)} ± {return_text(half)} at {result.env_steps:,}"
+    return [
+        f"mean return {return_text(result.mean)} ± {return_text(half)}",
+        f"at {result.env_steps:,} env steps",
+    ]
 
 
-def returns(status: Status) -> str:
-    """Return the returns in the buffer: min / mean / max."""
+def returns(status: Status) -> list[str]:
+    """Return the returns in the buffer, each with its name."""
     held = status.buffer
     if held.return_min is None or held.return_mean is None or held.return_max is None:
-        return "empty"
-    return " / ".join(map(return_text, (held.return_min, held.return_mean, held.return_max)))
+        return ["empty"]
+    values = (held.return_min, held.return_mean, held.return_max)
+    names = "lowest return", "mean", "highest"
+    return [f"{name} {return_text(v)}" for name, v in zip(names, values, strict=True)]
 
 
 def time_left(status: Status) -> str:
-    """Return how long a run goes on; nobody knows when an evaluation will reach its stop_return."""
+    """Return the time until the budget is spent; an evaluation may reach ``stop_return`` before."""
     most = "" if status.stop_return is None else "at most "
-    return most + duration(status.time_left_s or 0.0)
+    return f"{most}{duration(status.time_left_s or 0.0)} left"
 
 
 def duration(seconds: float) -> str:

@@ -1,5 +1,6 @@
 """``udrl evaluate``, ``udrl reproduce`` and ``udrl status``."""
 
+import sys
 import traceback
 from pathlib import Path
 
@@ -25,6 +26,9 @@ from udrl_launch.commands.options import (
 )
 from udrl_launch.output import print_json
 from udrl_show.display import panel
+
+#: Characters of a line in a pipe or a file, so that none is wrapped.
+_WIDE = 1000
 
 
 @click.command()
@@ -128,5 +132,6 @@ def status(
     else:
         from rich.console import Console
 
-        Console(soft_wrap=True).print(panel(found))
+        console = Console(width=None if sys.stdout.isatty() else _WIDE)
+        console.print(panel(found))
     return 0
