@@ -75,7 +75,7 @@ def test_a_usual_training_warns_of_nothing_and_says_why_it_ended(
     ).finish()  # fmt: skip
     assert code == 0, error
     assert "WARNING" not in error
-    assert "ended:          spent its budget of 2,000 env steps" in out
+    assert "ended:            spent its budget of 2,000 env steps" in out
 
 
 def test_budget_spent_in_the_warm_up_trains_nothing(

@@ -1,8 +1,110 @@
 """The command line as a whole."""
 
 import os
+import pty
+import select
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
+
+from udrl_launch.commands.runs import _narrow
+
+
+def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "udrl_launch", *arguments],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["trian", "CartPole-v1"], "no command 'trian'; did you mean 'train'? (see udrl --help)"),
+        (["bord"], "no command 'bord'; did you mean 'board'? (see udrl --help)"),
+        (["xyz"], "no such command 'xyz' (see udrl --help)"),
+        (["train"], "missing argument 'ENV' (see udrl train --help)"),
+        (
+            ["train", "X-v0", "--stop-retrun", "1"],
+            "no such option '--stop-retrun'; did you mean '--stop-return'? "
+            "(see udrl train --help)",
+        ),
+        (
+            ["train", "X-v0", "--max-env-steps", "much"],
+            "invalid value for '--max-env-steps': 'much' is not a number of steps, e.g. 500K, "
+            "10M, 1e6 or 250000",
+        ),
+        (
+            ["train", "X-v0", "--set", "batchsize=2"],
+            "unknown setting 'batchsize': did you mean 'batch_size'?",
+        ),
+    ],
+)
+def test_errors_are_one_line_of_one_form(arguments: list[str], says: str) -> None:
+    ended = udrl(*arguments)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {says}\n")
+
+
+def test_errors_of_services_have_the_same_form(tmp_path: Path) -> None:
+    ended = udrl(
+        "train", "CartPole-v1", "--run-dir", str(tmp_path / "run"), "--listen", "tcp/127.0.0.1"
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("udrl: error: endpoint 'tcp/127.0.0.1': expected tcp/HOST:PORT")
+    assert ended.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["keys"]])
+def test_a_group_without_a_command_shows_its_help(arguments: list[str]) -> None:
+    ended = udrl(*arguments)
+    assert ended.stderr.startswith("Usage: ")
+    assert "Commands:" in ended.stderr
+
+
+def in_a_terminal(columns: int, *arguments: str) -> str:
+    """Return what the command writes to a terminal."""
+    parent, child = pty.openpty()
+    environment = os.environ | {"COLUMNS": str(columns), "TERM": "dumb"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "udrl_launch", *arguments], stdout=child, env=environment
+    ) as process:
+        os.close(child)
+        text = b""
+        while select.select([parent], [], [], 60)[0]:
+            try:
+                text += os.read(parent, 65536)
+            except OSError:  # the command has ended
+                break
+        assert process.wait(60) == 0
+    os.close(parent)
+    return text.decode()
+
+
+@pytest.mark.parametrize("columns", [50, 80])
+def test_lines_end_between_words_in_a_terminal(columns: int) -> None:
+    words = " ".join(udrl("check", "CartPole-v1").stdout.split())
+    lines = in_a_terminal(columns, "check", "CartPole-v1").splitlines()
+    assert max(map(len, lines[:-1])) <= columns  # the last one is a command to copy
+    assert "observations  Box(" in lines[1]
+    assert len(" ".join(" ".join(lines).split())) == pytest.approx(len(words), abs=40)
+
+
+def test_runs_in_a_narrow_terminal() -> None:
+    row = [
+        "ended", "CartPole-v1", "7", "3,000 of 3,000", "412.5", "0:12 ago",
+        "spent its budget of 3,000 env steps", "runs/cartpole-v1-seed7",
+    ]  # fmt: skip
+    assert _narrow(row, 50) == [
+        "runs/cartpole-v1-seed7",
+        "  ended: spent its budget of 3,000 env steps;",
+        "  CartPole-v1; seed 7; 3,000 of 3,000 env steps;",
+        "  best return 412.5; changed 0:12 ago",
+    ]
+    unreadable = ["unreadable", "", "", "", "", "0:12 ago", "", "runs/broken"]
+    assert _narrow(unreadable, 50) == ["runs/broken", "  unreadable; changed 0:12 ago"]
 
 
 def test_end_does_not_wait_for_callbacks() -> None:

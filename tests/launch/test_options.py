@@ -17,6 +17,8 @@ from udrl_launch.commands.options import STEPS
         ("250_000", 250_000),
         ("7", 7),
         ("1,000,000", 1_000_000),
+        ("1e5", 100_000),
+        ("2.5E6", 2_500_000),
     ],
 )
 def test_steps_have_suffixes(text: str, steps: int) -> None:
@@ -24,7 +26,24 @@ def test_steps_have_suffixes(text: str, steps: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "0", "10G", "M", "-5", "1e6", "0.1", "1,5M", "1,50", "1,", "9" * 16, "9" * 30]
+    "text",
+    [
+        "",
+        "0",
+        "10G",
+        "M",
+        "-5",
+        "1e16",
+        "1e-3",
+        "1e",
+        "1e+6",
+        "0.1",
+        "1,5M",
+        "1,50",
+        "1,",
+        "9" * 16,
+        "9" * 30,
+    ],
 )
 def test_other_steps_are_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="500K"):

@@ -82,7 +82,7 @@ def test_service_has_the_main_thread_and_its_error_is_the_exit_code() -> None:
     assert ended("pass") == (0, "")
     code, said = ended("raise StoreError('the disk is gone')")
     assert code == 8
-    assert "ERROR   the disk is gone" in said
+    assert said == "udrl: error: the disk is gone\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -143,3 +143,20 @@ def test_environments_that_somebody_asked_for_in_vain_are_warned_of(
 ) -> None:
     warn_of_idle_environments(gather("CartPole-v1", options={"envs_per_actor": 16}))
     assert "32 environments, but at most 2 episodes can run at once" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("given", "steps"), [("3M", 3_000_000), ("1e5", 100_000), (1e5, 100_000), (250, 250)]
+)
+def test_numbers_of_steps_can_be_abbreviated(given: object, steps: int) -> None:
+    settings = gather("CartPole-v1", options={"max_env_steps": given, "eval_every": given})
+    assert settings.budget.max_env_steps == steps
+    assert settings.config.evaluation.eval_every == steps
+    assigned = gather("CartPole-v1", options={}, assignments=[f"max_env_steps={given}"])
+    assert assigned.budget.max_env_steps == steps
+
+
+@pytest.mark.parametrize("given", ["many", 1.5, "0.1"])
+def test_other_numbers_of_steps_are_refused(given: object) -> None:
+    with pytest.raises(ConfigError, match=f"max_env_steps = '?{given}"):
+        gather("CartPole-v1", options={"max_env_steps": given})

@@ -2,7 +2,9 @@
 
 import inspect
 import os
+import re
 import sys
+from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import NoReturn
@@ -40,7 +42,7 @@ _GROUP = "udrl.commands"
 
 
 def main() -> NoReturn:
-    """Run the command line. A :class:`UdrlError` is shown as one line, without a traceback."""
+    """Run the command line. Errors are shown without a traceback."""
     # Before NumPy is imported: its threads wait for each other by spinning, on cores that other
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -48,14 +50,18 @@ def main() -> NoReturn:
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
     try:
-        code = cli(standalone_mode=False)
+        code = cli(prog_name="udrl", standalone_mode=False)
     except BrokenPipeError:  # e.g. `| head`
         code = 0
     except UdrlError as error:
-        click.echo(f"udrl: error: {error}", err=True)
+        output.print_error(error)
         code = error.exit_code
     except click.ClickException as error:
-        error.show()
+        message = error.format_message()
+        if message.startswith("Usage: "):  # the help of a group without a command
+            click.echo(message, err=True)
+        else:
+            output.print_error(_one_line(error))
         code = error.exit_code
     except click.Abort:
         code = 130
@@ -64,6 +70,15 @@ def main() -> NoReturn:
     # exit handlers.
     output.flush()
     os._exit(code or 0)
+
+
+def _one_line(error: click.ClickException) -> str:
+    """Return click's message in the form of the other errors."""
+    message = error.format_message().removesuffix(".")
+    message = re.sub(r"\.? \(?Did you mean (.*\?)\)?$", r"; did you mean \1", message)
+    if isinstance(error, click.UsageError) and error.ctx and type(error) is not click.BadParameter:
+        message += f" (see {error.ctx.command_path} --help)"
+    return message[:1].lower() + message[1:]
 
 
 class _Commands(click.Group):
@@ -81,6 +96,15 @@ class _Commands(click.Group):
             command = added.load()
             return _with_example(command)
         return super().get_command(ctx, cmd_name)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        near = get_close_matches(name, self.list_commands(ctx), n=1)
+        if near and self.get_command(ctx, name) is None:
+            raise click.UsageError(f"no command {name!r}; did you mean {near[0]!r}?", ctx)
+        return super().resolve_command(ctx, args)
 
 
 def _with_example(command: click.Command) -> click.Command:

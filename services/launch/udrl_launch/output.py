@@ -1,7 +1,12 @@
-"""Standard output, reserved for JSON if that was requested, even if environments print."""
+"""Results and errors of commands.
+
+Standard output is reserved for JSON if that was requested, even if environments print.
+"""
 
 import os
+import shutil
 import sys
+import textwrap
 from typing import TextIO
 
 import click
@@ -24,6 +29,24 @@ def keep_for_json() -> None:
 def print_json(value: object) -> None:
     """Print a value as a line of JSON."""
     click.echo(msgspec.json.encode(value).decode(), file=_kept)
+
+
+def print_text(text: str, label: str = "") -> None:
+    """Print text after a label. In a terminal, lines end between words."""
+    width = shutil.get_terminal_size().columns
+    if sys.stdout.isatty():
+        text = textwrap.fill(
+            text, max(width, len(label) + 20), initial_indent=label,
+            subsequent_indent=" " * len(label), break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+        click.echo(text)
+    else:
+        click.echo(label + text)
+
+
+def print_error(error: object) -> None:
+    """Print an error. All commands print their errors in this form."""
+    click.echo(f"udrl: error: {error}", err=True)
 
 
 def flush() -> None:

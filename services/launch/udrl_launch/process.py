@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from udrl.errors import Interrupted, UdrlError
+from udrl_launch.output import print_error
 from udrl_launch.signals import Signals
 
 log = logging.getLogger("udrl")
@@ -112,5 +113,5 @@ def run_service(service: Callable[[threading.Event], None], grace_s: float = GRA
         return 128 + received
     if error is None:
         return 0
-    log.error("%s", error)
+    print_error(error)
     return error.exit_code

@@ -1,6 +1,8 @@
 """Settings of a command: preset, then file, then command line; the last one is used."""
 
+import re
 from collections.abc import Iterable, Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -31,6 +33,8 @@ NO_PRESET = "none"
 ANY_PRESET = "any"
 #: The value of a setting that is chosen automatically.
 _AUTO = "auto"
+#: Settings that are numbers of env steps, and accept :func:`read_steps`'s spellings.
+_STEPS = "max_env_steps", "eval_every"
 
 
 class Fleet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,6 +64,25 @@ def _from_file(file: Path, environment: str) -> dict[str, Any]:
 
 #: Environments per actor, at most, if their number is not set: more rows per call gain little.
 _MOST_ENVS = 16
+
+
+def read_steps(text: str) -> int:
+    """Return a number of env steps: ``250000``, ``500K``, ``1.5M`` or ``1e6``.
+
+    Raises:
+        ConfigError: the text is not such a number, or it is not from 1 to 2^53.
+    """
+    digits = re.sub(r"(?<=[0-9])[,_](?=[0-9]{3}(?![0-9]))", "", text)
+    found = re.fullmatch(r"([0-9]{1,16}(?:\.[0-9]{1,16})?)([kKmM]|[eE][0-9]{1,2})?", digits)
+    steps = 0
+    if found is not None:
+        number, suffix = Decimal(found[1]), (found[2] or "").lower()
+        factors = {"": 0, "k": 3, "m": 6}
+        exponent = factors[suffix] if suffix in factors else int(suffix[1:])
+        steps = round(number.scaleb(exponent))
+    if not 1 <= steps <= 2**53:
+        raise ConfigError(f"{text!r} is not a number of steps, e.g. 500K, 10M, 1e6 or 250000")
+    return steps
 
 
 class Settings(NamedTuple):
@@ -128,6 +151,15 @@ def gather(
             raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
         values[name] = value
     values["environment"] = environment
+    for name in _STEPS:
+        given = values.get(name)
+        if isinstance(given, float) and given.is_integer():  # 1e6 in Python and TOML
+            values[name] = int(given)
+        elif isinstance(given, str):
+            try:
+                values[name] = read_steps(given)
+            except ConfigError as error:
+                raise ConfigError(f"{name} = {error}") from error
     kinds = (Config, Budget, Fleet)
     refuse_unknown(values, tuple(name for kind in kinds for name in setting_names(kind)))
 

@@ -8,7 +8,7 @@ import click
 from udrl_inspect.checking import Check
 from udrl_inspect.checking import check as check_environment
 from udrl_launch.commands.options import FILE
-from udrl_launch.output import print_json
+from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
 from udrl_launch.settings import gather
 
@@ -32,9 +32,10 @@ def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bo
         print_json(found)
         return 0
     for name, text in _lines(found):
-        click.echo(f"{name:<13} {text}")
+        print_text(text, f"{name:<13} ")
     given = [f"--set={assignment}" for assignment in assignments]
     given += ["--config", shown(file)] if file else []
+    # Not wrapped, so that it can be copied.
     click.echo(
         f"{'verdict':<13} supported; train with: {shlex.join(['udrl', 'train', env, *given])}"
     )
@@ -52,8 +53,9 @@ def _lines(found: Check) -> list[tuple[str, str]]:
         ("episodes", limit),
         (
             "at random",
-            f"return {found.return_mean:.4g} ({found.return_min:.4g} to {found.return_max:.4g}), "
-            f"{found.length_mean:.4g} steps, in {found.episodes} episodes",
+            f"mean return {found.return_mean:.4g} ({found.return_min:.4g} to "
+            f"{found.return_max:.4g}), mean length {found.length_mean:.4g} steps, in "
+            f"{found.episodes} episodes",
         ),
         ("repeats", "yes, from its seed" if found.repeats else "NO"),
         (

@@ -24,7 +24,7 @@ from udrl_launch.commands.options import (
     place,
     version,
 )
-from udrl_launch.output import print_json
+from udrl_launch.output import print_json, print_text
 from udrl_show.display import panel
 
 #: Characters of a line in a pipe or a file, so that none is wrapped.
@@ -78,7 +78,7 @@ def evaluate(
         print_json(report)
         return 0
     found = result.evaluation
-    click.echo(
+    print_text(
         f"desired return {return_text(result.desired_return)} within "
         f"{result.desired_horizon} steps, "
         f"temperature {result.temperature:g}, weights version {agent.version}: mean return "

@@ -20,7 +20,7 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.output import print_json
+from udrl_launch.output import print_json, print_text
 from udrl_show import pictures
 from udrl_show.obedience_picture import draw
 
@@ -84,7 +84,8 @@ def obedience(
         }  # fmt: skip
         print_json(document)
     else:
-        click.echo(obedience_text.table(report))
+        for paragraph in obedience_text.table(report).splitlines():
+            print_text(paragraph)
     if output is not None:
         draw(report, output)
     for problem in _keep(run_dir, report, draws=output is None):

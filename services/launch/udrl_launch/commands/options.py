@@ -2,8 +2,6 @@
 
 import math
 import os
-import re
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +9,7 @@ import click
 
 from udrl.errors import ConfigError
 from udrl_inspect.address import Address
+from udrl_launch.settings import read_steps
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 
@@ -150,20 +149,15 @@ RETURNS = _Returns()
 
 
 class _Steps(click.ParamType):  # type: ignore[type-arg]
-    """A number of env steps: ``250000``, ``500K`` or ``1.5M``."""
+    """A number of env steps: ``250000``, ``500K``, ``1.5M`` or ``1e6``."""
 
     name = "steps"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        digits = re.sub(r"(?<=[0-9])[,_](?=[0-9]{3}(?![0-9]))", "", str(value))
-        found = re.fullmatch(r"([0-9]{1,16}(?:\.[0-9]{1,16})?)([kKmM]?)", digits)
-        steps = 0
-        if found is not None:
-            factor = {"": 1, "k": 1_000, "m": 1_000_000}[found[2].lower()]
-            steps = round(Decimal(found[1]) * factor)
-        if not 1 <= steps <= 2**53:
-            self.fail(f"{value!r} is not a number of steps, e.g. 500K, 10M or 250000", param, ctx)
-        return steps
+        try:
+            return read_steps(str(value))
+        except ConfigError as error:
+            self.fail(str(error), param, ctx)
 
 
 STEPS = _Steps()

@@ -18,7 +18,7 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.output import print_json
+from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
 from udrl_show.playing import play as play_episodes
 from udrl_show.playing import with_seeds
@@ -76,7 +76,7 @@ def play(
     )
     command = commands[0]
     if not as_json:
-        click.echo(
+        print_text(
             f"desired return {return_text(command.desired_return)} within "
             f"{command.desired_horizon} steps (temperature {command.temperature:g}, "
             f"weights version {agent.version})"

@@ -1,6 +1,9 @@
 """``udrl runs`` and ``udrl plot``: several runs at once."""
 
+import shutil
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +15,7 @@ from udrl_launch.commands.options import FILE, RUN_DIR
 from udrl_launch.output import print_json
 from udrl_proto.text import printable
 from udrl_show import curve
-from udrl_show.display import duration
+from udrl_show.display import duration, wrapped
 
 _HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "because", "run"
 
@@ -36,14 +39,32 @@ def runs(folder: Path, as_json: bool) -> int:
         click.echo(f"no runs in {folder}; start one with: udrl train LunarLander-v3", err=True)
         return 0
     rows = [_HEAD, *([printable(cell) for cell in _cells(summary)] for summary in found)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo("  ".join(cells).rstrip())
+    columns = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join(cell.ljust(n) for cell, n in zip(row, columns, strict=True)).rstrip()
+        for row in rows
+    ]
+    width = shutil.get_terminal_size().columns
+    if sys.stdout.isatty() and max(map(len, lines)) > width:
+        lines = [line for row in rows[1:] for line in _narrow(row, width)]
+    for line in lines:
+        click.echo(line)
     for summary in found:
         if summary.problem:
             click.echo(printable(f"{summary.run_dir}: {summary.problem}"), err=True)
     return 0
+
+
+def _narrow(row: Sequence[str], width: int) -> list[str]:
+    """Return a row of the table as lines for a narrow terminal."""
+    state, environment, seed, steps, best, changed, because, run_dir = row
+    phrases = [f"{state}: {because}" if because else state]
+    if environment:
+        phrases += [environment, f"seed {seed}", f"{steps} env steps", f"best return {best}"]
+    phrases.append(f"changed {changed}")
+    ends = [";"] * (len(phrases) - 1) + [""]
+    parts = [f"{phrase}{end}" for phrase, end in zip(phrases, ends, strict=True)]
+    return [run_dir, *(f"  {line}" for line in wrapped(parts, width - 2))]
 
 
 def _cells(summary: Summary) -> tuple[str, ...]:

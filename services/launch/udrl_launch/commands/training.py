@@ -20,7 +20,7 @@ from udrl_launch.commands.options import (
     RUN_DIR_OPTION,
 )
 from udrl_launch.commands.settings import gather_settings, settings_options
-from udrl_launch.output import print_json
+from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import new_run_dir, shown
 from udrl_launch.process import PARENTS_GRACE_S, log_to_stderr, run_service
 from udrl_launch.settings import Settings
@@ -138,22 +138,27 @@ def warn_of_idle_environments(settings: Settings) -> None:
 def _finish(run_dir: Path, status: Status) -> None:
     """Draw the learning curve, and print the result and the paths of all files."""
     closing = status.closing_evaluation
+    lines = []
     if not status.problem:
-        click.echo(f"ended:          {status.ended_because}")
+        lines.append(("ended", status.ended_because))
     if closing is not None:
-        click.echo(
-            f"final evaluation: mean return {return_text(closing.mean)} (95 % interval "
+        lines.append((
+            "final evaluation",
+            f"mean return {return_text(closing.mean)} (95 % interval "
             f"{return_text(closing.ci95_low)} to {return_text(closing.ci95_high)}, "
             f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
-            f"{status.wall_s:.0f} s"
-        )
+            f"{status.wall_s:.0f} s",
+        ))  # fmt: skip
     if status.weights_version:
-        weights = run_dir / "weights.safetensors"
-        click.echo(f"weights:        {shown(weights)} (version {status.weights_version})")
+        weights = shown(run_dir / "weights.safetensors")
+        lines.append(("weights", f"{weights} (version {status.weights_version})"))
     else:
-        click.echo("weights:        none; the budget was spent in the warm-up")
-    click.echo(f"metrics:        {shown(run_dir / 'metrics.csv')}")
+        lines.append(("weights", "none; the budget was spent in the warm-up"))
+    lines.append(("metrics", shown(run_dir / "metrics.csv")))
     try:
-        click.echo(f"learning curve: {shown(draw(run_dir, status.environment))}")
+        curve = shown(draw(run_dir, status.environment))
     except ConfigError as error:
-        click.echo(f"learning curve: {error}")
+        curve = str(error)
+    lines.append(("learning curve", curve))
+    for label, text in lines:
+        print_text(text, f"{label + ':':<18}")
