@@ -1,10 +1,12 @@
-"""Names of services: unique, and told apart by machine."""
+"""Endpoints of runs on this machine, and names of services."""
 
+import fcntl
 import platform
+from pathlib import Path
 
 import pytest
 
-from udrl_inspect.address import host_name, is_of_this_machine, unique_name
+from udrl_inspect.address import announced, host_name, is_of_this_machine, served_at, unique_name
 
 
 def on(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,3 +45,22 @@ def test_any_host_makes_a_name_that_can_be_a_key(
 ) -> None:
     on(host, monkeypatch)
     assert set(host_name("actor")) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ-")
+
+
+@pytest.mark.parametrize(
+    ("listening", "reached"),
+    [
+        ("tls/0.0.0.0:7447", "tls/127.0.0.1:7447"),
+        ("tcp/[::]:7447", "tcp/[::1]:7447"),
+        ("tls/10.0.0.5:7447", "tls/10.0.0.5:7447"),
+        ("tls/replay.example.org:7447", "tls/replay.example.org:7447"),
+        ("tcp/[fe80::1]:7447", "tcp/[fe80::1]:7447"),
+    ],
+)
+def test_a_run_that_listens_on_all_interfaces_is_reached_over_loopback(
+    listening: str, reached: str, tmp_path: Path
+) -> None:
+    with announced(tmp_path, listening), (tmp_path / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert served_at(tmp_path) == reached
+    assert served_at(tmp_path) is None

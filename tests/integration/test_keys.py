@@ -105,9 +105,10 @@ def test_killed_services_come_back_with_their_keys(
 def test_status_of_a_live_run_needs_an_observers_key(
     cli: Callable[..., Cli], keys_dir: Path, foreign_keys_dir: Path, tmp_path: Path
 ) -> None:
-    endpoint, run_dir = f"tls/127.0.0.1:{free_port()}", tmp_path / "run"
+    port, run_dir = free_port(), tmp_path / "run"
+    endpoint = f"tls/127.0.0.1:{port}"
     cli(
-        *arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1",
+        *arguments(TOY, 10_000_000, run_dir), "--listen", f"tls/0.0.0.0:{port}", "--actors", "1",
         "--keys", str(keys_dir),
     )  # fmt: skip
 
@@ -119,8 +120,14 @@ def test_status_of_a_live_run_needs_an_observers_key(
 
     wait_for(lambda: actors() == [16], "an actor")
     assert status_of(run_dir).actors == ()  # without a key it is what the store says
-    status = cli("status", "--connect", endpoint, "--keys", str(keys_dir), "--json").status()
-    assert status.state == "running"
+    for place in ((str(run_dir),), ("--connect", endpoint)):
+        status = cli("status", *place, "--keys", str(keys_dir), "--json").status()
+        assert status.state == "running"
+        assert status.actors
+    code, _, error = cli("status", str(run_dir)).finish()
+    assert code == 0
+    assert "cannot be queried, so this is the status in the store" in error
+    assert "add --keys DIR" in error
     with closing(Directory(run_dir, keys_dir / "observer")) as board:
         assert board.status().actors
         assert board.doubt() == ""

@@ -29,8 +29,7 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["train"], "missing argument 'ENV' (see udrl train --help)"),
         (
             ["train", "X-v0", "--stop-retrun", "1"],
-            "no such option '--stop-retrun'; did you mean '--stop-return'? "
-            "(see udrl train --help)",
+            "no such option '--stop-retrun'; did you mean '--stop-return'? (see udrl train --help)",
         ),
         (
             ["train", "X-v0", "--max-env-steps", "much"],

@@ -1,9 +1,10 @@
-"""Where a run is, how to get there, and what its services are called there.
+"""Addresses of runs, connections to them, and the names of their services.
 
-It imports no torch, for commands that look in for a moment.
+Imports no torch, so that short commands start fast.
 """
 
 import hashlib
+import ipaddress
 import json
 import logging
 import os
@@ -26,7 +27,7 @@ from udrl_replay.remedies import unwritable
 
 log = logging.getLogger("udrl")
 
-#: The file in a run's directory that says where it is served, while it is.
+#: The file in a run directory that has the endpoint, while the run is served.
 ENDPOINT_FILE = "endpoint.json"
 
 #: Characters of a machine's name in the names of its services, which are keys.
@@ -34,13 +35,13 @@ _LONGEST_HOST = 30
 
 
 class Address(NamedTuple):
-    """Where a run is.
+    """Address of a run.
 
     Attributes:
-        endpoint: of its router.
-        run_id: which one, where the router carries several.
-        patience_s: seconds to try until somebody answers.
-        keys: folder with the keys that a service proves its role with; None: nobody is asked.
+        endpoint: of its replay service or router.
+        run_id: id of the run, if a router carries several.
+        patience_s: seconds to wait for the first answer.
+        keys: folder with keys. None: no authentication.
     """
 
     endpoint: str
@@ -53,12 +54,12 @@ class Address(NamedTuple):
 def connected(
     role: str, address: Address, stop: threading.Event | None = None
 ) -> Iterator[tuple[Transport, Hello]]:
-    """Connect to a run in a role, and find it.
+    """Connect to a run in a role.
 
     Raises:
-        ConfigError: the endpoint or the keys cannot be used, or the run must be named.
-        Unreachable: nobody, or no such run, answers in time.
-        Interrupted: ``stop`` was set meanwhile.
+        ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
+        Unreachable: no service, or no such run, answered in time.
+        Interrupted: ``stop`` was set.
     """
     endpoint, run_id, patience_s, keys = address
     credentials = load(keys, role) if keys else None
@@ -69,10 +70,10 @@ def connected(
 
 @contextmanager
 def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
-    """Say in a run's directory that this process serves it at an endpoint.
+    """Write the endpoint of the run that this process serves to the run directory.
 
     Raises:
-        StoreError: it cannot be written there.
+        StoreError: the file cannot be written.
     """
     file = run_dir / ENDPOINT_FILE
     where = {"endpoint": endpoint, "host": platform.node(), "pid": os.getpid()}
@@ -87,10 +88,10 @@ def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
 
 
 def served_at(run_dir: Path) -> str | None:
-    """Return the endpoint at which a run is served; None: nobody works on it.
+    """Return the endpoint at which this machine reaches a run; None if no service serves it.
 
-    Whoever serves a run holds its lock. A process id would say nothing of other machines and
-    containers, nor of other users' processes.
+    The service holds the lock of the run directory. Its process id would not help: it means nothing
+    on other machines and in containers.
     """
     try:
         where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))
@@ -98,16 +99,33 @@ def served_at(run_dir: Path) -> str | None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.debug("%s is not served: %s", run_dir, error)
         return None
-    return endpoint if is_locked(run_dir) else None
+    return from_this_machine(endpoint) if is_locked(run_dir) else None
+
+
+def from_this_machine(endpoint: str) -> str:
+    """Return an endpoint with the loopback address in place of a wildcard.
+
+    A service that listens on all interfaces listens on loopback too. No certificate is valid for
+    a wildcard, and all are valid for loopback.
+    """
+    protocol, _, place = endpoint.partition("/")
+    host, _, port = place.rpartition(":")
+    try:
+        address = ipaddress.ip_address(host.strip("[]"))
+    except ValueError:  # a name
+        return endpoint
+    if not address.is_unspecified:
+        return endpoint
+    return f"{protocol}/{'127.0.0.1' if address.version == 4 else '[::1]'}:{port}"
 
 
 def unique_name(role: str) -> str:
-    """Return a name for a service that no other has; it begins with :func:`host_name`."""
+    """Return a unique name for a service; it begins with :func:`host_name`."""
     return f"{host_name(role)}-{os.getpid()}-{uuid.uuid4().hex[:6]}"
 
 
 def host_name(role: str) -> str:
-    """Return what the names of all services of a role on this machine begin with."""
+    """Return the prefix of the names of a role's services on this machine."""
     host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node()) or "host"
     if len(host) > _LONGEST_HOST:
         # Names of pods and of nodes differ at their ends.
@@ -117,5 +135,5 @@ def host_name(role: str) -> str:
 
 
 def is_of_this_machine(name: str, role: str) -> bool:
-    """Say whether a name is :func:`unique_name`'s, of a service of this role on this machine."""
+    """Return whether a name is that of a service of this role on this machine."""
     return re.fullmatch(rf"{re.escape(host_name(role))}-\d+-[0-9a-f]{{6}}", name) is not None

@@ -1,6 +1,7 @@
-"""Looking at a run from outside: its status and its settings."""
+"""Status and settings of a run, read from its service or its files."""
 
 import logging
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -24,31 +25,42 @@ _ANSWER_S = 3.0
 
 
 def status_at(address: Address) -> Status:
-    """Return the status of a run that is being worked on.
+    """Return the status of a run from its replay service.
 
     Raises:
-        Unreachable: nobody answers there.
-        ConfigError: the endpoint or the keys cannot be used, or the run must be named.
+        Unreachable: no service answered.
+        ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
     """
     with connected("observer", address) as (transport, hello):
         asker = Asker(transport, hello.run_id, "udrl status", patience_s=_ANSWER_S)
         return asker.ask(verbs.STATUS, StatusRequest())
 
 
-def status_from(where: Path | Address, keys_dir: Path | None = None) -> Status:
+def status_from(
+    where: Path | Address,
+    keys_dir: Path | None = None,
+    warn: Callable[[str], object] = log.debug,
+) -> Status:
     """Return the status of a run by its directory or its address.
 
     Raises:
         UdrlError: as :func:`status_of` and :func:`status_at`.
     """
-    return status_of(where, keys_dir) if isinstance(where, Path) else status_at(where)
+    return status_of(where, keys_dir, warn) if isinstance(where, Path) else status_at(where)
 
 
-def status_of(run_dir: Path, keys_dir: Path | None = None) -> Status:
-    """Return the status of a run by its directory, whether somebody works on it or not.
+def status_of(
+    run_dir: Path, keys_dir: Path | None = None, warn: Callable[[str], object] = log.debug
+) -> Status:
+    """Return the status of a run by its directory: from its service, or else from its store.
+
+    Args:
+        run_dir: the run's directory.
+        keys_dir: folder with the keys of an observer.
+        warn: receives the reason if there is a service and it cannot be queried.
 
     Raises:
-        StoreError: there is no run, or it is damaged.
+        StoreError: the directory holds no run, or it is damaged.
     """
     endpoint = served_at(run_dir)
     if endpoint is None:
@@ -58,15 +70,15 @@ def status_of(run_dir: Path, keys_dir: Path | None = None) -> Status:
             run_id = store.fact("hello", Hello).run_id
         return status_at(Address(endpoint, run_id, _ANSWER_S, keys_dir))
     except UdrlError as error:
-        log.debug("no live status: %s", error)
+        warn(f"the replay service cannot be queried, so this is the status in the store: {error}")
         return read_status(run_dir)
 
 
 def read_status(run_dir: Path) -> Status:
-    """Return the status of a run as its file says it; ``stopped`` if nobody works on it.
+    """Return the status of a run from its store; ``stopped`` if no service is running.
 
     Raises:
-        StoreError: there is no run, or it is damaged.
+        StoreError: the directory holds no run, or it is damaged.
     """
     with closing(Store(run_dir, read_only=True)) as store:
         run = read_run(run_dir, store)
@@ -79,15 +91,15 @@ def read_status(run_dir: Path) -> Status:
 
 
 def read_run(run_dir: Path, store: Store) -> Standing:
-    """Return a run by its directory and its store, to look at."""
+    """Return a read-only view of a run."""
     return Standing(store, budget_of(run_dir))
 
 
 def budget_of(run_dir: Path) -> Budget:
-    """Return the last budget that a run was given.
+    """Return the current budget of a run.
 
     Raises:
-        ConfigError: its file is not what was written.
+        ConfigError: its configuration file is invalid.
     """
     path = run_dir / "config.toml"
     values = read_toml(path) if path.exists() else {}
@@ -95,7 +107,7 @@ def budget_of(run_dir: Path) -> Budget:
 
 
 def settings_of(run_dir: Path) -> dict[str, Any]:
-    """Return the settings that a run was created with, and the last budget that it was given."""
+    """Return the settings and the current budget of a run."""
     with closing(Store(run_dir, read_only=True)) as store:
         config = store.fact("hello", Hello).config
     return flat(config) | flat(budget_of(run_dir))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from udrl.errors import UdrlError
-from udrl_inspect.address import Address
+from udrl_inspect.address import Address, from_this_machine
 from udrl_launch import roles
 from udrl_launch.process import switch_threads_soon
 from udrl_launch.settings import Settings
@@ -74,11 +74,12 @@ class Processes:
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
             "--listen", endpoint, *(["--insecure"] if insecure else []), "--audit", str(audit),
         )  # fmt: skip
-        start("learner", "learner", "--connect", endpoint, "--patience", _PATIENCE_S)
+        connect = from_this_machine(endpoint)
+        start("learner", "learner", "--connect", connect, "--patience", _PATIENCE_S)
         envs = str(settings.envs_per_actor)
         for number in range(1, fleet.actors + 1):
             start(
-                f"actor-{number}", "actor", "--connect", endpoint, "--envs", envs,
+                f"actor-{number}", "actor", "--connect", connect, "--envs", envs,
                 "--nice", "10", "--patience", _PATIENCE_S,
                 "--hang-timeout", f"{fleet.hang_timeout:g}",
                 "--first-index", str((number - 1) * settings.envs_per_actor),
@@ -140,7 +141,7 @@ class Threads:
                 audit=audit,
             ),
         )
-        address = Address(endpoint, patience_s=float(_PATIENCE_S), keys=keys)
+        address = Address(from_this_machine(endpoint), patience_s=float(_PATIENCE_S), keys=keys)
         self._start("learner", partial(roles.learner, address, self._stop))
         for number in range(1, fleet.actors + 1):
             self._start(

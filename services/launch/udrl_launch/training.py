@@ -6,12 +6,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Protocol
 
 from udrl.errors import Interrupted, Unreachable
-from udrl_inspect.address import Address, connected
+from udrl_inspect.address import Address, connected, from_this_machine
 from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.paths import shown
@@ -143,8 +143,10 @@ def train(
     services: Local = kind(
         run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
     )
+    address = Address(from_this_machine(endpoint), patience_s=_START_S, keys=keys)
     try:
-        _watch(services, Address(endpoint, patience_s=_START_S, keys=keys), stop, watcher)
+        with suppress(Interrupted):  # while it connects to the replay service
+            _watch(services, address, stop, watcher)
     finally:
         services.end()
     if stop.is_set():

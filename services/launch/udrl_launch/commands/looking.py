@@ -126,7 +126,9 @@ def status(
 
     Example: udrl status runs/mine
     """
-    found = inspection.status_from(place(run_dir, connect, run_id, keys), keys)
+    found = inspection.status_from(
+        place(run_dir, connect, run_id, keys), keys, lambda why: click.echo(why, err=True)
+    )
     if as_json:
         print_json(found)
     else:
