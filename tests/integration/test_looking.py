@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +18,7 @@ from click.testing import CliRunner
 from PIL import Image, ImageSequence
 
 from udrl.commands import Command
+from udrl.config import Budget
 from udrl.environments.making import make_environment
 from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl.rollout import Rollout
@@ -24,8 +26,12 @@ from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, loa
 from udrl_inspect.inspection import read_status
 from udrl_inspect.runs import find
 from udrl_launch.cli import cli
+from udrl_launch.settings import Fleet, Settings
+from udrl_launch.training import train
+from udrl_show import curve
 from udrl_show.curve import compare
 from udrl_show.playing import with_seeds
+from whole_run import small, toy
 
 
 def call(*arguments: object) -> str:
@@ -169,6 +175,17 @@ def test_films_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> 
     assert (tmp_path / name).stat().st_size > 1000
 
 
+def test_a_wrong_extension_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    for arguments, says in [
+        (("play", nowhere, "--video", tmp_path / "film.avi"), "ends with .mp4 or .gif"),
+        (("obedience", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
+        (("plot", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
+    ]:
+        with pytest.raises(ConfigError, match=says):
+            call(*arguments)
+
+
 def test_play_needs_a_run(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds no run"):
         call("play", tmp_path)
@@ -206,7 +223,7 @@ def test_runs_that_cannot_be_read_are_listed_too(ended_run: Path, tmp_path: Path
 def test_no_runs(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["runs", str(tmp_path)])
     assert "start one with: udrl train LunarLander-v3" in result.stderr
-    with pytest.raises(ConfigError, match=r"no such directory; name the one"):
+    with pytest.raises(ConfigError, match=r"no such directory; name the folder"):
         call("runs", tmp_path / "nowhere")
 
 
@@ -217,7 +234,7 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
     picture = tmp_path / "pictures" / "both.svg"
     assert str(picture) in call("plot", ended_run, twin, "--output", picture, "--x", "wall_s")
     drawn = ElementTree.fromstring(picture.read_text())
-    # The interval of a closing evaluation: the twin has no store, so nobody knows of its.
+    # The interval of a final evaluation, which the twin without a store lacks.
     assert picture.read_text().count('id="LineCollection_') == 1
     assert "cart" in picture.read_text()
     assert drawn.tag.endswith("svg")
@@ -225,6 +242,45 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
         compare([ended_run], tmp_path / "picture.bmp")
     with pytest.raises(StoreError, match="name the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")
+
+
+def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path: Path) -> None:
+    runs, figure = tmp_path / "runs", tmp_path / "all.svg"
+    for seed in (7, 8):
+        settings = Settings(small(seed=seed), Budget(max_env_steps=3000), Fleet(actors=1))
+        train(settings, runs / f"cart-{seed}", threading.Event(), in_process=True)
+    train(
+        Settings(toy(), Budget(max_env_steps=200), Fleet(actors=1)),
+        runs / "toy", threading.Event(), in_process=True,
+    )  # fmt: skip
+    assert call("plot", runs, "--output", figure) == f"figure: {figure}\n"
+    drawn = figure.read_text()
+    assert [name in drawn for name in ("CartPole-v1", "Figure2-v0", "2 seeds")] == [True] * 3
+    assert drawn.count('id="axes_') == 2  # a panel for each environment
+    assert drawn.count('id="LineCollection_') == 2  # a final evaluation in each
+
+    lines, missing = curve._lines([runs])
+    assert [len(line) for line in lines] == [2, 1]
+    assert missing == []
+    seeds = [[r["eval_mean"] for r in curve._evaluated(one)] for one in lines[0]]
+    means = [p.mean for p in curve._points(lines[0], "env_steps")]
+    assert means == [sum(pair) / 2 for pair in zip(*seeds, strict=True)]
+    final = curve._final(lines[0], "env_steps")
+    ends = [one.final.evaluation.mean for one in lines[0] if one.final]
+    assert final is not None
+    assert (final.low, final.mean, final.high) == (min(ends), sum(ends) / 2, max(ends))
+
+    # Named one by one, each is a line of its own.
+    call("plot", runs / "cart-7", runs / "cart-8", "--output", figure)
+    assert [name in figure.read_text() for name in ("cart-7", "cart-8", "seeds")] == [
+        True,
+        True,
+        False,
+    ]
+
+    (runs / "cart-8" / "metrics.csv").unlink()
+    result = CliRunner().invoke(cli, ["plot", str(runs), "--output", str(figure)])
+    assert f"not drawn: {runs / 'cart-8'}" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``udrl runs``: what runs there are, and how far they are."""
+"""``udrl runs``: a list of runs with their states."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -23,16 +23,16 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         run_dir: its directory.
-        state: ``running``: somebody works on it; ``stopped``: nobody does, and it can go on;
-            ``ended``; ``failed``; ``unreadable``.
-        environment: what it trains on.
-        seed: of the run.
-        env_steps: done so far.
+        state: ``running``; ``stopped``: no service is running, and it can be resumed; ``ended``;
+            ``failed``; ``unreadable``.
+        environment: its Gymnasium id.
+        seed: its seed.
+        env_steps: env steps so far.
         max_env_steps: its budget.
-        best_return: the greatest mean return of an evaluation; None: none yet.
-        changed: when its file was last written, seconds since 1970.
+        best_return: the highest mean return of an evaluation. None: there was no evaluation.
+        changed: time of the last change of its store, seconds since 1970.
         problem: why it failed, or cannot be read.
-        ended_because: why nobody works on it; empty: somebody does, or it cannot be read.
+        ended_because: why it is not running. Empty if it is, or if it cannot be read.
     """
 
     run_dir: str
@@ -48,21 +48,23 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def find(folder: Path) -> list[Summary]:
-    """Return the runs in a folder and in the folders below it, the newest first.
+    """Return the runs in a folder and in the folders below it, newest first.
 
     Raises:
-        ConfigError: there is no such folder.
+        ConfigError: the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such directory; name the one that your runs are in")
-    return sorted(map(summarise, _places(folder, set())), key=lambda s: s.changed, reverse=True)
+        raise ConfigError(f"{folder}: no such directory; name the folder of your runs")
+    summaries = map(summarise, run_directories(folder))
+    return sorted(summaries, key=lambda s: s.changed, reverse=True)
 
 
-def _places(folder: Path, seen: set[Path]) -> Iterator[Path]:
-    """Yield the directories of runs, once each; what is below one is its own affair."""
+def run_directories(folder: Path, seen: set[Path] | None = None) -> Iterator[Path]:
+    """Yield the directories of runs in a folder and in the folders below it, each once."""
+    seen = set() if seen is None else seen
     try:
         real = folder.resolve()
-        if real in seen:  # links may lead around
+        if real in seen:  # links may form a loop
             return
         seen.add(real)
         if (folder / FILE).exists():
@@ -70,14 +72,14 @@ def _places(folder: Path, seen: set[Path]) -> Iterator[Path]:
             return
         below = sorted(f for f in folder.iterdir() if f.is_dir())
     except OSError:
-        return  # other people's, or gone meanwhile
+        return  # not readable, or removed in the meantime
     for one in below:
-        yield from _places(one, seen)
+        yield from run_directories(one, seen)
 
 
 def summarise(run_dir: Path) -> Summary:
-    """Return a run in one line, whatever state it is in."""
-    # Not the third file that SQLite has there, which readers write too.
+    """Return a run in one line, also if it cannot be read."""
+    # Not SQLite's third file, which readers write too.
     changed = max(map(_changed, (run_dir / FILE, run_dir / f"{FILE}-wal")))
     try:
         with closing(Store(run_dir, read_only=True)) as store:
@@ -109,7 +111,7 @@ def summarise(run_dir: Path) -> Summary:
 
 
 def _changed(path: Path) -> float:
-    """Return when a file was last written; 0 if it is not there."""
+    """Return the time of a file's last change; 0 if it does not exist."""
     try:
         return path.stat().st_mtime
     except OSError:

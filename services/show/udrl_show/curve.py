@@ -1,17 +1,26 @@
-"""Pictures of learning curves, drawn from ``metrics.csv``.
+"""Figures of learning curves, drawn from ``metrics.csv``.
 
-The closing evaluation comes from the store; a directory without one is drawn too.
+Environment, settings and final evaluation come from the store. Directories without a store can be
+drawn too.
 """
 
 import csv
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TextIO
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TextIO
 
-from udrl.errors import StoreError
+import msgspec
+
+from udrl.config import flat
+from udrl.errors import StoreError, UdrlError
+from udrl.evaluation import Evaluation
+from udrl_inspect.runs import run_directories
+from udrl_proto.messages import Hello
+from udrl_replay.database import FILE
 from udrl_replay.store import EvaluationRow, Store
 from udrl_show import pictures
 from udrl_show.styles import line_style
@@ -21,34 +30,74 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("udrl")
 
-#: A line of ``metrics.csv``; what is missing is NaN.
+#: A row of ``metrics.csv``; missing values are NaN.
 Row = Mapping[str, float]
+X = Literal["env_steps", "wall_s"]
 
+_METRICS = "metrics.csv"
 _COLUMNS = (
     "env_steps", "wall_s", "return_mean", "explored_return", "eval_at_env_steps", "eval_mean",
     "eval_ci95_low", "eval_ci95_high",
 )  # fmt: skip
 
+#: Label and divisor of the x-axis.
 _X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
+#: Settings that the label of a line names, at most.
+_MOST_NAMED = 3
+
+
+class Curve(NamedTuple):
+    """What is drawn of one run.
+
+    Attributes:
+        run_dir: its directory.
+        rows: its metrics.
+        settings: its settings, without the seed; empty if it has no store.
+        final: its final evaluation.
+    """
+
+    run_dir: Path
+    rows: Sequence[Row]
+    settings: dict[str, Any]
+    final: EvaluationRow | None
+
+    @property
+    def environment(self) -> str:
+        """The Gymnasium id; empty if it is unknown."""
+        return str(self.settings.get("environment", ""))
+
+
+#: Runs that are drawn as one line: the seeds of one configuration.
+Line = list[Curve]
+
+
+class Point(NamedTuple):
+    """A point of a line, and the ends of its interval."""
+
+    at: float
+    mean: float
+    low: float
+    high: float
 
 
 def draw(run_dir: Path, title: str) -> Path:
-    """Draw a run's returns against env steps into its directory; return the picture.
+    """Draw a run's returns against env steps into its directory; return the figure's path.
 
     Raises:
         ConfigError: matplotlib is not installed.
         StoreError: the run has no metrics.
     """
-    rows = _read(run_dir)
+    curve = read(run_dir)
     figure, (axes,) = pictures.empty()
-    steps = [r["env_steps"] for r in rows]
+    steps = [r["env_steps"] for r in curve.rows]
     for name, label, style in (
-        ("return_mean", "mean of the replay buffer", "--"),
+        ("return_mean", "replay buffer, mean", "--"),
         ("explored_return", "exploratory episodes, mean of an iteration", ":"),
     ):
-        axes.plot(steps, [r[name] for r in rows], style, color="0.6", label=label, lw=1)
-    _evaluations(axes, rows, "env_steps", "evaluation, mean and 95 % interval", rank=1)
-    _closing(axes, run_dir, rows, "env_steps", rank=1, label="closing evaluation")
+        returns = [r[name] for r in curve.rows]
+        axes.plot(steps, returns, style, color="0.6", label=label, lw=1)
+    label = "evaluation, mean and 95 % interval"
+    _draw_line(axes, [curve], "env_steps", label, rank=1, final_label="final evaluation")
     axes.set(xlabel="env steps", ylabel="return", title=title)
     axes.legend(fontsize="small")
     picture = run_dir / "learning_curve.png"
@@ -56,59 +105,79 @@ def draw(run_dir: Path, title: str) -> Path:
     return picture
 
 
-def compare(
-    run_dirs: Sequence[Path], picture: Path, x: Literal["env_steps", "wall_s"] = "env_steps"
-) -> None:
-    """Draw the evaluations of several runs into one picture.
+def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[str]:
+    """Draw the evaluations of several runs, with a panel for each environment.
+
+    A run that is named is a line. Runs in a folder that is named are a line for each
+    configuration: the mean over its seeds.
 
     Args:
-        run_dirs: at least one; the lines are labelled with as much of the names as tells them
-            apart.
+        places: directories of runs, and folders of such directories; at least one.
         picture: ``.png``, ``.svg`` or ``.pdf``.
-        x: what the returns are drawn against.
+        x: the quantity on the x-axis.
+
+    Returns:
+        Why runs in folders are missing in the figure.
 
     Raises:
-        ConfigError: matplotlib is not installed, or another kind of file.
-        StoreError: a run has no metrics, or none has been evaluated.
+        ConfigError: matplotlib is not installed, or the file's extension is another.
+        StoreError: a run has no metrics, or no run has an evaluation.
     """
     pictures.check_name(picture)
-    runs = {run_dir: _read(run_dir) for run_dir in run_dirs}
-    if not any(_evaluated(rows) or _closing_evaluation(d) for d, rows in runs.items()):
-        names = ", ".join(map(str, run_dirs))
+    lines, missing = _lines(places)
+    curves = [curve for line in lines for curve in line]
+    if not any(_points(line, x) or line[0].final for line in lines):
+        names = ", ".join(map(str, places))
         raise StoreError(
-            f"nothing to draw: {names}: no evaluation in metrics.csv yet; there is one every "
+            f"nothing to draw: {names}: no evaluation in {_METRICS} yet; there is one every "
             f"eval_every env steps"
         )
-    figure, (axes,) = pictures.empty()
-    for rank, (label, run_dir) in enumerate(zip(_labels(list(runs)), runs, strict=True)):
-        _evaluations(axes, runs[run_dir], x, label, rank)
-        _closing(axes, run_dir, runs[run_dir], x, rank)
-    axes.set(xlabel=_X[x][0], ylabel="mean return of an evaluation, 95 % interval")
-    axes.legend(fontsize="small", handlelength=3.5)
+    panels: dict[str, list[Line]] = {}
+    for line in lines:
+        panels.setdefault(line[0].environment, []).append(line)
+    names_of = dict(zip((c.run_dir for c in curves), _names(curves), strict=True))
+    figure, all_axes = pictures.empty(len(panels))
+    for axes, (environment, held) in zip(all_axes, panels.items(), strict=True):
+        differing = _differing([line[0].settings for line in held])
+        for rank, line in enumerate(held):
+            name = names_of[line[0].run_dir] if len(line) == 1 else _label(line, differing)
+            _draw_line(axes, line, x, name, rank)
+        several = any(len(line) > 1 for line in held)
+        interval = "mean over seeds and range" if several else "95 % interval"
+        axes.set(xlabel=_X[x][0], ylabel=f"mean return of an evaluation, {interval}")
+        axes.set(title=environment)
+        axes.legend(fontsize="small", handlelength=3.5)
     pictures.save(figure, picture)
+    return missing
 
 
-def _labels(run_dirs: Sequence[Path]) -> list[str]:
-    """Return names that tell runs apart: as few of the last parts of their paths as do."""
-    parts = [run_dir.resolve().parts for run_dir in run_dirs]
-    for n in range(1, max(map(len, parts))):
-        labels = ["/".join(p[-n:]) for p in parts]
-        if len(set(labels)) == len(set(parts)):
-            return labels
-    return [str(run_dir) for run_dir in run_dirs]
+def read(run_dir: Path) -> Curve:
+    """Return what is drawn of a run.
 
-
-def _read(run_dir: Path) -> list[Row]:
-    path = run_dir / "metrics.csv"
+    Raises:
+        StoreError: it has no metrics.
+    """
+    path = run_dir / _METRICS
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [{name: float(row[name] or "nan") for name in _COLUMNS} for row in _rows(file)]
+            rows = [{name: float(row[name] or "nan") for name in _COLUMNS} for row in _rows(file)]
     except OSError as error:
-        raise StoreError(f"{path}: {error.strerror}; name the directory of a run") from error
+        raise StoreError(
+            f"{path}: {error.strerror}; name the directory of a run, or a folder of runs"
+        ) from error
     except (KeyError, ValueError, csv.Error) as error:
         raise StoreError(
-            f"{path} is not what a run writes ({error}); it is written anew when the run goes on"
+            f"{path} is not what a run writes ({error}); it is written again when the run is "
+            f"resumed"
         ) from error
+    try:
+        with closing(Store(run_dir, read_only=True)) as store:
+            config = store.fact("hello", Hello).config
+            settings = {n: v for n, v in flat(config).items() if n != "seed"}
+            return Curve(run_dir, rows, settings, store.last_evaluation(closing=True))
+    except StoreError as error:
+        log.debug("%s is drawn without its store: %s", run_dir, error)
+        return Curve(run_dir, rows, {}, None)
 
 
 def _rows(file: TextIO) -> Iterator[dict[str, str]]:
@@ -118,51 +187,120 @@ def _rows(file: TextIO) -> Iterator[dict[str, str]]:
         yield row
 
 
-def _evaluated(rows: Sequence[Row]) -> list[Row]:
-    return [r for r in rows if not math.isnan(r["eval_mean"])]
+def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
+    """Return the lines of a figure, and why runs are missing in it."""
+    lines: list[Line] = []
+    missing: list[str] = []
+    drawn: set[Path] = set()
+    for place in places:
+        is_run = any((place / name).exists() for name in (_METRICS, FILE))
+        below = [] if is_run else list(run_directories(place))
+        by_settings: dict[bytes, Line] = {}
+        for run_dir in below or [place]:
+            if run_dir.resolve() in drawn:
+                continue
+            drawn.add(run_dir.resolve())
+            try:
+                curve = read(run_dir)
+            except UdrlError as error:
+                if not below:
+                    raise
+                missing.append(f"{run_dir}: {error}")
+                continue
+            if not below or not curve.settings:
+                lines.append([curve])
+            elif not _evaluated(curve) and curve.final is None:
+                missing.append(f"{run_dir}: no evaluation yet")
+            else:
+                key = msgspec.json.encode(curve.settings, order="sorted")
+                by_settings.setdefault(key, []).append(curve)
+        lines += by_settings.values()
+    if not lines:
+        raise StoreError(f"nothing to draw: {'; '.join(missing)}")
+    return lines, missing
 
 
-def _evaluations(axes: "Axes", rows: Sequence[Row], x: str, label: str, rank: int) -> None:
-    """Draw the mean returns of a run's evaluations with their intervals."""
-    evaluated = _evaluated(rows)
-    unit = _X[x][1]
+def _names(curves: Sequence[Curve]) -> list[str]:
+    """Return names that distinguish runs: as few of the last parts of their paths as do."""
+    parts = [curve.run_dir.resolve().parts for curve in curves]
+    for n in range(1, max(map(len, parts))):
+        names = ["/".join(p[-n:]) for p in parts]
+        if len(set(names)) == len(set(parts)):
+            return names
+    return [str(curve.run_dir) for curve in curves]
+
+
+def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the names of settings that are not the same everywhere."""
+    first = settings[0]
+    return [n for n in first if any(s.get(n) != first[n] for s in settings[1:])]
+
+
+def _label(line: Line, differing: Sequence[str]) -> str:
+    """Return the label of several seeds: their number, and the settings that they share alone."""
+    named = [f"{n} = {line[0].settings.get(n)}" for n in differing[:_MOST_NAMED]]
+    if len(differing) > _MOST_NAMED:
+        named.append("…")
+    return "; ".join([*([", ".join(named)] if named else []), f"{len(line)} seeds"])
+
+
+def _evaluated(curve: Curve) -> list[Row]:
+    return [r for r in curve.rows if not math.isnan(r["eval_mean"])]
+
+
+def _points(line: Line, x: X) -> list[Point]:
+    """Return the evaluations of a line: of one run with their intervals, else mean and range."""
     column = "eval_at_env_steps" if x == "env_steps" else x
-    at = [r[column] / unit for r in evaluated]
-    low, mean, high = (
-        [r[n] for r in evaluated] for n in ("eval_ci95_low", "eval_mean", "eval_ci95_high")
-    )
-    style = line_style(rank)
-    axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
-    axes.plot(at, mean, label=label, markevery=max(1, len(at) // 10), **style)
+    unit = _X[x][1]
+    if len(line) == 1:
+        return [
+            Point(r[column] / unit, r["eval_mean"], r["eval_ci95_low"], r["eval_ci95_high"])
+            for r in _evaluated(line[0])
+        ]
+    # Evaluation k of a run is the first after k times eval_every env steps.
+    every = line[0].settings["eval_every"]
+    numbered = [{r["eval_at_env_steps"] // every: r for r in _evaluated(c)} for c in line]
+    common = sorted(set.intersection(*(set(one) for one in numbered)))
+    return [
+        _mean([(one[k][column] / unit, one[k]["eval_mean"]) for one in numbered]) for k in common
+    ]
 
 
-def _closing(
-    axes: "Axes",
-    run_dir: Path,
-    rows: Sequence[Row],
-    x: str,
-    rank: int,
-    label: str = "",
+def _mean(found: Sequence[tuple[float, float]]) -> Point:
+    """Return the mean of some evaluations, and their range."""
+    returns = [value for _, value in found]
+    return Point(fmean(at for at, _ in found), fmean(returns), min(returns), max(returns))
+
+
+def _final(line: Line, x: X) -> Point | None:
+    """Return the final evaluations of a line; None unless all its runs have one."""
+    found: list[tuple[float, Evaluation]] = []
+    for curve in line:
+        if curve.final is None or not curve.rows:
+            return None
+        at = curve.final.env_steps if x == "env_steps" else curve.rows[-1][x] / _X[x][1]
+        found.append((at, curve.final.evaluation))
+    if len(found) == 1:
+        ((at, one),) = found
+        return Point(at, one.mean, one.ci95_low, one.ci95_high)
+    return _mean([(at, one.mean) for at, one in found])
+
+
+def _draw_line(
+    axes: "Axes", line: Line, x: X, label: str, rank: int, final_label: str = "_"
 ) -> None:
-    """Draw the evaluation that closed a run, large and hollow, if there is one."""
-    row = _closing_evaluation(run_dir)
-    if row is None or not rows:
+    """Draw the evaluations of a line, and the final one as a large hollow marker."""
+    points, style = _points(line, x), line_style(rank)
+    at = [p.at for p in points]
+    low, high = [p.low for p in points], [p.high for p in points]
+    axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
+    means = [p.mean for p in points]
+    axes.plot(at, means, label=label, markevery=max(1, len(at) // 10), **style)
+    final = _final(line, x)
+    if final is None:
         return
-    at = row.env_steps if x == "env_steps" else rows[-1][x] / _X[x][1]
-    found = row.evaluation
-    style = line_style(rank)
     axes.errorbar(
-        [at], [found.mean],
-        [[found.mean - found.ci95_low], [found.ci95_high - found.mean]],
+        [final.at], [final.mean], [[final.mean - final.low], [final.high - final.mean]],
         color=style["color"], marker=style["marker"], markersize=9, markerfacecolor="none",
-        capsize=3, linestyle="none", label=label or "_",
+        capsize=3, linestyle="none", label=final_label,
     )  # fmt: skip
-
-
-def _closing_evaluation(run_dir: Path) -> EvaluationRow | None:
-    try:
-        with closing(Store(run_dir, read_only=True)) as store:
-            return store.last_evaluation(closing=True)
-    except StoreError as error:
-        log.debug("no closing evaluation of %s: %s", run_dir, error)
-        return None

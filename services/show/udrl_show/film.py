@@ -30,6 +30,16 @@ _KINDS = {
 _FINISH_S = 60.0
 
 
+def check_name(path: Path) -> None:
+    """Check the extension of a file name.
+
+    Raises:
+        ConfigError: films cannot be written as such files.
+    """
+    if path.suffix not in _KINDS:
+        raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
+
+
 class Film:
     """A file that pictures are appended to.
 
@@ -42,8 +52,7 @@ class Film:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        if path.suffix not in _KINDS:
-            raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
+        check_name(path)
         try:
             import imageio_ffmpeg
             from PIL import Image, ImageDraw, ImageFont

@@ -1,4 +1,4 @@
-"""Pictures by matplotlib: an empty one, and writing one whole."""
+"""Figures by matplotlib: creating an empty one, and writing it to a file."""
 
 import os
 from pathlib import Path
@@ -10,22 +10,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: What matplotlib can write.
+#: File name extensions of figures.
 _KINDS = (".png", ".svg", ".pdf")
+#: Panels in a row.
+_MOST_COLUMNS = 3
 
 
 def check_name(picture: Path) -> None:
-    """Check that a file's name says a kind that can be written.
+    """Check the extension of a file name.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: figures cannot be written as such files.
     """
     if picture.suffix not in _KINDS:
         raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
 
 
-def empty(columns: int = 1) -> "tuple[Figure, list[Axes]]":
-    """Return a figure without lines, and its axes from left to right.
+def empty(panels: int = 1) -> "tuple[Figure, list[Axes]]":
+    """Return a figure without lines, and the axes of its panels, row by row.
 
     Raises:
         ConfigError: matplotlib is not installed.
@@ -36,15 +38,18 @@ def empty(columns: int = 1) -> "tuple[Figure, list[Axes]]":
         raise ConfigError(
             'pictures of curves need matplotlib; install it with: pip install "udrl[plot]"'
         ) from error
-    figure = Figure(figsize=(7 if columns == 1 else 5.2 * columns, 4.3), layout="constrained")
-    axes = [figure.add_subplot(1, columns, k + 1) for k in range(columns)]
+    columns = min(panels, _MOST_COLUMNS)
+    rows = -(-panels // columns)
+    size = (7 if columns == 1 else 5.2 * columns, 4.3 * rows)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = [figure.add_subplot(rows, columns, k + 1) for k in range(panels)]
     for one in axes:
         one.grid(alpha=0.3)
     return figure, axes
 
 
 def save(figure: "Figure", picture: Path) -> None:
-    """Write a picture; it is there as a whole or not at all.
+    """Write a figure atomically.
 
     Raises:
         ConfigError: it cannot be written.

@@ -20,6 +20,7 @@ from udrl_launch.commands.options import (
 )
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
+from udrl_show import film
 from udrl_show.playing import play as play_episodes
 from udrl_show.playing import with_seeds
 from udrl_show.window import KEYS_HELP, Window
@@ -63,6 +64,8 @@ def play(
 
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
+    if video is not None:
+        film.check_name(video)
     agent = load_agent(run_dir, version(weights))
     commands = with_seeds(
         evaluation_commands(

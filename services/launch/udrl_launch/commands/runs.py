@@ -89,8 +89,12 @@ def _cells(summary: Summary) -> tuple[str, ...]:
 def plot(run_dirs: tuple[Path, ...], output: Path, x: Literal["env_steps", "wall_s"]) -> int:
     """Plot the learning curves of several runs.
 
-    Example: udrl plot runs/one runs/other --output both.svg
+    Draws a panel for each environment. Each RUN_DIR is a line. A folder of runs is drawn as a line
+    for each configuration: the mean over its seeds.
+
+    Example: udrl plot runs --output all.svg
     """
-    curve.compare(run_dirs, output, x)
+    for note in curve.compare(run_dirs, output, x):
+        click.echo(f"not drawn: {note}", err=True)
     click.echo(f"figure: {output}")
     return 0
