@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import threading
@@ -28,6 +29,7 @@ from udrl_inspect.runs import find
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training import train
+from udrl_replay.store import Store
 from udrl_show import curve
 from udrl_show.curve import compare
 from udrl_show.playing import with_seeds
@@ -315,14 +317,36 @@ def test_completion(shell: str) -> None:
     assert "_UDRL_COMPLETE" in call("completion", shell)
 
 
-def test_commands_are_completed() -> None:
-    asked = {"COMP_WORDS": "udrl pl", "COMP_CWORD": "1", "_UDRL_COMPLETE": "bash_complete"}
-    program = "from udrl_launch.cli import cli; cli(prog_name='udrl')"
+def completed(*words: str) -> list[str]:
+    """Return what bash offers for the last word."""
+    given = {
+        "COMP_WORDS": shlex.join(("udrl", *words[:-1])) + f" {words[-1]}",
+        "COMP_CWORD": str(len(words)),
+        "_UDRL_COMPLETE": "bash_complete",
+    }
     done = subprocess.run(
-        [sys.executable, "-c", program], env=os.environ | asked, capture_output=True, text=True,
-        timeout=60, check=False,
+        [sys.executable, "-m", "udrl_launch"], env=os.environ | given, capture_output=True,
+        text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert done.stdout.split() == ["plain,play", "plain,plot"]
+    assert done.stderr == ""
+    return [line.removeprefix("plain,") for line in done.stdout.split()]
+
+
+def test_commands_and_values_are_completed(ended_run: Path) -> None:
+    assert completed("pl") == ["play", "plot"]
+    landers = ["LunarLander-v3", "LunarLanderContinuous-v3", "LunarLanderSparse-v3"]
+    for command in ("train", "replay", "check"):
+        assert completed(command, "Lunar") == landers
+    assert completed("train", "CartPole-v1", "--preset", "no") == ["none"]
+    assert completed("train", "CartPole-v1", "--preset", "LunarLander-v3-p") == ["LunarLander-v3-paper"]
+    assert completed("train", "CartPole-v1", "--set", "batch") == ["batch_size="]
+    assert completed("train", "CartPole-v1", "--set", "envs") == ["envs_per_actor="]
+    with closing(Store(ended_run, read_only=True)) as store:
+        kept = [str(version) for version in store.versions_kept()]
+    assert kept
+    for command in ("play", "evaluate", "obedience", "export"):
+        assert completed(command, str(ended_run), "--weights", "") == ["latest", "best", *kept]
+    assert completed("play", "nowhere", "--weights", "b") == ["best"]
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import click
 
 from udrl_inspect.checking import Check
 from udrl_inspect.checking import check as check_environment
+from udrl_launch import completions
 from udrl_launch.commands.options import FILE
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
@@ -14,9 +15,10 @@ from udrl_launch.settings import gather
 
 
 @click.command()
-@click.argument("env")
+@click.argument("env", shell_complete=completions.environments)
 @click.option("--config", "file", type=FILE, metavar="FILE", help="Read settings from a TOML file.")
 @click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+              shell_complete=completions.settings,
               help="Set any setting, e.g. --set batch_size=512. May be repeated.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bool) -> int:

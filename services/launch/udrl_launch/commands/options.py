@@ -9,6 +9,7 @@ import click
 
 from udrl.errors import ConfigError
 from udrl_inspect.address import Address
+from udrl_launch import completions
 from udrl_launch.settings import read_steps
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
@@ -86,6 +87,7 @@ CONNECT = click.option(
 )
 WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
+    shell_complete=completions.weights,
     help="Weights version, among those that the run keeps.",
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ import click
 
 from udrl.errors import ConfigError
 from udrl_inspect.address import Address
-from udrl_launch import roles
+from udrl_launch import completions, roles
 from udrl_launch.commands.options import (
     ALLOW_INEXACT,
     AUDIT,
@@ -49,7 +49,7 @@ def _as_service(parent: int | None, service: Callable[[threading.Event], None]) 
 
 
 @click.command()
-@click.argument("env")
+@click.argument("env", shell_complete=completions.environments)
 @settings_options
 @click.option(
     "--listen", metavar="ENDPOINT", help="Endpoint to listen on, e.g. tcp/127.0.0.1:7447."

@@ -8,6 +8,7 @@ import click
 
 from udrl.config import preset_names
 from udrl_inspect import inspection
+from udrl_launch import completions
 from udrl_launch.commands.options import FILE, STEPS
 from udrl_launch.settings import Settings, gather
 from udrl_replay.creation import exists
@@ -19,11 +20,13 @@ def settings_options(command: Command) -> Command:
     """Add the options for settings."""
     options = (
         click.option("--preset", "preset_name", metavar="NAME",
+                     shell_complete=completions.presets,
                      help=f"Settings that ship with udrl: {', '.join(preset_names())}; or none. "
                      "Default: the preset named after ENV, else any."),
         click.option("--config", "file", type=FILE, metavar="FILE",
                      help="Read settings from a TOML file."),
         click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+                     shell_complete=completions.settings,
                      help="Set any setting, e.g. --set batch_size=512. May be repeated."),
         click.option("--from-dataset", "dataset", metavar="NAME",
                      help="Start from the episodes of a Minari dataset instead of random ones."),

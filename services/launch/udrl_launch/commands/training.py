@@ -10,6 +10,7 @@ import click
 
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
+from udrl_launch import completions
 from udrl_launch.commands.options import (
     ALLOW_INEXACT,
     AUDIT,
@@ -38,7 +39,7 @@ log = logging.getLogger("udrl")
 
 
 @click.command()
-@click.argument("env")
+@click.argument("env", shell_complete=completions.environments)
 @settings_options
 @click.option("--actors", type=int, metavar="N", help="Actor processes on this machine.")
 @click.option("--envs-per-actor", type=int, metavar="N",
