@@ -338,7 +338,9 @@ def test_commands_and_values_are_completed(ended_run: Path) -> None:
     for command in ("train", "replay", "check"):
         assert completed(command, "Lunar") == landers
     assert completed("train", "CartPole-v1", "--preset", "no") == ["none"]
-    assert completed("train", "CartPole-v1", "--preset", "LunarLander-v3-p") == ["LunarLander-v3-paper"]
+    assert completed("train", "CartPole-v1", "--preset", "LunarLander-v3-p") == [
+        "LunarLander-v3-paper"
+    ]
     assert completed("train", "CartPole-v1", "--set", "batch") == ["batch_size="]
     assert completed("train", "CartPole-v1", "--set", "envs") == ["envs_per_actor="]
     with closing(Store(ended_run, read_only=True)) as store:

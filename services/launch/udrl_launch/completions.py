@@ -1,8 +1,7 @@
 """What the shell completes: environments, presets, weights versions and settings."""
 
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -35,13 +34,12 @@ def weights(context: click.Context, param: click.Parameter, incomplete: str) -> 
     from udrl_replay.store import Store
 
     names = ["latest", "best"]
-    run_dir: Any = context.params.get("run_dir")
+    # While the option has no value, click leaves the arguments unparsed.
+    run_dir = context.params.get("run_dir") or next(iter(context.args), None)
     if run_dir is not None:
-        try:
+        with suppress(UdrlError):  # the command itself reports it
             with closing(Store(Path(run_dir), read_only=True)) as store:
                 names += [str(version) for version in store.versions_kept()]
-        except UdrlError:
-            pass  # the command itself reports it
     return [name for name in names if name.startswith(incomplete)]
 
 
