@@ -1,6 +1,6 @@
-"""Upside-Down Reinforcement Learning (Srivastava et al. 2019): the algorithm, free of messaging.
+"""Upside-Down Reinforcement Learning (Srivastava et al. 2019): the algorithm, without messaging.
 
-The paper's parts and where they live:
+:func:`train` trains an agent, :func:`load` loads one. The paper's parts are in these modules:
 
 ================================  ======================================
 Algorithm 1                       :mod:`udrl.algorithm1`
@@ -22,12 +22,21 @@ from typing import TYPE_CHECKING, Any
 from udrl.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from udrl.folder import load as load
+    from udrl_inspect.agents import load as load
     from udrl_launch.api import train as train
+
+__all__ = ["__version__", "load", "train"]
+
+#: Entry points of functions that packages above this one define.
+_GROUP = "udrl"
 
 
 def __getattr__(name: str) -> Any:
-    """Return what packages above this one offer here; it is imported when it is wanted."""
-    for offered in entry_points(group="udrl", name=name):
-        return offered.load()
+    """Return a function of a package above this one; it is imported on first use."""
+    for found in entry_points(group=_GROUP, name=name):
+        return found.load()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *entry_points(group=_GROUP).names})

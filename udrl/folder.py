@@ -148,5 +148,6 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ConfigError(
-            f"{path}: {error.strerror}; name a folder that udrl export --folder wrote"
+            f"{path}: {error.strerror}; name a run directory, or a folder that udrl export "
+            f"--folder wrote"
         ) from error

@@ -97,7 +97,7 @@ def test_weights_of_another_architecture(written: Path) -> None:
 
 
 def test_no_folder(tmp_path: Path, policy: Policy) -> None:
-    with pytest.raises(ConfigError, match="name a folder that udrl export --folder wrote"):
+    with pytest.raises(ConfigError, match="or a folder that udrl export --folder wrote"):
         udrl.load(tmp_path / "nothing")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="name a folder you may write"):
@@ -105,6 +105,8 @@ def test_no_folder(tmp_path: Path, policy: Policy) -> None:
 
 
 def test_the_package_offers_nothing_else() -> None:
+    assert {"train", "load", "__version__"} <= set(dir(udrl))
+    assert set(udrl.__all__) <= set(dir(udrl))
     with pytest.raises(AttributeError, match="'udrl' has no attribute 'loads'"):
         udrl.loads  # noqa: B018
 

@@ -1,6 +1,7 @@
 """``udrl.train``."""
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,10 @@ import pytest
 import udrl
 from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl_inspect.agents import load_agent
-from udrl_proto.reports import Status
+from udrl_inspect.exporting import export_folder
+from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
+from udrl_replay.reporting import history
+from udrl_replay.store import Store
 from whole_run import SMALL, digests, small
 
 SETTINGS: dict[str, Any] = {k: v for k, v in SMALL.items() if k != "environment"}
@@ -49,6 +53,64 @@ def test_a_callback_stops_a_run_that_can_be_resumed(
     budget = stopped.status.env_steps + 1000
     ended = udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, max_env_steps=budget)
     assert digests(ended.status) == digests(run(small(), budget))
+
+
+def test_events_are_passed_on_once_and_in_order(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    iterations: list[IterationStatus] = []
+    evaluations: list[EvaluationStatus] = []
+    ends: list[Status] = []
+    given: dict[str, Any] = {
+        "run_dir": run_dir, "on_iteration": iterations.append, "on_evaluation": evaluations.append,
+        "on_end": ends.append,
+    }  # fmt: skip
+    first = udrl.train("CartPole-v1", preset="none", max_env_steps="3K", **given, **SETTINGS)
+    assert ends == [first.status]
+    assert [i.iteration for i in iterations] == list(range(first.status.iteration + 1))
+    last = udrl.train("CartPole-v1", resume=True, max_env_steps=4500, **given)
+    assert ends == [first.status, last.status]
+    assert [i.iteration for i in iterations] == list(range(last.status.iteration + 1))
+    with closing(Store(run_dir, read_only=True)) as store:
+        found = history(store, -1)
+    # Exactly what the store has, before and after the resumption.
+    assert iterations == list(found.iterations)
+    assert evaluations == list(found.evaluations)
+
+
+@pytest.mark.parametrize("event", ["on_iteration", "on_evaluation"])
+def test_an_event_can_stop_a_run(event: str, tmp_path: Path) -> None:
+    seen: list[object] = []
+
+    def enough(found: object) -> bool:
+        seen.append(found)
+        return False
+
+    callback: dict[str, Any] = {event: enough}
+    stopped = udrl.train(
+        "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
+        **callback, **SETTINGS,
+    )  # fmt: skip
+    assert seen
+    assert stopped.status.state == "stopped"
+
+
+def test_a_run_directory_can_be_loaded(ended_run: Path, tmp_path: Path) -> None:
+    policy, agent = udrl.load(ended_run), load_agent(ended_run)
+    seen = [0.0, 0.1, 0.0, -0.1]
+    assert policy.logits(seen, 50.0, 50).tolist() == agent.policy.logits(seen, 50.0, 50).tolist()
+    assert policy.desired_return == agent.policy.desired_return
+    best = udrl.load(str(ended_run), "best")
+    assert best.behavior.weights.keys() == policy.behavior.weights.keys()
+    export_folder(agent, ended_run, tmp_path / "agent")
+    assert udrl.load(tmp_path / "agent").logits(seen, 50.0, 50).tolist() == (
+        policy.logits(seen, 50.0, 50).tolist()
+    )
+    with pytest.raises(ConfigError, match="an exported agent has one version"):
+        udrl.load(tmp_path / "agent", "best")
+    with pytest.raises(ConfigError, match="expected latest, best or a version number"):
+        udrl.load(ended_run, "newest")  # type: ignore[arg-type]
+    with pytest.raises(StoreError, match="kept are versions"):
+        udrl.load(ended_run, 10**6)
 
 
 def test_a_run_that_ends_with_its_warm_up_has_no_agent(tmp_path: Path) -> None:

@@ -6,11 +6,14 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.metadata import SESSION_START_INFO_TAG
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from udrl_inspect.inspection import read_status
-from udrl_show.event_files import EVALUATION_TAGS, FOLDER, TAGS
+from udrl_show.event_files import DERIVED_TAGS, EVALUATION_TAGS, FOLDER, TAGS
 from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 
@@ -22,6 +25,15 @@ def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
         tag: [(event.step, event.value) for event in found.Scalars(tag)]
         for tag in found.Tags()["scalars"]
     }
+
+
+def hyperparameters(run_dir: Path) -> dict[str, object]:
+    """Return the hyperparameters that TensorBoard's HPARAMS page shows."""
+    found = EventAccumulator(str(run_dir / FOLDER))
+    found.Reload()
+    content = found.SummaryMetadata(SESSION_START_INFO_TAG).plugin_data.content
+    values = HParamsPluginData.FromString(content).session_start_info.hparams
+    return {name: getattr(v, str(v.WhichOneof("kind"))) for name, v in values.items()}
 
 
 def metrics(run_dir: Path) -> list[dict[str, str]]:
@@ -36,7 +48,7 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
             *arguments(SMALL, budget, run_dir), "--resume", "--tensorboard", "--in-process"
         ).status()
         told, rows = read(run_dir), metrics(run_dir)
-        assert set(told) == {*TAGS, *EVALUATION_TAGS, "time/fps"}
+        assert set(told) == {*TAGS, *EVALUATION_TAGS, *DERIVED_TAGS}
         # Iterations may be complete in the same moment; between them there is no speed.
         walls = [0.0, *(float(r["wall_s"]) for r in rows)]
         timed = [
@@ -45,6 +57,17 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
         ]  # fmt: skip
         assert [step for step, _ in told.pop("time/fps")] == timed
         assert timed
+        evaluated = SMALL["eval_episodes"]
+        explored = [int(r["commands"]) - (evaluated if r["eval_mean"] else 0) for r in rows]
+        assert explored[0] == SMALL["n_warm_up_episodes"]
+        assert set(explored[1:]) == {SMALL["n_episodes_per_iter"]}
+        totals = [0, *(int(r["env_steps"]) for r in rows)]
+        lengths = [(b - a) / n for a, b, n in zip(totals, totals[1:], explored, strict=False)]
+        assert [value for _, value in told["rollout/ep_len_mean"]] == pytest.approx(lengths)
+        assert [step for step, _ in told.pop("rollout/ep_len_mean")] == totals[1:]
+        assert hyperparameters(run_dir)["learning_rate"] == SMALL["learning_rate"]
+        assert hyperparameters(run_dir)["hidden"] == "[16, 16]"
+        assert hyperparameters(run_dir)["max_env_steps"] == budget
         last = read_status(run_dir).closing_evaluation
         assert last is not None
         for tag in ("eval/mean_reward", "eval/ci95_low", "eval/ci95_high"):

@@ -16,12 +16,14 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import Evaluation, summarise
+from udrl.folder import load as load_folder
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
 from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
+from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
 from udrl_replay.store import EvaluationRow, Store
 
@@ -64,12 +66,14 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         hello = store.fact("hello", Hello)
         progress = store.fact("progress", Progress)
         named = {"latest": progress.latest_version, "best": progress.best_version}
+        if version not in named and not isinstance(version, int):
+            raise ConfigError(f"weights {version!r}: expected latest, best or a version number")
         wanted = version if isinstance(version, int) else named[version]
         found = store.version(wanted)
         if progress.latest_version == 0:
             raise StoreError(
-                f"{run_dir} has no weights: nothing was trained after the warm-up yet; go on with "
-                f"the run, with a larger max_env_steps if that is spent"
+                f"{run_dir} has no weights: nothing was trained after the warm-up yet; resume the "
+                f"run, with a larger max_env_steps if its budget is spent"
             )
         if found is None or not found.weights:
             raise StoreError(
@@ -87,6 +91,31 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             iteration=progress.iteration,
             weights=found.weights,
         )
+
+
+def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") -> Policy:
+    """Return the agent of a run, or an exported one.
+
+    Its ``desired_return`` and ``desired_horizon`` are those of its evaluations.
+
+    Args:
+        path: the directory of a run, or a folder written by ``udrl export --folder``.
+        weights: a weights version that the run keeps, ``latest`` or ``best``.
+
+    Raises:
+        ConfigError: the path is neither, or ``weights`` cannot be chosen.
+        InvalidData: the files are invalid.
+        StoreError: the run has no such version.
+    """
+    path = Path(path)
+    if (path / FILE).exists():
+        return load_agent(path, weights).policy
+    if weights != "latest":
+        raise ConfigError(
+            f"weights = {weights!r}: {path} is not a run directory, and an exported agent has one "
+            f"version; leave weights out"
+        )
+    return load_folder(path)
 
 
 def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:

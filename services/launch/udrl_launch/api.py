@@ -16,6 +16,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from udrl.errors import ConfigError, Interrupted, UdrlError
 from udrl.policy import Policy
 from udrl_inspect.agents import load_agent
@@ -23,11 +25,17 @@ from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.paths import new_run_dir
 from udrl_launch.settings import gather
 from udrl_launch.training import train as run_training
-from udrl_proto.reports import Status
+from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
 from udrl_replay.creation import directory_name, exists
+from udrl_replay.store import EVALUATION_COLUMNS
+from udrl_show.metrics_file import MetricsReader
 
 #: Called with the status of a run. It stops the run by returning False.
 Callback = Callable[[Status], bool | None]
+#: Called with a completed iteration. It stops the run by returning False.
+IterationCallback = Callable[[IterationStatus], bool | None]
+#: Called with an evaluation. It stops the run by returning False.
+EvaluationCallback = Callable[[EvaluationStatus], bool | None]
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,9 @@ def train(
     preset: str | None = None,
     resume: bool = False,
     callbacks: Callback | Iterable[Callback] = (),
+    on_iteration: IterationCallback | None = None,
+    on_evaluation: EvaluationCallback | None = None,
+    on_end: Callable[[Status], object] | None = None,
     in_process: bool = True,
     **settings: Any,
 ) -> Trained:
@@ -70,11 +81,18 @@ def train(
         preset: a preset. None: the one named after the environment, else ``any``. ``"none"``: the
             defaults.
         resume: resume the run in ``run_dir``, if there is one.
-        callbacks: called with the run's status about twice a second, and at the end. A callback
-            that returns False stops the run, which can then be resumed.
+        callbacks: called with the run's status about twice a second, and at the end.
+        on_iteration: called once with each iteration, in order.
+        on_evaluation: called once with each evaluation, in order. The final evaluation is in the
+            status that ``on_end`` receives.
+        on_end: called once with the last status, when the run has ended, failed or was stopped.
         in_process: run all services as threads of this process. False: as separate processes,
             which is faster for long runs.
-        settings: any setting of ``docs/configuration.md``, by name.
+        settings: any setting of ``docs/configuration.md``, by name. Numbers of env steps can be
+            strings, such as ``"3M"``.
+
+    If one of ``callbacks``, ``on_iteration`` or ``on_evaluation`` returns False, the run is stopped
+    and can be resumed.
 
     Raises:
         ConfigError: a setting is unknown or invalid.
@@ -92,7 +110,10 @@ def train(
     )
     folder = chosen or new_run_dir(directory_name(gathered.config))
     stop = threading.Event()
-    watcher = _Callbacks([callbacks] if callable(callbacks) else list(callbacks), stop)
+    after = read_status(folder).iteration if going_on else -1
+    watcher = _Callbacks(folder, after, gathered.config.evaluation.eval_episodes, stop)
+    watcher.on_status += [callbacks] if callable(callbacks) else list(callbacks)
+    watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation
     try:
         status = run_training(
             gathered, folder, stop, go_on=resume, in_process=in_process, watcher=watcher
@@ -100,19 +121,56 @@ def train(
     except Interrupted:
         status = read_status(folder)
     watcher.show(status)
+    if on_end is not None:
+        on_end(status)
     if status.problem:
         raise UdrlError(status.problem)
     return Trained(folder, status)
 
 
 class _Callbacks:
-    """Passes the status to callbacks, and stops the run if one returns False."""
+    """Calls callbacks, and stops the run if one returns False.
 
-    def __init__(self, callbacks: list[Callback], stop: threading.Event) -> None:
-        self._callbacks = callbacks
+    Args:
+        run_dir: the run's directory, whose metrics have the iterations.
+        after: the last iteration that was complete before; -1: none was.
+        eval_episodes: episodes of an evaluation.
+        stop: stops the run.
+    """
+
+    def __init__(
+        self, run_dir: Path, after: int, eval_episodes: int, stop: threading.Event
+    ) -> None:
+        self.on_status: list[Callback] = []
+        self.on_iteration: IterationCallback | None = None
+        self.on_evaluation: EvaluationCallback | None = None
+        self._metrics = MetricsReader(run_dir)
+        self._after = after
+        self._eval_episodes = eval_episodes
         self._stop = stop
 
     def show(self, status: Status) -> None:
-        for callback in self._callbacks:
-            if callback(status) is False:
-                self._stop.set()
+        if self.on_iteration is not None or self.on_evaluation is not None:
+            for row in self._metrics.read().rows:
+                if int(row["iteration"]) > self._after:
+                    self._after = int(row["iteration"])
+                    self._events(row)
+        for callback in self.on_status:
+            self._stop_if_false(callback(status))
+
+    def _events(self, row: dict[str, str]) -> None:
+        values = {name: value or None for name, value in row.items()}
+        if self.on_iteration is not None:
+            found = {name: values[name] for name in IterationStatus.__struct_fields__}
+            iteration = msgspec.convert(found, IterationStatus, strict=False)
+            self._stop_if_false(self.on_iteration(iteration))
+        if self.on_evaluation is not None and values["eval_mean"] is not None:
+            found = {name: values[column] for column, name in EVALUATION_COLUMNS.items()}
+            found |= {"iteration": values["iteration"], "episodes": str(self._eval_episodes)}
+            found = {name: found[name] for name in EvaluationStatus.__struct_fields__}
+            evaluation = msgspec.convert(found, EvaluationStatus, strict=False)
+            self._stop_if_false(self.on_evaluation(evaluation))
+
+    def _stop_if_false(self, returned: bool | None) -> None:
+        if returned is False:
+            self._stop.set()

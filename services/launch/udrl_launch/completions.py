@@ -37,9 +37,9 @@ def weights(context: click.Context, param: click.Parameter, incomplete: str) -> 
     # While the option has no value, click leaves the arguments unparsed.
     run_dir = context.params.get("run_dir") or next(iter(context.args), None)
     if run_dir is not None:
-        with suppress(UdrlError):  # the command itself reports it
-            with closing(Store(Path(run_dir), read_only=True)) as store:
-                names += [str(version) for version in store.versions_kept()]
+        # The command itself reports an error.
+        with suppress(UdrlError), closing(Store(Path(run_dir), read_only=True)) as store:
+            names += [str(version) for version in store.versions_kept()]
     return [name for name in names if name.startswith(incomplete)]
 
 

@@ -1,15 +1,16 @@
-"""TensorBoard's event files, written from ``metrics.csv`` while it grows."""
+"""TensorBoard event files, written from ``metrics.csv`` during a run."""
 
-import csv
-import os
+import json
 import time
 from pathlib import Path
 from typing import Any
 
 from udrl.errors import ConfigError
+from udrl_inspect.inspection import settings_of
 from udrl_proto.reports import Status
+from udrl_show.metrics_file import MetricsReader
 
-#: The names that others use for the same, and the columns that they are.
+#: Tags as other libraries name them, and columns.
 TAGS = {
     "rollout/ep_rew_mean": "explored_return",
     "rollout/desired_return_min": "commanded_min",
@@ -22,7 +23,7 @@ TAGS = {
     "time/iterations": "iteration",
     "time/wall_s": "wall_s",
 }
-#: Of evaluations, which stand at env steps of their own.
+#: Tags of evaluations, which have env steps of their own.
 EVALUATION_TAGS = {
     "eval/mean_reward": "eval_mean",
     "eval/ci95_low": "eval_ci95_low",
@@ -30,12 +31,16 @@ EVALUATION_TAGS = {
     "eval/desired_return": "eval_desired_return",
     "eval/desired_horizon": "eval_desired_horizon",
 }
+#: Tags of values that follow from two rows.
+DERIVED_TAGS = ("rollout/ep_len_mean", "time/fps")
 
 FOLDER = "tensorboard"
 
 
 class EventFiles:
-    """The event files of a run, made anew whenever somebody begins to work on it.
+    """The event files of a run, written again from its first iteration at every start.
+
+    They have the run's settings as hyperparameters.
 
     Args:
         run_dir: the run's directory.
@@ -48,48 +53,49 @@ class EventFiles:
         try:
             from tensorboard.compat.proto.event_pb2 import Event
             from tensorboard.compat.proto.summary_pb2 import Summary
+            from tensorboard.plugins.hparams.summary_v2 import hparams_pb
             from tensorboard.summary.writer.event_file_writer import EventFileWriter
         except ModuleNotFoundError as error:
             raise ConfigError(
                 'event files need tensorboard; install it with: pip install "udrl[tensorboard]"'
             ) from error
-        self._metrics = run_dir / "metrics.csv"
+        self._run_dir = run_dir
         self._folder = run_dir / FOLDER
+        self._metrics = MetricsReader(run_dir)
         self._kind, self._event, self._summary = EventFileWriter, Event, Summary
+        self._hyperparameters = hparams_pb
         self._writer: Any = None
-        self._read = 0
-        self._columns: list[str] = []
-        self._file: os.stat_result | None = None
+        self._has_rows = False
         self._began = 0.0
-        self._before = (0.0, 0.0)
+        self._eval_episodes = 0
+        self._env_steps = 0
+        self._timed = 0, 0.0
         self._is_closed = False
         self._begin()
 
     def show(self, status: Status) -> None:
-        """Write what has come to ``metrics.csv`` since the last time."""
-        try:
-            with self._metrics.open("rb") as file:
-                self._begin_if_new(os.fstat(file.fileno()), status)
-                file.seek(self._read)
-                text = file.read()
-        except FileNotFoundError:
-            return  # the replay service has not written anything yet
-        whole = text[: text.rfind(b"\n") + 1]
-        self._read += len(whole)
-        for row in csv.reader(whole.decode().splitlines()):
-            if self._columns:
-                self._write(dict(zip(self._columns, row, strict=True)))
-            else:
-                self._columns = row
+        """Write the rows of ``metrics.csv`` since the last call."""
+        found = self._metrics.read()
+        if found.is_new_file:
+            if self._has_rows:
+                self._begin()
+            self._has_rows = True
+            self._env_steps, self._timed, self._is_closed = 0, (0, 0.0), False
+            self._began = time.time() - status.wall_s
+            self._write_settings(status.run_id)
+        if not self._has_rows:
+            return
+        for row in found.rows:
+            self._write(row)
         if status.closing_evaluation is not None and not self._is_closed:
             self._is_closed = True
-            found, at = status.closing_evaluation, self._began + status.wall_s
+            final, at = status.closing_evaluation, self._began + status.wall_s
             for tag, value in (
-                ("eval/mean_reward", found.mean),
-                ("eval/ci95_low", found.ci95_low),
-                ("eval/ci95_high", found.ci95_high),
+                ("eval/mean_reward", final.mean),
+                ("eval/ci95_low", final.ci95_low),
+                ("eval/ci95_high", final.ci95_high),
             ):
-                self._add(tag, value, found.env_steps, at)
+                self._add(tag, value, final.env_steps, at)
         self._writer.flush()
 
     def close(self) -> None:
@@ -97,18 +103,8 @@ class EventFiles:
         if self._writer is not None:
             self._writer.close()
 
-    def _begin_if_new(self, found: os.stat_result, status: Status) -> None:
-        """Begin again if this is another file, or it has been begun anew."""
-        held, self._file = self._file, found
-        if held is None or held.st_ino != found.st_ino or found.st_size < self._read:
-            if held is not None:
-                self._begin()
-            self._read, self._columns = 0, []
-            self._before, self._is_closed = (0.0, 0.0), False
-            self._began = time.time() - status.wall_s
-
     def _begin(self) -> None:
-        """Open a file of events in the place of those that are there."""
+        """Replace the event files by a new one."""
         self.close()
         try:
             for old in self._folder.glob("events.out.tfevents.*"):
@@ -116,8 +112,18 @@ class EventFiles:
             self._writer = self._kind(str(self._folder))
         except OSError as error:
             raise ConfigError(
-                f"{self._folder}: {error.strerror}; make it a folder that you may write"
+                f"{self._folder}: {error.strerror}; make it a folder that you can write to"
             ) from error
+
+    def _write_settings(self, run_id: str) -> None:
+        settings = settings_of(self._run_dir)
+        self._eval_episodes = settings["eval_episodes"]
+        values = {
+            name: value if isinstance(value, bool | int | float | str) else json.dumps(value)
+            for name, value in settings.items()
+        }
+        summary = self._hyperparameters(values, trial_id=run_id, start_time_secs=self._began)
+        self._writer.add_event(self._event(wall_time=self._began, summary=summary))
 
     def _add(self, tag: str, value: float, step: int, at: float) -> None:
         scalar = self._summary.Value(tag=tag, simple_value=value)
@@ -130,8 +136,13 @@ class EventFiles:
             for tag, column in tags.items():
                 if row[column] and row[steps]:
                     self._add(tag, float(row[column]), int(row[steps]), at)
-        now = float(row["env_steps"]), float(row["wall_s"])
-        if now[1] > self._before[1]:
-            speed = (now[0] - self._before[0]) / (now[1] - self._before[1])
-            self._add("time/fps", speed, int(now[0]), at)
-            self._before = now
+        env_steps, wall_s = int(row["env_steps"]), float(row["wall_s"])
+        episodes = int(row["commands"]) - (self._eval_episodes if row["eval_mean"] else 0)
+        if episodes > 0:
+            length = (env_steps - self._env_steps) / episodes
+            self._add("rollout/ep_len_mean", length, env_steps, at)
+        self._env_steps = env_steps
+        if wall_s > self._timed[1]:  # iterations can be complete at the same moment
+            speed = (env_steps - self._timed[0]) / (wall_s - self._timed[1])
+            self._add("time/fps", speed, env_steps, at)
+            self._timed = env_steps, wall_s
