@@ -1,4 +1,4 @@
-"""A trained agent to act with: an observation and an order in, an action out."""
+"""A trained agent: observation and command in, action out."""
 
 import math
 from typing import Any
@@ -18,19 +18,25 @@ from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
 
 class Policy:
-    """A behavior function with the settings that say how to ask it (section 2.3.2).
+    """A behavior function with the settings that it was trained with (section 2.3.2).
 
-    The same arguments give the same distribution, to the bit the one that Algorithm 2 samples from
-    (:mod:`udrl.acting`). An agent with a ``memory`` remembers what :meth:`predict` was shown since
-    :meth:`reset`, which has to be called when an episode begins.
+    Its distributions are bit-identical to those that Algorithm 2 samples from (:mod:`udrl.acting`).
+    An agent with a ``memory`` remembers the observations that :meth:`predict` received since
+    :meth:`reset`, which must be called at the beginning of each episode.
+
+    All methods also take a batch: a desired return and a desired horizon for each of ``n``
+    observations, which are stacked along the first dimension as vector environments do. A single
+    desired return or horizon is used for all of them::
+
+        actions = policy.predict(observations, np.full(8, 200.0), 300)
 
     Args:
         behavior: B(s, c; theta).
         config: the settings that it was trained with.
-        spec: of its environment.
-        rng: draws the actions; None: seeded by the operating system.
-        desired_return: what to ask it for if one has no wishes; None: unknown.
-        desired_horizon: in how many steps; likewise.
+        spec: properties of its environment.
+        rng: source of random numbers for actions. None: seeded by the operating system.
+        desired_return: the default command's return. None: unknown.
+        desired_horizon: the default command's horizon. None: unknown.
     """
 
     def __init__(
@@ -52,18 +58,31 @@ class Policy:
         self._rng = rng or np.random.default_rng()
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the episode so far."""
-        self._state: State | None = None
+    def reset(self, rows: npt.ArrayLike | None = None) -> None:
+        """Begin an episode: forget the observations so far.
+
+        Args:
+            rows: the rows of a batch whose episodes begin, bool [n]. None: all.
+        """
+        if rows is None:
+            self._state: State | None = None
+        elif self._state is not None:
+            begins = np.asarray(rows, bool)
+            if begins.shape != (len(self._state),):
+                raise InvalidData(
+                    f"rows of shape {begins.shape}: expected ({len(self._state)},), one for each "
+                    f"row of the batch"
+                )
+            self._state = np.where(begins[:, None], np.float32(0), self._state)
 
     def make_environment(self, **kwargs: Any) -> Environment:
-        """Return the environment that it was trained in, with observations as it knows them.
+        """Create the environment of the agent, with the observations that it was trained with.
 
         Args:
             kwargs: further arguments for ``gymnasium.make``, e.g. ``render_mode="human"``.
 
         Raises:
-            UnsupportedEnvironment: it cannot be made here.
+            UnsupportedEnvironment: the environment cannot be created here.
         """
         known = self.config.environment_kwargs
         env: Environment = make_environment(
@@ -71,7 +90,7 @@ class Policy:
         )
         if isinstance(self.spec.observation_space, Record):
             space = env.observation_space
-            # A function, since Gymnasium copies what it is given, and a method has its policy.
+            # A function, because Gymnasium copies it, and a method would bring its policy.
             env = gym.wrappers.TransformObservation(
                 env, lambda record: nested(space, iter(parts_of(record))), space
             )
@@ -80,64 +99,77 @@ class Policy:
         return gym.wrappers.FrameStackObservation(env, self.config.network.frame_stack)
 
     def logits(
-        self, observation: npt.ArrayLike, desired_return: float, desired_horizon: float
+        self,
+        observation: npt.ArrayLike,
+        desired_return: npt.ArrayLike,
+        desired_horizon: npt.ArrayLike,
     ) -> npt.NDArray[np.float64]:
         """Return the logits of P(a | s, c).
 
         Args:
-            observation: what the environment shows; of a record a structured array will do too.
-                With a ``frame_stack`` of more than 1 the most recent ones, the newest last, as
-                ``gymnasium.wrappers.FrameStackObservation`` stacks them.
-            desired_return: what is still to be obtained.
-            desired_horizon: in how many steps; less than 1 counts as 1. It is not read where the
-                horizon follows from the return (``desired_horizon = "return"``).
+            observation: an observation of the environment, or a batch; a record can also be a
+                structured array. With a ``frame_stack`` of more than 1, the last observations,
+                newest last, as ``gymnasium.wrappers.FrameStackObservation`` stacks them.
+            desired_return: the return still to be obtained.
+            desired_horizon: the steps left for it; less than 1 counts as 1. Not used if the horizon
+                follows from the return (``desired_horizon = "return"``).
 
         Returns:
-            float64 [n_parameters].
+            float64 [n_parameters]; of a batch [n, n_parameters].
 
         Raises:
-            InvalidData: the observation has another shape than those it was trained on, or
-                something is not finite, or the temperature less than 0.
+            InvalidData: the observation has another shape than in training, a value is not finite,
+                or the temperature is below 0.
         """
         return self.advance(observation, desired_return, desired_horizon, self._state)[0]
 
     def advance(
         self,
         observation: npt.ArrayLike,
-        desired_return: float,
-        desired_horizon: float,
+        desired_return: npt.ArrayLike,
+        desired_horizon: npt.ArrayLike,
         state: State | None,
     ) -> tuple[npt.NDArray[np.float64], State]:
-        """Return the logits, as :meth:`logits`, and what is remembered afterwards.
+        """Return the logits, as :meth:`logits`, and the memory at the next step.
 
         Args:
             observation: see :meth:`logits`.
             desired_return: likewise.
             desired_horizon: likewise.
-            state: what is remembered; None: nothing, the episode begins.
+            state: the memory. None: empty, as at the beginning of an episode.
         """
-        desired = np.array([[desired_return, desired_horizon]], np.float64)
-        if not np.isfinite(desired).all():
+        desired, n = _commands(desired_return, desired_horizon)
+        seen = self._memory.join(self._plain(observation, n))
+        if n is None:
+            rows, after = self.behavior.advance(seen, desired, state)
+            return rows[0].astype(np.float64), after
+        if state is not None and len(state) != n:
             raise InvalidData(
-                f"desired return {desired_return}, desired horizon {desired_horizon}: expected "
-                f"finite numbers"
+                f"a batch of {n} observations, but the memory is that of {len(state)} episodes; "
+                f"call reset() first"
             )
-        seen = self._memory.join(self._plain(observation)[None])
-        rows, after = self.behavior.advance(seen, desired, state)
-        return rows[0].astype(np.float64), after
+        call = self.behavior.call(n)
+        for given, array in zip(call.seen, seen, strict=True):
+            given[:] = array
+        call.command[:] = desired
+        call.state[:] = 0 if state is None else state
+        call.run()
+        return call.logits.astype(np.float64), call.next_state.copy()
 
-    def _plain(self, observation: Any) -> Observations:
-        """Return what the environment showed as an array, [frame_stack, *observation_shape]."""
-        space, n = self.spec.observation_space, self._memory.length
-        plain: Observations = np.empty((n, *space.shape), space.dtype)
+    def _plain(self, observation: Any, n: int | None) -> Observations:
+        """Return observations as an array, [n or 1, frame_stack, *observation_shape]."""
+        space, length = self.spec.observation_space, self._memory.length
+        plain: Observations = np.empty((n or 1, length, *space.shape), space.dtype)
         parts = zip(leaves_of(space), parts_of(plain), self._memory.shapes, strict=True)
+        rows = () if n is None else (n,)
         for leaf, part, joined in parts:
             seen = np.asarray(_find(leaf, observation))
-            expected = part.shape[1:] if n == 1 else joined
-            if seen.shape not in (expected, part.shape):
+            stacked = part.shape[1:]
+            expected = stacked[1:] if length == 1 else joined
+            if seen.shape not in ((*rows, *expected), (*rows, *stacked)):
                 raise InvalidData(
-                    f"an observation{leaf.name} of shape {seen.shape}: expected {expected}; show "
-                    f"the policy what it was trained on ({self.config.environment})"
+                    f"an observation{leaf.name} of shape {seen.shape}: expected "
+                    f"{(*rows, *expected)}, as in training ({self.config.environment})"
                 )
             if not np.isfinite(seen).all():
                 raise InvalidData(f"observation{leaf.name}: {seen}; expected finite numbers")
@@ -147,65 +179,99 @@ class Policy:
     def probabilities(
         self,
         observation: npt.ArrayLike,
-        desired_return: float,
-        desired_horizon: float,
+        desired_return: npt.ArrayLike,
+        desired_horizon: npt.ArrayLike,
         temperature: float = 1.0,
     ) -> npt.NDArray[np.float64]:
-        """Return P(a | s, c), float64 [n_parameters]; arguments and errors as of :meth:`logits`.
+        """Return P(a | s, c), float64 of the shape that :meth:`logits` returns.
 
         Args:
             observation: see :meth:`logits`.
             desired_return: likewise.
             desired_horizon: likewise.
-            temperature: logits are divided by it; 0: all on the mode.
+            temperature: divisor of the logits; 0 = probability 1 for the most likely action.
         """
         _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
-        return self.spec.action_space.probabilities(logits, temperature)
+        space = self.spec.action_space
+        if logits.ndim == 1:
+            return space.probabilities(logits, temperature)
+        return np.stack([space.probabilities(row, temperature) for row in logits])
 
     def predict(
         self,
         observation: npt.ArrayLike,
-        desired_return: float,
-        desired_horizon: float,
+        desired_return: npt.ArrayLike,
+        desired_horizon: npt.ArrayLike,
         *,
         temperature: float = 1.0,
         deterministic: bool = False,
     ) -> Any:
-        """Return an action of P(a | s, c); arguments and errors as of :meth:`logits`.
+        """Sample an action from P(a | s, c).
 
-        Who acts counts down: after a reward r ask for ``desired_return - r`` within
-        ``desired_horizon - 1`` steps (Algorithm 2).
+        The caller counts down: after a reward r, pass ``desired_return - r`` and
+        ``desired_horizon - 1`` (Algorithm 2).
 
         Args:
             observation: see :meth:`logits`.
             desired_return: likewise.
             desired_horizon: likewise.
-            temperature: logits are divided by it; 0: take the mode.
-            deterministic: the same as a temperature of 0.
+            temperature: divisor of the logits; 0 = the most likely action.
+            deterministic: same as a temperature of 0.
+
+        Returns:
+            The action; of a batch the actions, stacked along the first dimension. A batch gets the
+            actions that as many single calls with the same random numbers would get.
         """
         _check(temperature)
+        temperature = 0.0 if deterministic else temperature
         logits, self._state = self.advance(
             observation, desired_return, desired_horizon, self._state
         )
         space = self.spec.action_space
-        uniform: Any = self._rng.random(space.shape)
-        return space.choose(logits, 0.0 if deterministic else temperature, uniform)
+        if logits.ndim == 1:
+            uniform: Any = self._rng.random(space.shape)
+            return space.choose(logits, temperature, uniform)
+        uniforms = self._rng.random((len(logits), *space.shape))
+        if temperature == 0:
+            return space.mode(logits)
+        return space.sample(logits, np.full((len(logits), 1), temperature), uniforms)
+
+
+def _commands(
+    desired_return: npt.ArrayLike, desired_horizon: npt.ArrayLike
+) -> tuple[npt.NDArray[np.float64], int | None]:
+    """Return commands, float64 [n, 2], and n; of a single command [1, 2], and None."""
+    values = np.asarray(desired_return, np.float64), np.asarray(desired_horizon, np.float64)
+    try:
+        desired = np.stack(np.broadcast_arrays(*values), axis=-1)
+    except ValueError:
+        desired = np.empty(())
+    if desired.ndim not in (1, 2) or desired.size == 0:
+        raise InvalidData(
+            f"desired returns of shape {values[0].shape} and desired horizons of shape "
+            f"{values[1].shape}: expected numbers, or one for each observation of a batch"
+        )
+    if not np.isfinite(desired).all():
+        raise InvalidData(
+            f"desired return {values[0]}, desired horizon {values[1]}: expected finite numbers"
+        )
+    return (desired[None], None) if desired.ndim == 1 else (desired, len(desired))
 
 
 def _find(leaf: Leaf, observation: Any) -> Any:
-    """Return a leaf of what an environment shows, plain or its own."""
+    """Return a leaf of an observation, which can be plain or the environment's own."""
     try:
         if isinstance(observation, np.ndarray | np.void) and observation.dtype.names:
             return observation[leaf.name]
         return leaf.find(observation)
     except (LookupError, ValueError) as error:
         raise InvalidData(
-            f"observation{leaf.name} is missing in {describe(observation)}; show the policy what "
-            f"it was trained on"
+            f"observation{leaf.name} is missing in {describe(observation)}; pass observations like "
+            f"those in training"
         ) from error
 
 
 def _check(temperature: float) -> None:
     if not 0 <= temperature < math.inf:
-        raise InvalidData(f"temperature {temperature}: expected a finite number from 0 on")
+        raise InvalidData(f"temperature {temperature}: expected a finite number of at least 0")

@@ -1,8 +1,10 @@
+import contextlib
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from udrl.actions import Categorical
 from udrl.config import Config, build
@@ -108,3 +110,85 @@ def test_choosing_is_by_inverse_cdf(uniform: float) -> None:
     assert space.choose(logits, 1.0, uniform) == expected
     assert space.choose(logits, 0.0, uniform) == 2
     assert space.probabilities(logits, 1.0) == pytest.approx([0.2, 0.3, 0.5])
+
+
+BATCHED: list[dict[str, Any]] = [
+    {},
+    {"memory": "gru"},
+    {"frame_stack": 3},
+    {"environment": "Figure2-v0"},  # an index
+    {"environment": "Taxi-v4", "action_mask": "info"},  # a record
+    {"environment": "Pendulum-v1"},  # several components
+]
+
+
+@pytest.mark.parametrize("settings", BATCHED)
+@pytest.mark.parametrize("temperature", [1.0, 0.0])
+def test_a_batch_gets_the_actions_that_single_calls_get(
+    settings: dict[str, Any], temperature: float
+) -> None:
+    agent, other = policy(**settings), policy(**settings)
+    with contextlib.closing(agent.make_environment()) as env:
+        env.observation_space.seed(3)
+        single = [env.observation_space.sample() for _ in range(4)]
+        space = batch_space(env.observation_space, 4)
+        empty: Any = create_empty_array(env.observation_space, 4)
+        batch: Any = concatenate(env.observation_space, single, empty)
+        assert space.contains(batch)
+    returns, horizons = np.array([0.5, 1.0, 1.5, 2.0]), np.array([1, 2, 3, 4])
+    for _ in range(3 if agent.behavior.state_size else 1):
+        states = [None if agent._state is None else agent._state[k : k + 1] for k in range(4)]
+        logits, one_by_one = [], []
+        for k in range(4):
+            other._state = states[k]
+            logits.append(other.logits(single[k], returns[k], horizons[k]).tolist())
+            one_by_one.append(
+                np.asarray(
+                    other.predict(single[k], returns[k], horizons[k], temperature=temperature)
+                ).tolist()
+            )
+        assert agent.logits(batch, returns, horizons).tolist() == logits
+        shares = agent.probabilities(batch, returns, horizons, temperature)
+        assert shares.shape == (4, agent.spec.action_space.n_parameters)
+        actions = agent.predict(batch, returns, horizons, temperature=temperature)
+        assert actions.tolist() == one_by_one
+
+
+def test_a_number_is_used_for_all_rows_of_a_batch() -> None:
+    agent = policy()
+    batch = np.array([SEEN, SEEN[::-1]])
+    expected = agent.logits(batch, np.array([20.0, 20.0]), np.array([30, 30])).tolist()
+    assert agent.logits(batch, np.array([20.0, 20.0]), 30).tolist() == expected
+    assert agent.logits(batch, 20.0, np.array([30, 30])).tolist() == expected
+
+
+def test_rows_of_a_batch_forget_their_episodes_one_by_one() -> None:
+    agent = policy(memory="gru")
+    batch, returns = np.array([SEEN, SEEN]), np.array([20.0, 20.0])
+    first = agent.logits(batch, returns, 30).tolist()
+    agent.predict(batch, returns, 30)
+    later = agent.logits(batch, returns, 30).tolist()
+    assert later != first
+    agent.reset([True, False])
+    assert agent.logits(batch, returns, 30).tolist() == [first[0], later[1]]
+    with pytest.raises(InvalidData, match=r"rows of shape \(3,\): expected \(2,\)"):
+        agent.reset([True, False, True])
+    with pytest.raises(InvalidData, match="a batch of 1 observations, but the memory is that of 2"):
+        agent.predict(batch[:1], returns[:1], 30)
+    agent.reset()
+    assert agent.logits(batch, returns, 30).tolist() == first
+
+
+@pytest.mark.parametrize(
+    ("seen", "desired", "says"),
+    [
+        (SEEN, ([1.0, 2.0], 1), r"an observation of shape \(4,\): expected \(2, 4\)"),
+        ([SEEN, SEEN], (1.0, 1), r"an observation of shape \(2, 4\): expected \(4,\)"),
+        ([SEEN, SEEN], ([1.0, 2.0], [1, 2, 3]), r"returns of shape \(2,\) and .* of shape \(3,\)"),
+        ([SEEN, SEEN], ([[1.0, 2.0]], 1), r"returns of shape \(1, 2\)"),
+        ([SEEN, SEEN], ([1.0, math.nan], 1), "expected finite numbers"),
+    ],
+)
+def test_batches_that_do_not_fit_are_refused(seen: Any, desired: Any, says: str) -> None:
+    with pytest.raises(InvalidData, match=says):
+        policy().predict(seen, *desired)
