@@ -42,10 +42,10 @@ def test_advice_for_what_is_unusual() -> None:
 
     advice = " ".join(checked(Poor, horizon_scale=1e-4).advice)
     for part in (
-        "not the same again from its seed",
+        "Episodes cannot be repeated from their seeds",
         "All random episodes return 0",
-        "last until the limit of 50 steps",
-        "horizon_scale = 0.0001 makes numbers of about 0.005",
+        "All random episodes reach the limit of 50 steps",
+        "horizon_scale = 0.0001 scales values of about 50 to inputs of about 0.005",
     ):
         assert part in advice
 

@@ -40,10 +40,11 @@ def test_there_is_python_to_run() -> None:
     assert [("udrl.train" in block, "udrl.load" in block) for block in BLOCKS] == [
         (True, False),
         (False, True),
+        (False, True),
     ]
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=["train", "load"])
+@pytest.mark.parametrize("block", BLOCKS, ids=["train", "load", "batch"])
 def test_examples_run(agent: Path, block: str) -> None:
     # As written, but for the length of the training.
     code = block.replace("max_env_steps=100_000", "max_env_steps=1_000")

@@ -77,7 +77,7 @@ def test_the_cards_command_trains_the_same_agent(
     cli(*words, "--run-dir", str(tmp_path / "run"), "--in-process", "--json").status()
     again = (tmp_path / "run" / "weights.safetensors").read_bytes()
     assert again == (folder / "model.safetensors").read_bytes()
-    assert "it gives the same weights, to the bit" in (folder / "README.md").read_text()
+    assert "this command trains bit-identical weights" in (folder / "README.md").read_text()
 
 
 def test_earlier_weights_have_the_evaluation_that_was_theirs(
@@ -87,14 +87,14 @@ def test_earlier_weights_have_the_evaluation_that_was_theirs(
         version = store.evaluations(-1, 10**9)[0].iteration - small().lead
     export(ended_run, "--folder", tmp_path / "best", "--weights", version)
     card = (tmp_path / "best" / "README.md").read_text()
-    told = re.search(r"\*\*Mean return.*asked for (\S+) within (\d+) steps", card)
+    told = re.search(r"\*\*Mean return.*desired return of (\S+) within (\d+) steps", card)
     assert told is not None
     loaded = udrl.load(tmp_path / "best")
     assert f"{loaded.desired_return:.1f}" == told[1]
     assert str(loaded.desired_horizon) == told[2]
     # It does not end with these, and does not say so.
-    assert f"its version {version} has the same weights" in card
-    assert "it gives the same weights" not in card
+    assert f"version {version} of this command's run has bit-identical weights" in card
+    assert "this command trains bit-identical weights" not in card
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -113,7 +113,7 @@ def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is the directory of a run"):
         export(ended_run, "--folder", ended_run)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="name a file you may write"):
+    with pytest.raises(ConfigError, match="name a file that you can write to"):
         export(ended_run, "--onnx", tmp_path / "file" / "agent.onnx")
     with pytest.raises(UdrlError, match="not kept"):
         export(ended_run, "--folder", tmp_path / "x", "--weights", "1")

@@ -150,7 +150,7 @@ def test_horizons_that_are_not_read_are_neither_varied_nor_commanded(ended_run: 
     agent = load_agent(ended_run)
     agent = agent._replace(config=change(agent.config, horizon_scale=0))
     assert plan_commands(agent, points=3, episodes=2).by_horizon == []
-    with pytest.raises(ConfigError, match=r"desired horizon 9.*do not read it"):
+    with pytest.raises(ConfigError, match=r"desired horizon 9.*do not use it"):
         evaluation_commands(agent, episodes=2, desired_horizon=9)
 
 
@@ -169,16 +169,16 @@ def test_the_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: P
     version = load_agent(run_dir).version
     assert f"udrl obedience {run_dir} --weights {version}" in hint
     card = tmp_path / "agent" / "README.md"
-    assert "What it can be asked for" not in card.read_text()
+    assert "Which returns it delivers" not in card.read_text()
     call("obedience", run_dir, "--episodes", 2, "--points", 2)
     report = kept(run_dir)
     assert report is not None
     assert call("export", run_dir, "--folder", tmp_path / "agent")[1] == ""
-    assert f"## What it can be asked for\n\n{markdown(report)}\n" in card.read_text()
+    assert f"## Which returns it delivers\n\n{markdown(report)}\n" in card.read_text()
     for other in ({"weights_version": version + 1}, {"run_id": "another"}):
         keep(run_dir, msgspec.structs.replace(report, **other))
         call("export", run_dir, "--folder", tmp_path / "agent")
-        assert "What it can be asked for" not in card.read_text()
+        assert "Which returns it delivers" not in card.read_text()
     (run_dir / "obedience.json").write_text("{}")
     with pytest.raises(UdrlError, match="measure again"):
         call("export", run_dir, "--folder", tmp_path / "agent")

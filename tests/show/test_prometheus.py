@@ -92,7 +92,7 @@ def test_every_metric_is_in_the_glossary() -> None:
 def test_a_port_that_is_taken() -> None:
     with (
         closing(Exporter(lambda: None, "127.0.0.1", 0)) as first,
-        pytest.raises(ConfigError, match=f"port {first.port}: .*a port that is free"),
+        pytest.raises(ConfigError, match=f"port {first.port}: .*a free port"),
     ):
         Exporter(lambda: None, "127.0.0.1", first.port)
 

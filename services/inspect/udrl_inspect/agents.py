@@ -1,4 +1,4 @@
-"""Agents of runs: loaded, evaluated, and told one command again."""
+"""Agents of runs: loading and evaluating them, and running a command again."""
 
 import faulthandler
 from collections.abc import Callable, Sequence
@@ -27,12 +27,12 @@ from udrl_replay.database import FILE
 from udrl_replay.progress import Progress
 from udrl_replay.store import EvaluationRow, Store
 
-#: Seconds after which a command that is reproduced shows where it is, again and again.
+#: Seconds between tracebacks of a command that is reproduced.
 _SHOW_S = 60.0
 
 
 class Agent(NamedTuple):
-    """A trained behavior function and the run that it comes from."""
+    """A trained behavior function and its run."""
 
     run_id: str
     config: Config
@@ -45,22 +45,23 @@ class Agent(NamedTuple):
 
     @property
     def policy(self) -> Policy:
-        """What to act with; if one has no wishes, ask it for what evaluations ask (2.3.6)."""
-        told = evaluation_commands(self, episodes=1)[0]
+        """The policy; its default command is that of evaluations (2.3.6)."""
+        command = evaluation_commands(self, episodes=1)[0]
         return Policy(
             self.behavior,
             self.config,
             self.environment,
-            desired_return=told.desired_return,
-            desired_horizon=told.desired_horizon,
+            desired_return=command.desired_return,
+            desired_horizon=command.desired_horizon,
         )
 
 
 def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest") -> Agent:
-    """Return an agent from a run's directory.
+    """Return the agent of a run.
 
     Raises:
-        StoreError: there is no run, or it does not keep that version.
+        ConfigError: the version is neither a number nor ``latest`` or ``best``.
+        StoreError: the directory holds no run, or the run does not keep that version.
     """
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)
@@ -119,7 +120,7 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
 
 
 def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:
-    """Return what the run's own evaluation of an agent obtained; None: there was none."""
+    """Return the run's own evaluation of an agent; None if there was none."""
     # With a lead the same weights are evaluated in a later iteration.
     return store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
         agent.version + agent.config.lead, closing=False
@@ -127,17 +128,20 @@ def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:
 
 
 def reproduce(run_dir: Path, command_id: int) -> Episode:
-    """Carry out one outstanding command of a run.
+    """Run one outstanding command of a run.
 
     Raises:
         StoreError: there is no such command, or its weights are not kept.
-        EnvironmentFault: the environment failed, with what it raised as the cause.
+        EnvironmentFault: the environment failed; its exception is the cause.
     """
     with closing(Store(run_dir, read_only=True)) as store:
         config = store.fact("hello", Hello).config
         outstanding = {c.id: c for c in store.commands(cancelled=False)}
     if command_id not in outstanding:
-        raise StoreError(f"command {command_id} is not outstanding in {run_dir}")
+        raise StoreError(
+            f"command {command_id} is not outstanding in {run_dir}; use the id in the run's error "
+            f"or log"
+        )
     command = outstanding[command_id]
     version = command.weights_version
     behavior = load_agent(run_dir, version).behavior if version else None
@@ -150,15 +154,15 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
 
 
 class Result(NamedTuple):
-    """What an evaluation commanded, and what was obtained.
+    """The command of an evaluation, and its results.
 
     Attributes:
         desired_return: of every episode's command.
-        desired_horizon: likewise, in steps.
-        temperature: likewise.
-        evaluation: of the returns.
-        returns: of the episodes, in the order of their commands.
-        lengths: of the episodes, in steps.
+        desired_horizon: of every episode's command, in steps.
+        temperature: of every episode's command.
+        evaluation: statistics of the returns.
+        returns: the episodes' returns, in the order of their commands.
+        lengths: the episodes' lengths in steps.
     """
 
     desired_return: float
@@ -177,31 +181,31 @@ def evaluation_commands(
     desired_return: float | None = None,
     desired_horizon: int | None = None,
 ) -> list[Command]:
-    """Return the commands of an evaluation; what is None is as in the run's closing one (2.3.6).
+    """Return the commands of an evaluation; None means as in the run's final evaluation (2.3.6).
 
     Raises:
-        ConfigError: a horizon is given, and the run's horizons follow from the returns, or are not
-            read.
+        ConfigError: a horizon is given, but the run's horizons follow from the returns, or its
+            agents have no horizon as input.
     """
     if agent.config.network.horizon_scale == 0 and desired_horizon is not None:
         raise ConfigError(
-            f"desired horizon {desired_horizon}: this run's agents do not read it (horizon_scale "
-            f"= 0); give the return only"
+            f"desired horizon {desired_horizon}: this run's agents do not use it (horizon_scale = "
+            f"0); give only a desired return"
         )
     if agent.config.network.desired_horizon == "return" and desired_horizon is not None:
         raise ConfigError(
-            f"desired horizon {desired_horizon}: in this run it is the desired return, as an "
-            f"integer, at every step; give the return only"
+            f"desired horizon {desired_horizon}: in this run it always equals the desired return, "
+            f"as an integer; give only a desired return"
         )
     if temperature is None:
         temperature = agent.config.evaluation.eval_temperature
     config = change(agent.config, eval_episodes=episodes, eval_temperature=temperature)
     sampler = CommandSampler(config, agent.environment)
     commands = sampler.close(agent.iteration, agent.buffer)
-    told = commands[0]
+    default = commands[0]
     desired = ReturnInTime(config.network).settle(
-        told.desired_return if desired_return is None else desired_return,
-        told.desired_horizon if desired_horizon is None else desired_horizon,
+        default.desired_return if desired_return is None else desired_return,
+        default.desired_horizon if desired_horizon is None else desired_horizon,
     )
     return [
         msgspec.structs.replace(c, desired_return=desired[0], desired_horizon=desired[1])
@@ -210,9 +214,9 @@ def evaluation_commands(
 
 
 def evaluate(agent: Agent, commands: Sequence[Command], environments: int = 16) -> Result:
-    """Evaluate an agent by the commands of an evaluation (:func:`evaluation_commands`).
+    """Evaluate an agent with given commands (:func:`evaluation_commands`).
 
-    With those of the run's own settings this repeats its closing evaluation exactly.
+    With the run's own settings this repeats its final evaluation exactly.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
@@ -227,20 +231,20 @@ def evaluate_all(
     environments: int = 16,
     ended: Callable[[], object] = lambda: None,
 ) -> list[Result]:
-    """Carry out several evaluations in one go, so that all environments stay busy.
+    """Run several evaluations together, so that all environments stay busy.
 
     Each result is that of :func:`evaluate`: an episode depends on its command alone.
 
     Args:
-        agent: who acts.
-        evaluations: for each its commands, at least one.
-        environments: most episodes that run at the same time.
-        ended: called whenever an episode has ended.
+        agent: the agent.
+        evaluations: the commands of each, at least one.
+        environments: maximum number of episodes at the same time.
+        ended: called at the end of each episode.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
     """
-    # Evaluations of the same run have the same ids; episodes are told apart by theirs.
+    # Evaluations of the same run have the same ids, and episodes are identified by them.
     first = evaluations[0][0].id if evaluations else 0
     numbered = [
         msgspec.structs.replace(command, id=first + k)

@@ -1,4 +1,4 @@
-"""``udrl check``: whether an environment can be trained on, and what it is like."""
+"""``udrl check``: whether an environment is supported, and its properties."""
 
 import logging
 import re
@@ -23,35 +23,36 @@ from udrl.episode import Episode
 from udrl.fitting import fit, fits
 from udrl.repeating import environment_digest, repeated_digest
 
-#: Random episodes that are looked at, and seconds after which no other one is begun.
+#: Random episodes, and seconds after which no further one is started.
 _EPISODES = 20
 _PATIENCE_S = 20.0
 _MIB = 2**20
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
-    """What an environment is like.
+    """Properties of an environment.
 
     Attributes:
         environment: its id.
         declared_observations: its observation space.
         declared_actions: its action space.
-        observations: what the algorithm sees of them.
-        actions: likewise.
+        observations: the observation space as the algorithm reads it.
+        actions: the action space as the algorithm reads it.
         max_episode_steps: its step limit.
-        max_return: the greatest return that it declares; None: none.
-        repeats: whether an episode is the same again from its seed, in the same instance and in
-            another; runs are exact only then.
-        episodes: random ones that were played.
-        return_min, return_mean, return_max: of these.
-        length_mean: of these, steps.
-        make_s: seconds that making one took.
-        reset_s: seconds of a reset, mean.
-        step_s: seconds of a step, mean.
-        memory_mib: that an environment takes of this process, about; 0: less than can be told.
-        step_bytes: of one step as it is sent and stored.
-        chosen: settings that were left open, and what was chosen.
-        advice: what is unusual, a sentence each.
+        max_return: the highest possible return that it declares. None: it declares none.
+        repeats: whether an episode can be repeated from its seed, in the same instance and in
+            another. Only then are runs exact.
+        episodes: number of random episodes.
+        return_min, return_mean, return_max: their returns.
+        length_mean: their mean length in steps.
+        make_s: seconds to create an environment.
+        reset_s: mean seconds of a reset.
+        step_s: mean seconds of a step.
+        memory_mib: approximate memory of an environment in this process; 0 if it is too small to
+            measure.
+        step_bytes: size of one step as it is sent and stored.
+        chosen: values of the settings that are chosen automatically.
+        advice: a sentence about each unusual property.
     """
 
     environment: str
@@ -77,15 +78,15 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def check(config: Config, left_open: Collection[str] = ()) -> Check:
-    """Make an environment, have it checked, and play random episodes in it.
+    """Create an environment, check it, and play random episodes.
 
     Args:
-        config: the settings of a run of it.
-        left_open: those to choose by what it is like (:mod:`udrl.fitting`).
+        config: the settings of a run.
+        left_open: settings to choose automatically (:mod:`udrl.fitting`).
 
     Raises:
-        UnsupportedEnvironment: it cannot be made or is not supported; the message says all.
-        EnvironmentFault: it raised, or returned what it may not.
+        UnsupportedEnvironment: it cannot be created or is not supported.
+        EnvironmentFault: it raised, or returned an invalid value.
     """
     before, began = _memory(), time.perf_counter()
     env = make_environment(config)
@@ -95,7 +96,7 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
     env.close()
     with closing(EpisodeGenerator(config, 1)) as generator:
         spec = generator.spec
-        memory = (_memory() - before) / 2  # two were made
+        memory = (_memory() - before) / 2  # two were created
         digest = repeated_digest(generator)
         fitted = fit(config, left_open, generator)
         episodes, reset_s, step_s = _play(generator, fitted)
@@ -130,7 +131,7 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
 
 
 def _play(generator: EpisodeGenerator, config: Config) -> tuple[list[Episode], float, float]:
-    """Play random episodes; return them and the seconds of a reset and of a step."""
+    """Play random episodes; return them and the mean seconds of a reset and a step."""
     sampler = CommandSampler(change(config, n_warm_up_episodes=_EPISODES), generator.spec)
     episodes: list[Episode] = []
     resets = steps = 0.0
@@ -155,45 +156,46 @@ def _play(generator: EpisodeGenerator, config: Config) -> tuple[list[Episode], f
 
 
 def _of_gymnasium(env: Any) -> list[str]:
-    """Return what Gymnasium's own checker finds, a sentence each."""
+    """Return a sentence for each finding of Gymnasium's own checker."""
     logger = logging.getLogger("gymnasium")
     level = logger.level
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         try:
             check_env(env, skip_render_check=True)
-        except Exception as error:  # noqa: BLE001 - it says no in many ways, and runs foreign code
-            return [f"Gymnasium's checker says: {_line(error)}"]
+        except Exception as error:  # noqa: BLE001 - it raises many types, and runs foreign code
+            return [f"Gymnasium's checker reports: {_line(error)}"]
         finally:
             logger.setLevel(level)
     said = [_line(w.message) for w in found]
-    return [f"Gymnasium's checker warns: {s}" for s in said if "infinity" not in s]  # as most are
+    return [f"Gymnasium's checker warns: {s}" for s in said if "infinity" not in s]  # true of most
 
 
 def _line(message: object) -> str:
-    """Return a message without colours, in one line."""
+    """Return a message on one line, without colours."""
     return " ".join(re.sub(r"\x1b\[\d*m|WARN: ", "", str(message)).split())
 
 
 def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[str]:
-    """Return what is unusual of random episodes, and what to do about it, a sentence each."""
+    """Return a sentence for each unusual property of random episodes, with its remedy."""
     advice = []
     returns = np.array([e.episode_return for e in episodes])
     lengths = np.array([e.length for e in episodes])
     if not repeats:
         advice.append(
-            "An episode is not the same again from its seed, so runs will be marked exact: false; "
-            "draw all random numbers from self.np_random, seeded in reset(seed=...)."
+            "Episodes cannot be repeated from their seeds, so runs are marked exact: false; draw "
+            "all random numbers from self.np_random, seeded in reset(seed=...)."
         )
     if np.ptp(returns) == 0:
         advice.append(
-            f"All random episodes return {returns[0]:g}: nothing tells good ones from bad ones "
-            f"until chance finds a reward; expect a long beginning, or shape the reward."
+            f"All random episodes return {returns[0]:g}, so there is nothing to learn from until "
+            f"one of them finds a reward by chance; expect slow progress at first, or shape the "
+            f"reward."
         )
     if all(e.truncated and not e.terminated for e in episodes):
         advice.append(
-            f"All random episodes last until the limit of {lengths[0]} steps; a lower "
-            f"max_episode_steps makes the warm-up shorter."
+            f"All random episodes reach the limit of {lengths[0]} steps; a lower "
+            f"max_episode_steps shortens the warm-up."
         )
     for name, scale, size in (
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
@@ -201,13 +203,13 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
     ):
         if not fits(scale, size):
             advice.append(
-                f"{name} = {scale:g} makes numbers of about {scale * size:.2g} for the network of "
-                f"what is about {size:.3g}; try {name} = auto."
+                f"{name} = {scale:g} scales values of about {size:.3g} to inputs of about "
+                f"{scale * size:.2g}; the network needs inputs of about 1; try {name} = auto."
             )
     return advice
 
 
 def _memory() -> int:
-    """Return the greatest memory of this process so far, bytes."""
+    """Return the peak memory of this process in bytes."""
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

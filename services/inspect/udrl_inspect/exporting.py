@@ -1,4 +1,4 @@
-"""A run's agent as a folder with a model card, and its episodes as a dataset."""
+"""Exports: a run's agent as a folder with a model card, its episodes as a dataset."""
 
 import shlex
 from contextlib import closing
@@ -29,10 +29,10 @@ tags:
   - {environment}
 {index}---
 
-# {environment}, told what to do
+# Command-conditioned agent for {environment}
 
-An agent trained by [Upside-Down Reinforcement Learning](https://arxiv.org/abs/1912.02877): it is
-given an order, *"get this return within this many steps"*, and acts.
+An agent trained by [Upside-Down Reinforcement Learning](https://arxiv.org/abs/1912.02877). It takes
+a command: *get this return within this many steps*.
 
 {results}
 
@@ -41,20 +41,20 @@ given an order, *"get this return within this many steps"*, and acts.
 ```python
 {example}```
 
-This needs udrl, and what the environment needs.
+This needs `udrl` and the environment's dependencies.
 
-## Trained with
+## Training
 
 ```sh
 {command}
 ```
 
-udrl {version}, seed {seed}, weights version {weights}. All settings are in `config.toml` beside
-this card. About the command: {again}
+udrl {version}, seed {seed}, weights version {weights}. All settings are in `config.toml` in this
+folder. {again}
 """
 
 _OBEDIENCE = """\
-## What it can be asked for
+## Which returns it delivers
 
 {report}
 
@@ -94,13 +94,13 @@ while not over:
 
 
 def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
-    """Write an agent, its settings and a model card with what its run's evaluations said.
+    """Write an agent, its settings and a model card with the results of its evaluation.
 
-    If these weights were measured by ``udrl obedience``, the card has that report too.
+    The card includes the report of ``udrl obedience`` if it is about these weights.
 
     Raises:
-        ConfigError: the folder cannot be written, or holds a run.
-        InvalidData: the report is not what was written.
+        ConfigError: the folder cannot be written, or it is a run directory.
+        InvalidData: the report is damaged.
         StoreError: the run cannot be read.
     """
     if (folder / FILE).exists():
@@ -109,7 +109,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
         progress = store.fact("progress", Progress)
         found = stored_evaluation(store, agent)
     policy = agent.policy
-    if found is not None:  # what the card's results were asked for
+    if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
     card = _card(agent, folder, found, kept_of(agent, run_dir), _again(agent, progress))
     folders.save(folder, policy, card)
@@ -117,7 +117,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
 
 
 def export_model(agent: Agent, path: Path) -> None:
-    """Write the graph that an agent acts with (:mod:`udrl.graph`) as an ONNX model.
+    """Write an agent's acting graph (:mod:`udrl.graph`) as an ONNX model.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -126,11 +126,11 @@ def export_model(agent: Agent, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(agent.behavior.model)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a file you may write") from error
+        raise ConfigError(f"{path}: {error.strerror}; name a file that you can write to") from error
 
 
 def export_buffer(run_dir: Path, name: str) -> int:
-    """Write the replay buffer as a Minari dataset, least return first; return how many episodes.
+    """Write the replay buffer as a Minari dataset, lowest return first; return its size.
 
     Raises:
         ConfigError: the dataset cannot be written.
@@ -140,7 +140,9 @@ def export_buffer(run_dir: Path, name: str) -> int:
         hello = store.fact("hello", Hello)
         ids = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
         if not ids:
-            raise StoreError(f"{run_dir}: the replay buffer is empty; wait for the warm-up's end")
+            raise StoreError(
+                f"{run_dir}: the replay buffer is empty; wait until the warm-up is complete"
+            )
         space = hello.environment.observation_space
         episodes = (
             decode_episode(decode(body, EpisodeMessage, LARGEST), space)
@@ -152,19 +154,23 @@ def export_buffer(run_dir: Path, name: str) -> int:
 
 
 def _again(agent: Agent, progress: Progress) -> str:
-    """Return what the card's command gives whoever gives it."""
+    """Return a sentence about the weights that the card's command trains."""
     config = agent.config
     if progress.inexact_reason:
-        said = f"The run was not exact ({progress.inexact_reason}), so it gives other weights."
+        said = (
+            f"The run was not exact ({progress.inexact_reason}), so this command trains other "
+            f"weights."
+        )
     elif progress.state == "ended" and agent.version == progress.latest_version:
-        said = "On the same kind of hardware it gives the same weights, to the bit."
+        said = "On the same kind of hardware this command trains bit-identical weights."
     else:
         said = (
-            f"On the same kind of hardware its version {agent.version} has the same weights, to "
-            f"the bit; it goes on from there, and keeps the versions that it evaluates."
+            f"On the same kind of hardware, version {agent.version} of this command's run has "
+            f"bit-identical weights. The run continues after it, and keeps the versions that it "
+            f"evaluates."
         )
     if config.commands.dataset is not None:
-        said += f" It begins with the dataset `{config.commands.dataset}`, which has to be there."
+        said += f" It needs the dataset `{config.commands.dataset}`."
     return said
 
 
@@ -176,14 +182,14 @@ def _card(
     again: str,
 ) -> str:
     environment = agent.config.environment
-    results, index = "These weights were never evaluated.", ""
+    results, index = "These weights were not evaluated.", ""
     if found is not None:
         mean, std, low, high, episodes = found.evaluation
         index = _INDEX.format(environment=environment, mean=return_text(mean), std=return_text(std))
         results = (
             f"**Mean return {return_text(mean)}** (95 % interval {return_text(low)} to "
             f"{return_text(high)}, standard deviation {return_text(std)}, {episodes} episodes with "
-            f"seeds not trained on), asked for {return_text(found.desired_return)} within "
+            f"unseen seeds) for a desired return of {return_text(found.desired_return)} within "
             f"{found.desired_horizon} steps, after "
             f"{found.env_steps:,} env steps of training."
         )

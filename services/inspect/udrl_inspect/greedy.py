@@ -1,4 +1,4 @@
-"""Whether an agent acts worse greedily than sampled: often, if it learned from sampled actions."""
+"""Warns if an agent does worse with greedy actions, as it often does after sampled training."""
 
 import math
 from collections.abc import Sequence
@@ -12,19 +12,18 @@ from udrl_replay.store import Store
 
 
 def caution(agent: Agent, run_dir: Path, told: Command, returns: Sequence[float]) -> str:
-    """Return a sentence if greedy episodes obtained far less than the run's sampled evaluations.
+    """Return a warning if greedy episodes obtained far less than the run's sampled evaluations.
 
-    Far less: more than a standard deviation of the sampled returns, and more than chance explains,
-    however few the greedy episodes are.
+    Far less means more than a standard deviation of the sampled returns, and significantly less.
 
     Args:
-        agent: who acted.
+        agent: the agent.
         run_dir: the run's directory.
-        told: the command that it was given; any but the run's own cannot be compared.
-        returns: what it obtained.
+        told: its command. Only the run's own command can be compared.
+        returns: the returns that it obtained.
 
     Returns:
-        What was found and what to do; empty: nothing, or there is nothing to compare with.
+        The finding and its remedy; empty if there is none, or nothing to compare with.
 
     Raises:
         StoreError: the run cannot be read.

@@ -1,7 +1,7 @@
-"""What an agent can be asked for: commanded against obtained, and where the agent obeys.
+"""How well an agent follows its commands: obtained against commanded returns and horizons.
 
-The report is kept in the run's directory, so that the model card and the board show it without
-measuring again. It is a function of the run: the same commands, with the same seeds, each time.
+The report is stored in the run's directory, where model cards and the board read it. It is a
+function of the run: commands and seeds are the same each time.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,8 @@ from udrl_inspect.tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
-#: How far a mean obtained return may be from its command, as a share of the reachable range, where
-#: nothing else is wanted.
+#: Default tolerance: the largest difference between mean obtained and commanded return, as a share
+#: of the reachable range.
 TOLERANCE = 0.1
 
 _AtLeast0 = Annotated[float, Meta(ge=0)]
@@ -41,12 +41,12 @@ _Count = Annotated[int, Meta(ge=1)]
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What was obtained for one command.
+    """The results of one command.
 
     Attributes:
         desired_return: commanded.
         desired_horizon: commanded, in steps.
-        episodes: how many were carried out.
+        episodes: number of episodes.
         return_mean: mean of their returns.
         return_std: standard deviation of the sample.
         return_ci95_low: lower end of the 95 % confidence interval of the mean.
@@ -71,13 +71,13 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Agreement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How well obtained means follow commands, over a range of commands.
+    """Agreement of obtained means with commands, over a range of commands.
 
     Attributes:
-        low: least command.
-        high: greatest command.
-        mean_absolute_error: mean over the commands of the distance of what was obtained.
-        correlation: of the commands and the means; 0 where the means do not vary.
+        low: lowest command.
+        high: highest command.
+        mean_absolute_error: mean difference between obtained and commanded values.
+        correlation: of commands and means; 0 if the means are all equal.
     """
 
     low: float
@@ -93,18 +93,18 @@ class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         format: of the file.
         run_id: the run that the agent comes from.
         environment: Gymnasium's id.
-        weights_version: the agent's.
-        temperature: of its actions; 0: the most likely one.
-        episodes: for each command.
-        reachable_low: least return that counts as reachable (:func:`udrl.obedience.spread`).
-        reachable_high: greatest return that counts as reachable.
-        tolerance: how far a mean may be from its command, in units of the return.
-        by_return: commanded returns in increasing order, each with the horizon that belongs to it.
-        by_horizon: commanded horizons in increasing order, all with the return that evaluations
-            command; empty where that makes no difference, or all episodes have the same length.
+        weights_version: the agent's weights version.
+        temperature: sampling temperature; 0 = most likely action.
+        episodes: number of episodes for each command.
+        reachable_low: lowest reachable return (:func:`udrl.obedience.spread`).
+        reachable_high: highest reachable return.
+        tolerance: largest difference between a mean and its command that counts as obeyed.
+        by_return: results by commanded return in increasing order, each with its horizon.
+        by_horizon: results by commanded horizon in increasing order, with the desired return of
+            evaluations. Empty if the horizon has no effect, or all episodes have the same length.
         all_returns: agreement over all of ``by_return``.
-        obeyed: agreement over the range in which the agent obeys; None: there is none.
-        all_horizons: agreement of commanded horizons and lengths, in steps; None: not measured.
+        obeyed: agreement over the range in which the agent obeys. None: there is no such range.
+        all_horizons: agreement of commanded horizons and lengths, in steps. None: not measured.
     """
 
     format: Literal[1] = 1
@@ -132,9 +132,9 @@ class Plan(NamedTuple):
     """The commands of a report.
 
     Attributes:
-        by_return: for each commanded return its episodes' commands.
-        by_horizon: likewise for each commanded horizon.
-        reachable: the least and the greatest return that count as reachable.
+        by_return: the commands for each desired return.
+        by_horizon: the commands for each desired horizon.
+        reachable: the lowest and the highest reachable return.
     """
 
     by_return: list[list[Command]]
@@ -143,7 +143,7 @@ class Plan(NamedTuple):
 
     @property
     def total(self) -> int:
-        """How many episodes it has."""
+        """Number of episodes."""
         return sum(map(len, self.by_return + self.by_horizon))
 
 
@@ -158,14 +158,14 @@ def plan_commands(
     """Return the commands for a report on an agent.
 
     Args:
-        agent: who is asked.
-        points: commanded returns, and commanded horizons; at least 2.
-        episodes: for each.
-        temperature: None: as in the run's evaluations.
-        desired_returns: the least and the greatest return to command; None: what is reachable.
+        agent: the agent.
+        points: number of desired returns, and of desired horizons; at least 2.
+        episodes: number of episodes for each.
+        temperature: sampling temperature. None: as in the run's evaluations.
+        desired_returns: range of desired returns. None: the reachable returns.
 
     Raises:
-        ConfigError: there would be one commanded return only.
+        ConfigError: there is only one desired return.
     """
     returns = [entry.episode_return for entry in agent.buffer]
     lengths = [entry.length for entry in agent.buffer]
@@ -186,8 +186,8 @@ def plan_commands(
     if len(by_return) < 2:
         only = by_return[0][0].desired_return
         raise ConfigError(
-            f"all returns that could be commanded are {only:g}, as those of the replay buffer are; "
-            f"name a range to command: --desired-returns LOW:HIGH"
+            f"all returns in the replay buffer are {only:g}, so there is no range to command; give "
+            f"one with --desired-returns LOW:HIGH"
         )
     horizons = spread(lengths, points) if has_horizon else []
     whole = sorted({max(1, nearest(value)) for value in horizons})
@@ -201,14 +201,14 @@ def measure(
     tolerance: float | None = None,
     ended: Callable[[], object] = lambda: None,
 ) -> Obedience:
-    """Carry out a plan and return the report.
+    """Run the commands of a plan and return the report.
 
     Args:
-        agent: that the plan was made for.
-        plan: its commands.
-        tolerance: how far a mean may be from its command, in units of the return; None:
+        agent: the agent of the plan.
+        plan: the commands.
+        tolerance: largest difference between a mean and its command that counts as obeyed. None:
             :data:`TOLERANCE` of the reachable range.
-        ended: called whenever an episode has ended.
+        ended: called at the end of each episode.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
@@ -223,7 +223,7 @@ def measure(
             for name in ("desired_return", "return_mean", "return_ci95_low", "return_ci95_high")
         )
     )
-    # Of a buffer whose returns are all the same no tolerance follows.
+    # If all returns in the buffer are equal, their range is 0.
     if tolerance is None:
         tolerance = TOLERANCE * (high - low or float(np.ptp(means.commanded)))
     where = obeyed(means, tolerance)
@@ -276,10 +276,10 @@ def _agreement(commanded: Sequence[float], obtained: Sequence[float]) -> Agreeme
 
 
 def keep(run_dir: Path, report: Obedience) -> Path:
-    """Write a report into a run's directory, and return the file.
+    """Write a report to a run's directory, and return the file's path.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     path = run_dir / FILE
     try:
@@ -290,10 +290,10 @@ def keep(run_dir: Path, report: Obedience) -> Path:
 
 
 def kept_of(agent: Agent, run_dir: Path) -> Obedience | None:
-    """Return the report that a run's directory holds on these very weights; None: there is none.
+    """Return the report in a run's directory if it is about this agent's weights, else None.
 
     Raises:
-        InvalidData: the file is not what :func:`keep` writes.
+        InvalidData: the file is invalid.
     """
     report = kept(run_dir)
     if report is None:
@@ -303,10 +303,10 @@ def kept_of(agent: Agent, run_dir: Path) -> Obedience | None:
 
 
 def kept(run_dir: Path) -> Obedience | None:
-    """Return the report that a run's directory holds; None: there is none.
+    """Return the report in a run's directory; None if there is none.
 
     Raises:
-        InvalidData: the file is not what :func:`keep` writes.
+        InvalidData: the file is invalid.
     """
     path = run_dir / FILE
     try:

@@ -1,4 +1,4 @@
-"""The report on what an agent can be asked for, as text: sentences, tables, rows of a CSV file."""
+"""The obedience report as text: sentences, tables, rows of a CSV file."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +16,11 @@ _HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "me
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of the CSV file; what it shares with :class:`Point` is described there.
+    """A row of the CSV file; its other attributes are those of :class:`Point`.
 
     Attributes:
-        sweep: what was varied.
-        obeyed: whether the command belongs to the range in which the agent obeys.
+        sweep: which part of the command is varied.
+        obeyed: whether the command is in the range in which the agent obeys.
     """
 
     sweep: Literal["return", "horizon"]
@@ -39,7 +39,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def rows(report: Obedience) -> Iterator[Row]:
-    """Yield the lines of the CSV file: commanded returns, then commanded horizons."""
+    """Yield the rows of the CSV file: commanded returns, then commanded horizons."""
     for point in report.by_return:
         yield Row(sweep="return", obeyed=is_obeyed(report, point), **_fields(point))
     for point in report.by_horizon:
@@ -52,13 +52,13 @@ def _fields(point: Point) -> dict[str, Any]:
 
 
 def is_obeyed(report: Obedience, point: Point) -> bool:
-    """Return whether a command belongs to the range in which the agent obeys."""
+    """Return whether a command is in the range in which the agent obeys."""
     found = report.obeyed
     return found is not None and found.low <= point.desired_return <= found.high
 
 
 def answer(report: Obedience) -> str:
-    """Return the sentence that says which returns can be commanded."""
+    """Return a sentence about the returns that can be commanded."""
     every, found = report.all_returns, report.obeyed
     error = _number(report)
     if found is not None:
@@ -89,7 +89,7 @@ def answer(report: Obedience) -> str:
 
 
 def best(report: Obedience) -> str:
-    """Return the sentence that says what to command for the most."""
+    """Return a sentence about the command with the highest mean return."""
     point, number = report.best, _number(report)
     return (
         f"Highest mean return: {number(point.return_mean)} (95 % interval "
@@ -99,12 +99,12 @@ def best(report: Obedience) -> str:
 
 
 def summary(report: Obedience) -> str:
-    """Return the answer, and what to command for the most."""
+    """Return the sentences of :func:`answer` and :func:`best`."""
     return f"{answer(report)} {best(report)}"
 
 
 def horizons(report: Obedience) -> str:
-    """Return the sentence about commanded horizons; empty: none were measured."""
+    """Return a sentence about commanded horizons; empty if none were measured."""
     found = report.all_horizons
     if found is None:
         return ""
@@ -118,7 +118,7 @@ def horizons(report: Obedience) -> str:
 
 
 def rule(report: Obedience) -> str:
-    """Return the sentence that says when a command counts as obeyed."""
+    """Return a sentence that defines when a command counts as obeyed."""
     is_usual = math.isclose(report.tolerance, _usual_tolerance(report))
     share = f" ({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns)"
     return (
@@ -128,7 +128,7 @@ def rule(report: Obedience) -> str:
 
 
 def about(report: Obedience) -> str:
-    """Return the sentence that says how it was measured."""
+    """Return a sentence about the measurement."""
     return (
         f"{report.environment}, weights version {report.weights_version}, temperature "
         f"{report.temperature:g}, {report.episodes} episodes for each command."
@@ -136,7 +136,7 @@ def about(report: Obedience) -> str:
 
 
 def table(report: Obedience) -> str:
-    """Return the whole report for a terminal; it ends with the answer."""
+    """Return the report for a terminal; it ends with the answer."""
     cells = [list(_HEAD), *_cells(report, report.by_return)]
     if report.by_horizon:
         cells += [[""], *_cells(report, report.by_horizon)]
@@ -176,14 +176,14 @@ def _cells(report: Obedience, points: Sequence[Point]) -> Iterator[list[str]]:
 
 
 def _exact(value: float) -> str:
-    """Return a commanded return as it is; they are round (:func:`udrl.obedience.evenly`)."""
+    """Return a commanded return unrounded (:func:`udrl.obedience.evenly` rounds them)."""
     return f"{value:.10g}"
 
 
 def _number(report: Obedience) -> Callable[[float], str]:
-    """Return what writes returns of a report, alike and with as many digits as tell them apart.
+    """Return a function that formats the returns of a report, all with the same precision.
 
-    These are digits to a tenth of the tolerance, which may be wider than all returns.
+    The precision is a tenth of the tolerance, or of the usual one if that is smaller.
     """
     finest = min(report.tolerance, _usual_tolerance(report))
     if finest <= 0:

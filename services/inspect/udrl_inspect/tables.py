@@ -1,4 +1,4 @@
-"""Tidy tables: a CSV file with a line for each observation, typed and checked when it is read."""
+"""Tidy tables: CSV files whose rows are typed and checked when they are read."""
 
 import csv
 import io
@@ -16,14 +16,14 @@ Row = TypeVar("Row", bound=msgspec.Struct)
 
 
 def put(path: Path, content: bytes) -> None:
-    """Write a file; it is there whole or not at all."""
+    """Write a file atomically."""
     aside = path.with_name(path.name + ".part")
     aside.write_bytes(content)
     os.replace(aside, path)
 
 
 def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
-    """Write rows, with the field names as the first line; the file is there whole or not at all."""
+    """Write rows below a line with the field names; the file is written atomically."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(kind.__struct_fields__)
@@ -35,7 +35,7 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
     """Return the rows of a file.
 
     Raises:
-        InvalidData: it is not such a table.
+        InvalidData: the file is no such table.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -43,7 +43,7 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
             rows = list(table)
         if tuple(table.fieldnames or ()) != kind.__struct_fields__:
             raise ValueError(f"its columns are {table.fieldnames}")  # noqa: TRY301
-        # The text "" is none where no text is expected.
+        # An empty cell is None unless it is text.
         words = {f.name for f in msgspec.structs.fields(kind) if f.type is str}
         read = [
             msgspec.convert(
@@ -63,6 +63,6 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
     except (OSError, ValueError, csv.Error, msgspec.ValidationError) as error:
         raise InvalidData(
             f"{path}: {error}; expected a CSV file with {', '.join(kind.__struct_fields__)}; "
-            f"delete it to have it made again"
+            f"delete it, and it is written again"
         ) from error
     return read

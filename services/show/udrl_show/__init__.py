@@ -1,1 +1,1 @@
-"""Runs and agents made visible: pictures, films, a panel, metrics for other programs."""
+"""Views of runs and agents: figures, films, a progress panel, metrics for other programs."""

@@ -1,4 +1,4 @@
-"""Films of episodes: MP4 or GIF, a caption under every picture."""
+"""Films of episodes as MP4 or GIF, with a caption below every picture."""
 
 import subprocess
 import tempfile
@@ -13,20 +13,20 @@ from udrl.errors import ConfigError
 Picture = npt.NDArray[np.uint8]
 
 _CAPTION_HEIGHT = 26
-#: Small screens are enlarged until they are this wide, in pixels.
+#: Smaller pictures are enlarged to at least this width in pixels.
 _LEAST_WIDTH = 320
-#: What GIFs have at most; browsers slow down faster ones.
+#: Maximum of GIFs; browsers slow down faster ones.
 _GIF_FPS = 25
 #: Options of ffmpeg for each kind of file.
 _KINDS = {
     ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "15"),
-    # One palette for all pictures has to see them all first: ffmpeg holds them meanwhile.
+    # The palette is computed from all pictures, so ffmpeg keeps them in memory until the end.
     ".gif": (
         "-filter_complex",
         "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
     ),
 }
-#: Seconds that ffmpeg gets to finish a file.
+#: Seconds for ffmpeg to finish a file.
 _FINISH_S = 60.0
 
 
@@ -41,14 +41,15 @@ def check_name(path: Path) -> None:
 
 
 class Film:
-    """A file that pictures are appended to.
+    """A film that pictures are appended to.
 
     Args:
         path: ``.mp4`` (H.264) or ``.gif``.
-        fps: pictures a second; of a GIF only so many are kept that it plays as fast.
+        fps: pictures per second. A GIF drops pictures to keep this speed.
 
     Raises:
-        ConfigError: another kind of file, it cannot be written, or the extra is not installed.
+        ConfigError: the extension is another, the file cannot be written, or the extra is not
+            installed.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -70,7 +71,7 @@ class Film:
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the film
 
     def add(self, picture: Picture, caption: str) -> None:
-        """Append a picture, uint8 [height, width, 3]; the first says how large the film is."""
+        """Append a picture, uint8 [height, width, 3]; the first one sets the size of the film."""
         self._seen += 1
         if (self._seen - 1) % self._every:
             return
@@ -80,7 +81,7 @@ class Film:
         if frame.shape != self._shape:
             raise ConfigError(
                 f"--video {self._path}: the environment's pictures changed from {self._shape} to "
-                f"{frame.shape}, and those of a film have one size"
+                f"{frame.shape}; expected pictures of one size"
             )
         assert self._process.stdin is not None
         try:
@@ -89,7 +90,7 @@ class Film:
             raise self._failed() from error
 
     def frame(self, picture: Picture, caption: str) -> Picture:
-        """Return a picture with its caption below it, both sides even, as H.264 wants them."""
+        """Return a picture with its caption below it; both sides are even, as H.264 requires."""
         enlarge = max(1, -(-_LEAST_WIDTH // picture.shape[1]))
         large = picture.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
         height, width = (n - n % 2 for n in large.shape[:2])
@@ -99,7 +100,7 @@ class Film:
         return np.asarray(page)
 
     def close(self) -> None:
-        """Finish the file; a film without pictures leaves none.
+        """Finish the file. Without pictures, no file is written.
 
         Raises:
             ConfigError: ffmpeg could not write it.
@@ -120,25 +121,25 @@ class Film:
         return process.returncode
 
     def _failed(self) -> ConfigError:
-        """Return an error with the first thing that ffmpeg said; nothing is left of the film."""
+        """Return an error with the first line of ffmpeg's output, and remove the file."""
         if self._process is not None:
             self._finish()
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
         self._said.close()
         self._path.unlink(missing_ok=True)
-        why = lines[0].strip() if lines else "it ended without a word"
+        why = lines[0].strip() if lines else "it ended without a message"
         return ConfigError(f"--video {self._path}: ffmpeg cannot write it: {why}")
 
     def _open(self, frame: Picture) -> subprocess.Popen[bytes]:
         height, width, _ = frame.shape
-        # Here and not by ffmpeg, which would not say it as shortly.
+        # ffmpeg's own message would be longer.
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.open("wb").close()
         except OSError as error:
             raise ConfigError(
-                f"--video {self._path}: {error.strerror}; name a file that you may write"
+                f"--video {self._path}: {error.strerror}; name a file that you can write to"
             ) from error
         arguments = (
             "-y", "-loglevel", "error",

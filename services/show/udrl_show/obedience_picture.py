@@ -1,4 +1,4 @@
-"""The report on what an agent can be asked for, as a picture."""
+"""The obedience report as a figure."""
 
 from pathlib import Path
 from textwrap import fill
@@ -12,7 +12,7 @@ from udrl_show.styles import line_style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Characters of a line of the title over one pair of axes.
+#: Characters per line of the title, for each panel.
 _TITLE = 52
 
 
@@ -20,11 +20,12 @@ def draw(report: Obedience, picture: Path) -> None:
     """Draw obtained against commanded returns, and lengths against commanded horizons.
 
     Args:
-        report: what was measured.
+        report: the report.
         picture: ``.png``, ``.svg`` or ``.pdf``.
 
     Raises:
-        ConfigError: matplotlib is not installed, another kind of file, or it cannot be written.
+        ConfigError: matplotlib is not installed, the extension is another, or the file cannot be
+            written.
     """
     pictures.check_name(picture)
     figure, axes = pictures.empty(2 if report.by_horizon else 1)

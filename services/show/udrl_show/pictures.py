@@ -36,7 +36,7 @@ def empty(panels: int = 1) -> "tuple[Figure, list[Axes]]":
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise ConfigError(
-            'pictures of curves need matplotlib; install it with: pip install "udrl[plot]"'
+            'figures need matplotlib; install it with: pip install "udrl[plot]"'
         ) from error
     columns = min(panels, _MOST_COLUMNS)
     rows = -(-panels // columns)
@@ -60,4 +60,6 @@ def save(figure: "Figure", picture: Path) -> None:
         figure.savefig(aside, format=picture.suffix[1:], dpi=130)
         os.replace(aside, picture)
     except OSError as error:
-        raise ConfigError(f"{picture}: {error.strerror}; name a file you may write") from error
+        raise ConfigError(
+            f"{picture}: {error.strerror}; name a file that you can write to"
+        ) from error

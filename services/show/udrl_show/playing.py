@@ -1,4 +1,4 @@
-"""``udrl play``: episodes to look at, in a window or a film, one step at a time."""
+"""``udrl play``: episodes shown in a window or recorded as a film."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -17,28 +17,28 @@ from udrl.streams import Purpose, stream_key
 from udrl_inspect.agents import Agent
 from udrl_show.film import Film, Picture
 
-#: Pictures a second where the environment does not say how fast it is.
+#: Pictures per second if the environment does not declare a speed.
 _USUAL_FPS = 30.0
 
 
 class Screen(Protocol):
-    """Where pictures are shown while an episode goes on."""
+    """A display for the pictures of an episode."""
 
     def show(self, rollout: Rollout, picture: Picture, caption: str) -> bool:
-        """Show a moment of an episode; return whether whoever watches wants to go on."""
+        """Show a step of an episode; return False to stop playing."""
         ...
 
     def close(self) -> None:
-        """Show nothing any more."""
+        """Close the display."""
         ...
 
 
 def with_seeds(commands: list[Command], first: int | None = None) -> list[Command]:
-    """Return commands whose episodes follow from their seeds, so that a seed says which they are.
+    """Return commands whose seeds also determine the actions, so that episodes can be repeated.
 
     Args:
-        commands: of an evaluation, whose actions follow from their places in it.
-        first: the first seed, one more for each that follows; None: the environments' seeds stay.
+        commands: the commands of an evaluation.
+        first: the first seed; each further one adds 1. None: the seeds of the commands.
     """
     seeds = [
         command.environment_seed if first is None else (first + k) % 2**31
@@ -53,23 +53,23 @@ def with_seeds(commands: list[Command], first: int | None = None) -> list[Comman
 
 
 def filmed(config: Config) -> Environment:
-    """Return the environment of a run, made to be looked at.
+    """Return the environment of a run, created with rgb_array rendering.
 
     Raises:
-        UnsupportedEnvironment: it has no pictures to show.
+        UnsupportedEnvironment: it does not support rgb_array rendering.
     """
     with closing(make_environment(config)) as env:
         if "rgb_array" not in env.metadata.get("render_modes", ()):
             raise UnsupportedEnvironment(
-                f"environment {config.environment!r} has no pictures to show: it supports no "
-                f"render_mode of 'rgb_array'; play without a film or window"
+                f"environment {config.environment!r} has no pictures to show: it does not support "
+                f"render_mode='rgb_array'; play without --video and --window"
             )
     kwargs = config.environment_kwargs | {"render_mode": "rgb_array"}
     return make_environment(change(config, environment_kwargs=kwargs))
 
 
 def fps_of(env: Environment) -> float:
-    """Return how many steps a second of an environment's time has."""
+    """Return an environment's steps per second."""
     return float(env.metadata.get("render_fps") or _USUAL_FPS)
 
 
@@ -80,19 +80,19 @@ def play(
     video: Path | None = None,
     open_screen: Callable[[float], Screen] | None = None,
 ) -> Iterator[Rollout]:
-    """Carry out commands one after another and yield each episode when it is over.
+    """Run commands one after another, and yield each episode at its end.
 
     Args:
-        agent: who acts.
-        commands: what it is told.
-        video: a film of all episodes.
-        open_screen: opens what shows them meanwhile, so many pictures a second, and may end
-            everything.
+        agent: the agent.
+        commands: its commands.
+        video: file for a film of all episodes.
+        open_screen: opens a display with a number of pictures per second. The display can stop
+            playing.
 
     Raises:
-        ConfigError: the film cannot be made.
+        ConfigError: the film cannot be written.
         EnvironmentFault: the environment raised an exception.
-        UnsupportedEnvironment: there is nothing to look at.
+        UnsupportedEnvironment: the environment has no pictures.
     """
     looks = video is not None or open_screen is not None
     policy = agent.policy
@@ -109,13 +109,13 @@ def play(
 
 
 def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
-    """Carry out one episode; return whether whoever watches saw it to its end."""
+    """Run one episode; return whether it was shown to its end."""
     while True:
         if film is not None or screen is not None:
-            picture, said = rollout.picture(), caption(rollout)
+            picture, text = rollout.picture(), caption(rollout)
             if film is not None:
-                film.add(picture, said)
-            if screen is not None and not screen.show(rollout, picture, said):
+                film.add(picture, text)
+            if screen is not None and not screen.show(rollout, picture, text):
                 return False
         if rollout.over:
             return True
@@ -123,8 +123,8 @@ def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
 
 
 def caption(rollout: Rollout) -> str:
-    """Return what is asked for still, and what has been obtained."""
+    """Return the return so far, and the rest of the command."""
     return (
-        f"step {rollout.steps}: obtained {return_text(rollout.episode_return)}; asked for "
+        f"step {rollout.steps}: return {return_text(rollout.episode_return)}; desired: "
         f"{return_text(rollout.desired_return)} more within {max(rollout.desired_horizon, 1)} steps"
     )

@@ -8,14 +8,14 @@ from udrl_proto.reports import EvaluationStatus, Status
 
 STATES = ("running", "closing", "ended", "failed", "stopped")
 
-#: What a metric is called, what it counts, and whether it only grows.
+#: Name, status field and description of each metric, and whether it is a counter.
 _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
     ("udrl_iteration", "iteration", "The last iteration completed.", False),
     ("udrl_env_steps", "env_steps", "Steps of warm-up and exploratory episodes.", True),
     ("udrl_eval_env_steps", "eval_env_steps", "Steps of evaluation episodes.", True),
     ("udrl_env_steps_per_second", "env_steps_per_s", "In the last 10 s.", False),
     ("udrl_max_env_steps", "max_env_steps", "The budget.", False),
-    ("udrl_wall_seconds", "wall_s", "Time that the run was worked on.", True),
+    ("udrl_wall_seconds", "wall_s", "Time that the run was served.", True),
     ("udrl_time_left_seconds", "time_left_s", "Until the budget is spent.", False),
     ("udrl_weights_version", "weights_version", "The newest.", False),
     ("udrl_weights_lag_versions", "weights_lag", "Versions the slowest actor is behind.", False),
@@ -28,21 +28,21 @@ _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
 
 
 class StatusCollector:
-    """What Prometheus collects when it asks.
+    """Collects a status for Prometheus.
 
     Args:
-        get: returns the status; None: nobody can say now, and only ``udrl_up`` is told, as 0.
+        get: returns the status. None: it is unknown, and only ``udrl_up`` is exported, as 0.
     """
 
     def __init__(self, get: Callable[[], Status | None]) -> None:
         self._get = get
 
     def describe(self) -> list[Any]:
-        """Return nothing: what there is depends on the run."""
+        """Return nothing, because the metrics depend on the run."""
         return []
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metrics of the run as it is now."""
+        """Yield the current metrics of the run."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         def labelled(
@@ -71,11 +71,11 @@ class StatusCollector:
                 kind = CounterMetricFamily if grows else GaugeMetricFamily
                 yield kind(name, about, value=float(number))
         yield labelled(
-            "udrl_run_info", "Which run it is; always 1.", ["run_id", "environment"],
+            "udrl_run_info", "Run id and environment; always 1.", ["run_id", "environment"],
             [([status.run_id, status.environment], 1.0)],
         )  # fmt: skip
         yield labelled(
-            "udrl_state", "1 for the state that the run is in.", ["state"],
+            "udrl_state", "1 for the current state of the run.", ["state"],
             [([s], float(s == status.state)) for s in STATES],
         )  # fmt: skip
         for name, found in (
@@ -99,12 +99,17 @@ class StatusCollector:
                 [([field], float(getattr(ledger, field))) for field in fields],
             )  # fmt: skip
         actors = status.actors
-        yield GaugeMetricFamily("udrl_actors", "Actors that are here.", value=len(actors))
+        yield GaugeMetricFamily("udrl_actors", "Connected actors.", value=len(actors))
         for name, attribute, about, grows in (
-            ("udrl_actor_env_steps_per_second", "env_steps_per_s", "As the actor says.", False),
+            (
+                "udrl_actor_env_steps_per_second",
+                "env_steps_per_s",
+                "As reported by the actor.",
+                False,
+            ),
             ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
-            ("udrl_actor_reruns", "reruns", "Commands dealt that had been dealt before.", True),
-            ("udrl_actor_failures", "failures", "Commands that it could not carry out.", True),
+            ("udrl_actor_reruns", "reruns", "Commands that another actor had before.", True),
+            ("udrl_actor_failures", "failures", "Commands that failed.", True),
             ("udrl_actor_last_seen_seconds", "last_seen_s", "Since its last message.", False),
         ):
             yield labelled(
@@ -113,7 +118,7 @@ class StatusCollector:
                 grows=grows,
             )  # fmt: skip
         yield labelled(
-            "udrl_waiting_seconds", "Who waits for whom, and for how long.", ["who", "for"],
+            "udrl_waiting_seconds", "Of a service for another.", ["who", "for"],
             [([w.who, w.on], w.seconds) for w in status.waiting],
         )  # fmt: skip
         yield GaugeMetricFamily(
@@ -127,18 +132,18 @@ def _stats(found: EvaluationStatus | None) -> list[tuple[list[str], float | None
 
 
 class Exporter:
-    """Answers Prometheus over HTTP.
+    """Serves metrics to Prometheus over HTTP.
 
     Args:
         get: see :class:`StatusCollector`.
         host: address to listen on.
-        port: likewise; 0: any that is free.
+        port: port to listen on; 0 = any free port.
 
     Attributes:
-        port: that it listens on.
+        port: the port.
 
     Raises:
-        ConfigError: the extra is not installed, or the address cannot be listened on.
+        ConfigError: the extra is not installed, or the address cannot be used.
     """
 
     def __init__(self, get: Callable[[], Status | None], host: str, port: int) -> None:
@@ -154,13 +159,13 @@ class Exporter:
             self._server, self._thread = start_http_server(port, host, registry)
         except OSError as error:
             raise ConfigError(
-                f"metrics on {host}, port {port}: {error.strerror}; name an address of this "
-                f"machine and a port that is free, or 0"
+                f"metrics on {host}, port {port}: {error.strerror}; choose an address of this "
+                f"machine and a free port, or port 0"
             ) from error
         self.port: int = self._server.server_port
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

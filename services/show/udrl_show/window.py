@@ -1,4 +1,4 @@
-"""A window in which an agent can be watched, and told something else on the way."""
+"""A window that shows an agent, and changes its command by keyboard."""
 
 import os
 from typing import Any
@@ -18,13 +18,13 @@ _MARGIN = 6
 
 
 class Window:
-    """Shows pictures at a fixed speed and listens to the keyboard.
+    """Shows pictures at a fixed speed and handles the keyboard.
 
     Args:
-        fps: pictures a second.
+        fps: pictures per second.
 
     Raises:
-        ConfigError: pygame is not installed, or there is no screen to open a window on.
+        ConfigError: pygame is not installed, or there is no screen.
     """
 
     def __init__(self, fps: float) -> None:
@@ -47,9 +47,7 @@ class Window:
         driver = pygame.display.get_driver()
         if driver in ("offscreen", "dummy") and "SDL_VIDEODRIVER" not in os.environ:
             pygame.display.quit()
-            raise ConfigError(
-                "a window cannot be opened: there is no screen here; use --video FILE"
-            )
+            raise ConfigError("a window cannot be opened: there is no screen; use --video FILE")
         pygame.font.init()
         self._font = pygame.font.Font(None, _LINE)
         self._clock = pygame.time.Clock()
@@ -59,14 +57,14 @@ class Window:
         self._pygame.display.quit()
 
     def show(self, rollout: Rollout, picture: Picture, caption: str) -> bool:
-        """Show a moment of an episode and obey the keys; return False to end everything."""
+        """Show a step of an episode and handle the keys; return False to stop playing."""
         while True:
             self._draw(picture, caption, rollout)
             keys = self._keys()
             if "q" in keys:
                 return False
             for key in keys:
-                self._obey(key, rollout)
+                self._handle(key, rollout)
             if not self._is_paused or "right" in keys:
                 return True
 
@@ -81,10 +79,10 @@ class Window:
                 keys.append("q" if name == "escape" else name)
         return keys
 
-    def _obey(self, key: str, rollout: Rollout) -> None:
-        told = rollout.command
-        more = max(1.0, abs(told.desired_return) / 20)
-        longer = max(1, told.desired_horizon // 20)
+    def _handle(self, key: str, rollout: Rollout) -> None:
+        command = rollout.command
+        more = max(1.0, abs(command.desired_return) / 20)
+        longer = max(1, command.desired_horizon // 20)
         changes = {
             "up": (more, 0), "down": (-more, 0),
             "page up": (0.0, longer), "page down": (0.0, -longer),
@@ -95,7 +93,7 @@ class Window:
         elif key == "space":
             self._is_paused = not self._is_paused
         elif key == "g":
-            rollout.temperature = (told.temperature or 1.0) if rollout.temperature == 0 else 0.0
+            rollout.temperature = (command.temperature or 1.0) if rollout.temperature == 0 else 0.0
 
     def _draw(self, picture: Picture, caption: str, rollout: Rollout) -> None:
         pygame = self._pygame
