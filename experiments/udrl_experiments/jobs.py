@@ -23,7 +23,7 @@ from udrl_experiments.records import Evaluated
 from udrl_inspect.tables import put, read
 
 #: What is said when a study is stopped.
-INTERRUPTED = "stopped; go on with the same command and --resume"
+INTERRUPTED = "stopped; resume with the same command and --resume"
 
 _PROGRAM = ("-m", "udrl_experiments.job")
 _POLL_S = 0.2

@@ -118,7 +118,7 @@ def _open(study: Study, place: Place, *, resume: bool) -> None:
     if file.exists():
         if not resume:
             raise ConfigError(
-                f"{place.folder} holds a study already; go on with it: --resume; or name another "
+                f"{place.folder} holds a study already; resume it with --resume; or name another "
                 f"--folder"
             )
         planned: dict[tuple[str, str], int] = {}

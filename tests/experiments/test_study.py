@@ -87,7 +87,7 @@ def test_what_is_missing_is_told_before_the_first_run(
 
 def test_a_study_is_not_done_over_another(world: World) -> None:
     world.conduct(job(1))
-    with pytest.raises(ConfigError, match=r"holds a study already; go on with it: --resume"):
+    with pytest.raises(ConfigError, match=r"holds a study already; resume it with --resume"):
         world.conduct(job(1))
 
 

@@ -63,7 +63,7 @@ def test_a_comparison_is_interrupted_and_goes_on(
 
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), *SETTINGS, *whole).finish()
     assert code == 2
-    assert "holds a study already; go on with it: --resume" in error
+    assert "holds a study already; resume it with --resume" in error
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), "--resume").finish()
     assert code == 2
     assert "which is not in this one; give the options that it was begun with" in error

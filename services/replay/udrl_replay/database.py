@@ -144,7 +144,7 @@ class Database:
                 if path.exists():
                     raise StoreError(
                         f"{run_dir} holds a run already; add --resume (in Python: "
-                        f"resume=True) to go on with it, or name another --run-dir"
+                        f"resume=True) to resume it, or name another --run-dir"
                     )
                 # Written aside and renamed, so that a run's file is there as a whole or not at all.
                 unfinished = path.with_suffix(".new")

@@ -70,7 +70,7 @@ def _check_environment(store: Store, hello: Hello, *, allow_inexact: bool) -> No
     if not allow_inexact:
         raise OtherConfiguration(
             f"environment {environment} has changed since the run was created: {found}; restore "
-            f"its package and what it computes with, or go on with --allow-inexact"
+            f"its package and what it computes with, or resume with --allow-inexact"
         )
     progress = store.fact("progress", Progress)
     progress.exact = False
