@@ -144,7 +144,10 @@ def test_films_have_a_picture_for_every_moment(ended_run: Path, tmp_path: Path, 
 
 @pytest.mark.parametrize(
     ("name", "says"),
-    [("film.avi", "ends with .mp4 or .gif"), ("taken/film.gif", "name a file that you can write to")],
+    [
+        ("film.avi", "ends with .mp4 or .gif"),
+        ("taken/film.gif", "name a file that you can write to"),
+    ],
 )
 def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, says: str) -> None:
     (tmp_path / "taken").write_text("a file where a folder should be")
