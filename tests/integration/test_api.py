@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 
 import udrl
-from udrl.errors import ConfigError, StoreError, UdrlError
+from udrl.errors import ConfigError, RunFailed, StoreError, UdrlError
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_folder
+from udrl_launch import api
 from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
+from udrl_replay.creation import create
 from udrl_replay.reporting import history
 from udrl_replay.store import Store
 from whole_run import SMALL, digests, small
@@ -75,6 +77,29 @@ def test_events_are_passed_on_once_and_in_order(tmp_path: Path) -> None:
     # Exactly what the store has, before and after the resumption.
     assert iterations == list(found.iterations)
     assert evaluations == list(found.evaluations)
+
+
+def test_a_run_that_was_stopped_in_its_warm_up_has_all_iterations_to_come(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    create(run_dir, small()).close()
+    seen: list[int] = []
+    udrl.train(
+        "CartPole-v1", run_dir=run_dir, resume=True, max_env_steps=500,
+        on_iteration=lambda iteration: seen.append(iteration.iteration),
+    )  # fmt: skip
+    assert seen[:2] == [0, 1]
+
+
+def test_a_run_that_fails_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RunFailed("an environment crashed")
+
+    create(tmp_path / "run", small()).close()
+    monkeypatch.setattr(api, "run_training", fail)
+    ends: list[Status] = []
+    with pytest.raises(RunFailed, match="crashed"):
+        udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, on_end=ends.append)
+    assert len(ends) == 1
 
 
 @pytest.mark.parametrize("event", ["on_iteration", "on_evaluation"])

@@ -15,6 +15,7 @@ from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Status, StatusRequest
+from udrl_replay.progress import Progress
 from udrl_replay.reporting import Throughput, Waits, status
 from udrl_replay.standing import Standing
 from udrl_replay.store import Store
@@ -93,6 +94,12 @@ def read_status(run_dir: Path) -> Status:
 def read_run(run_dir: Path, store: Store) -> Standing:
     """Return a read-only view of a run."""
     return Standing(store, budget_of(run_dir))
+
+
+def last_iteration(run_dir: Path) -> int:
+    """Return the last completed iteration of a run; -1 if its warm-up is not complete."""
+    with closing(Store(run_dir, read_only=True)) as store:
+        return store.fact("progress", Progress).iteration
 
 
 def budget_of(run_dir: Path) -> Budget:

@@ -18,10 +18,10 @@ from typing import Any
 
 import msgspec
 
-from udrl.errors import ConfigError, Interrupted, UdrlError
+from udrl.errors import ConfigError, Interrupted, RunFailed, UdrlError
 from udrl.policy import Policy
 from udrl_inspect.agents import load_agent
-from udrl_inspect.inspection import read_status, settings_of
+from udrl_inspect.inspection import last_iteration, read_status, settings_of
 from udrl_launch.paths import new_run_dir
 from udrl_launch.settings import gather
 from udrl_launch.training import train as run_training
@@ -110,7 +110,7 @@ def train(
     )
     folder = chosen or new_run_dir(directory_name(gathered.config))
     stop = threading.Event()
-    after = read_status(folder).iteration if going_on else -1
+    after = last_iteration(folder) if going_on else -1
     watcher = _Callbacks(folder, after, gathered.config.evaluation.eval_episodes, stop)
     watcher.on_status += [callbacks] if callable(callbacks) else list(callbacks)
     watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation
@@ -120,6 +120,10 @@ def train(
         )
     except Interrupted:
         status = read_status(folder)
+    except RunFailed:
+        if on_end is not None:
+            on_end(read_status(folder))
+        raise
     watcher.show(status)
     if on_end is not None:
         on_end(status)
