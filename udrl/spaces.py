@@ -241,6 +241,9 @@ class Record(Space, frozen=True, tag="record"):
 
     leaves: Annotated[tuple[Leaf, ...], Meta(min_length=1, max_length=MOST_LEAVES)]
 
+    def __str__(self) -> str:
+        return ", ".join(f"{leaf.name}: {leaf.space}" for leaf in self.leaves)
+
     def __post_init__(self) -> None:
         if len({leaf.name for leaf in self.leaves}) < len(self.leaves):
             raise ValueError("two leaves have the same name")

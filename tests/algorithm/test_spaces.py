@@ -177,3 +177,8 @@ def test_without_logits_all_actions_are_as_likely(n: int, u: list[float]) -> Non
     flat = np.zeros((len(u), n)), np.ones((len(u), 1))
     assert space.uniform(numbers).tolist() == [int(x * n) for x in u]
     assert space.sample(*flat, numbers).tolist() == space.uniform(numbers).tolist()
+
+
+def test_a_record_prints_its_leaves_as_python_finds_them() -> None:
+    leaves = (Leaf(("map", 1), Vector(size=2)), Leaf(("time",), Category(n=3)))
+    assert str(Record(leaves)) == "['map'][1]: Vector(size=2), ['time']: Category(n=3)"
