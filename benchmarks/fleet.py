@@ -20,7 +20,7 @@ import zenoh
 from udrl.commands import Command
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, encode, encode_array
@@ -94,7 +94,9 @@ class Fleet:
     def run(self) -> Measured:
         """Join, then work for the time that the load says."""
         subscribers = [
-            s.declare_subscriber(keys.key(RUN, keys.NEW_WEIGHTS), self._note_weights)
+            s.declare_subscriber(
+                key_expressions.key(RUN, key_expressions.NEW_WEIGHTS), self._note_weights
+            )
             for s in self._sessions
         ]
         actors = [
@@ -184,7 +186,7 @@ class Fleet:
         # On Zenoh's own thread, which only fills the queue: another thread for every query would
         # cost more than the query.
         actor.session.get(
-            keys.key(RUN, actor.verb),
+            key_expressions.key(RUN, actor.verb),
             zenoh.handlers.Callback(
                 reply, lambda: self._answers.put((actor, query, None)), indirect=False
             ),

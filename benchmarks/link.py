@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from udrl.errors import UdrlError
 from udrl_inspect.inspection import status_of
-from udrl_launch.training import free_port
+from udrl_launch.training_run import free_port
 from udrl_proto.reports import Status
 
 _CHUNK = 16 * 1024

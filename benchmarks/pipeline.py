@@ -42,7 +42,7 @@ from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
 from udrl.streams import Purpose, stream_key
 from udrl_launch.settings import Settings, gather
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_replay.run import Run
 
 #: Seconds on this machine, in runs (docs/performance.md): CPU of the replay service for an episode;

@@ -36,8 +36,8 @@ from udrl.graph import acting_graph
 from udrl.spaces import Vector
 from udrl.training import untrained, use_one_thread
 from udrl.weights import encode_weights
-from udrl_launch.training import free_port
-from udrl_proto import PROTOCOL, keys, verbs
+from udrl_launch.training_run import free_port
+from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto import session as sessions
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
@@ -103,7 +103,7 @@ def deliver_versions(
             asker.ask(verbs.VERSION, message)
             announced.append(Announced(version, time.monotonic()))
             news = encode(Weights(version=version, weights=weights))
-            session.put(keys.key(RUN, keys.NEW_WEIGHTS), news)
+            session.put(key_expressions.key(RUN, key_expressions.NEW_WEIGHTS), news)
             version += 1
 
 

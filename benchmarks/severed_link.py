@@ -5,7 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 
-from udrl_launch.training import free_port
+from udrl_launch.training_run import free_port
 
 _CHUNK = 1 << 16
 _TRY_AGAIN_S = 0.2

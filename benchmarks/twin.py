@@ -3,7 +3,7 @@
 import sys
 import threading
 
-from udrl_actor.service import ActorService
+from udrl_actor.actor_service import ActorService
 from udrl_launch.process import die_with_parent
 from udrl_proto.session import connect, find_run
 from udrl_proto.zenoh_transport import ZenohTransport

@@ -20,7 +20,7 @@ PAGE = Path(__file__).with_name("cli.md")
 _HEAD = """\
 # Command line
 
-<!-- Written by docs/make_cli.py; edit the help texts in services/launch/udrl_launch/commands/. -->
+<!-- Written by docs/make_cli.py; edit the help in services/launch/udrl_launch/subcommands/. -->
 
 {about} `python -m udrl_launch` is the same command.
 

@@ -13,16 +13,15 @@ from udrl.errors import OtherConfiguration
 from udrl_actor import outbox
 from udrl_inspect.inspection import budget_of
 from udrl_launch import supervisor
-from udrl_launch.commands.settings import gather_settings
 from udrl_launch.roles import open_run
 from udrl_launch.settings import Fleet, Settings
+from udrl_launch.subcommands.settings_options import gather_settings
 from udrl_proto import asking, verbs
 from udrl_proto.access import RIGHTS
 from udrl_proto.messages import Hello
-from udrl_replay import auditing, dealing, quarantine
-from udrl_replay import service as replay_service
+from udrl_replay import auditing, dealing, quarantine, replay_service
+from udrl_replay.schema import SCHEMA
 from udrl_replay.store import Store
-from udrl_replay.tables import SCHEMA
 
 OPERATIONS = "docs/operations.md"
 TOY = Config(environment="Figure2-v0", max_return=2.0)

@@ -8,7 +8,7 @@ import pytest
 from tests.markdown import ROOT, text_of
 from udrl_experiments.records import Evaluated, Obtained
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
-from udrl_inspect.tables import read
+from udrl_inspect.csv_tables import read
 
 RESULTS = ROOT / "docs" / "results"
 STUDIES = sorted(path.parent for path in RESULTS.rglob("evaluations.csv"))

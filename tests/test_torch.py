@@ -7,12 +7,13 @@ import pytest
 
 #: What actors, the replay service, lookers-on and users of a trained agent import.
 MODULES = (
-    "udrl.folder", "udrl.inference", "udrl.obedience", "udrl.policy", "udrl.rollout",
-    "udrl_actor.service", "udrl_replay.service", "udrl_board.app", "udrl_board.command",
-    "udrl_inspect.agents", "udrl_launch.api", "udrl_launch.cli", "udrl_launch.commands.exporting",
-    "udrl_launch.commands.obedience", "udrl_launch.commands.playing",
-    "udrl_launch.commands.services", "udrl_launch.commands.training", "udrl_show.event_files",
-    "udrl_inspect.exporting", "udrl_launch.roles",
+    "udrl.folder", "udrl.inference", "udrl.obedience_statistics", "udrl.policy", "udrl.rollout",
+    "udrl_actor.actor_service", "udrl_replay.replay_service", "udrl_board.app",
+    "udrl_board.board_command", "udrl_inspect.agents", "udrl_launch.api", "udrl_launch.cli",
+    "udrl_launch.subcommands.export_command", "udrl_launch.subcommands.obedience_command",
+    "udrl_launch.subcommands.play_command", "udrl_launch.subcommands.service_commands",
+    "udrl_launch.subcommands.train_command", "udrl_show.event_files", "udrl_inspect.exporting",
+    "udrl_launch.roles",
 )  # fmt: skip
 
 WITHOUT = "import sys; sys.modules['torch'] = None; "
@@ -32,7 +33,7 @@ def test_only_the_learner_needs_torch() -> None:
         capture_output=True, text=True, timeout=100, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "torch" in python("import udrl_learner.service").stderr
+    assert "torch" in python("import udrl_learner.learner_service").stderr
 
 
 @pytest.mark.parametrize(

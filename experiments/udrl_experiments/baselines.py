@@ -28,7 +28,7 @@ from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments.records import Evaluated
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
-from udrl_inspect.tables import write
+from udrl_inspect.csv_tables import write
 
 #: Environments that an evaluation runs in at the same time; its result does not depend on it.
 _ENVIRONMENTS = 16

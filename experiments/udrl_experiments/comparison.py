@@ -12,7 +12,7 @@ from udrl_experiments.records import Evaluated
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Place, Study
 from udrl_experiments.tuned import tuned
-from udrl_inspect.tables import read, write
+from udrl_inspect.csv_tables import read, write
 
 _PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
 

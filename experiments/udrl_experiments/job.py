@@ -19,10 +19,10 @@ from udrl_experiments import baselines
 from udrl_experiments.jobs import Job, read_job
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import Evaluated
-from udrl_inspect.tables import put, read, write
+from udrl_inspect.csv_tables import put, read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.reports import Status
 
 

@@ -20,7 +20,7 @@ from udrl.config import Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.records import Evaluated
-from udrl_inspect.tables import put, read
+from udrl_inspect.csv_tables import put, read
 
 #: What is said when a study is stopped.
 INTERRUPTED = "stopped; resume with the same command and --resume"

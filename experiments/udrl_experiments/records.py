@@ -1,4 +1,4 @@
-"""The rows of the studies' tables (:mod:`udrl_inspect.tables`)."""
+"""The rows of the studies' tables (:mod:`udrl_inspect.csv_tables`)."""
 
 import msgspec
 

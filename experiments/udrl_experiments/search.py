@@ -20,7 +20,7 @@ from udrl_experiments.protocol import LAST, Algorithm, Plan, Task
 from udrl_experiments.ray_tune import carry_out
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Place, Study
-from udrl_inspect.tables import put, write
+from udrl_inspect.csv_tables import put, write
 
 #: Configurations of each algorithm, and env steps of each run, at the small scale.
 SMALL_CONFIGURATIONS = 8

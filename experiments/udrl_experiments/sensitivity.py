@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from udrl.obedience import correlation
+from udrl.obedience_statistics import correlation
 from udrl_experiments import figures
 from udrl_experiments.comparison import job
 from udrl_experiments.jobs import Job
@@ -11,8 +11,8 @@ from udrl_experiments.protocol import Plan, Task
 from udrl_experiments.records import Obtained
 from udrl_experiments.study import Place, Study
 from udrl_inspect.agents import evaluate_all, evaluation_commands, load_agent
+from udrl_inspect.csv_tables import read, write
 from udrl_inspect.inspection import read_status
-from udrl_inspect.tables import read, write
 
 #: Episodes a point.
 EPISODES = 100

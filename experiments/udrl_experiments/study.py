@@ -13,7 +13,7 @@ from udrl.strategies import make_strategy
 from udrl_experiments.jobs import Job, carry_out
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
-from udrl_inspect.tables import put
+from udrl_inspect.csv_tables import put
 
 
 class Place(NamedTuple):

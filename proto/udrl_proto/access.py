@@ -10,7 +10,7 @@ what they ask.
 
 from typing import Any, NamedTuple
 
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 
 
 class Rights(NamedTuple):
@@ -34,12 +34,12 @@ REPLAY = "replay"
 #: What those who connect may do, by role.
 RIGHTS = {
     "learner": Rights(
-        hears=(keys.PROGRESS,),
-        says=(keys.NEW_WEIGHTS,),
+        hears=(key_expressions.PROGRESS,),
+        says=(key_expressions.NEW_WEIGHTS,),
         joins=True,
     ),
     "actor": Rights(
-        hears=(keys.NEW_WEIGHTS,),
+        hears=(key_expressions.NEW_WEIGHTS,),
         joins=True,
     ),
     "observer": Rights(),
@@ -90,16 +90,20 @@ def access_control(*, hosted: bool = True) -> dict[str, Any]:
 
 def _question(verb: str) -> str:
     # A run is looked for whatever protocol it speaks, so that the difference can be told.
-    return keys.every_hello() if verb == verbs.HELLO.name else keys.key("*", verb)
+    return (
+        key_expressions.every_hello()
+        if verb == verbs.HELLO.name
+        else key_expressions.key("*", verb)
+    )
 
 
 def _of_client(role: str) -> dict[Rule, list[str]]:
     """Return what the router lets in from a role, and what it lets out to it."""
     rights = RIGHTS[role]
     asks = [_question(verb) for verb in verbs.asked_by(role)]
-    hears = [keys.key("*", name) for name in rights.hears]
-    says = [keys.key("*", name) for name in rights.says]
-    alive = [keys.alive("*", role, "*")] if rights.joins else []
+    hears = [key_expressions.key("*", name) for name in rights.hears]
+    says = [key_expressions.key("*", name) for name in rights.says]
+    alive = [key_expressions.alive("*", role, "*")] if rights.joins else []
     return {
         ("asks", "ingress", "query"): asks,
         ("is answered", "egress", "reply"): asks,
@@ -115,9 +119,11 @@ def _of_client(role: str) -> dict[Rule, list[str]]:
 def _of_replay() -> dict[Rule, list[str]]:
     """Return the counterpart: what a router lets in from the replay service, and out to it."""
     answers = [_question(verb.name) for verb in verbs.VERBS]
-    says = [keys.key("*", keys.PROGRESS)]
-    alive = [keys.alive("*", role, "*") for role, rights in RIGHTS.items() if rights.joins]
-    watches = [keys.alive("*", "*", "*")]
+    says = [key_expressions.key("*", key_expressions.PROGRESS)]
+    alive = [
+        key_expressions.alive("*", role, "*") for role, rights in RIGHTS.items() if rights.joins
+    ]
+    watches = [key_expressions.alive("*", "*", "*")]
     return {
         ("offers answers", "ingress", "declare_queryable"): answers,
         ("is asked", "egress", "query"): answers,

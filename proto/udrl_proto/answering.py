@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from udrl.errors import InvalidData
-from udrl_proto import keys
+from udrl_proto import key_expressions
 from udrl_proto.codec import decode, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
@@ -72,4 +72,6 @@ def serve(
 
         return receive
 
-    return [transport.answer(keys.key(run_id, verb.name), receiver(verb)) for verb in verbs]
+    return [
+        transport.answer(key_expressions.key(run_id, verb.name), receiver(verb)) for verb in verbs
+    ]

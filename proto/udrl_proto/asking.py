@@ -9,7 +9,7 @@ import threading
 import time
 
 from udrl.errors import Interrupted, Refused, Unreachable
-from udrl_proto import keys
+from udrl_proto import key_expressions
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import JoinRequest, Problem
 from udrl_proto.text import printable
@@ -71,7 +71,7 @@ class Asker:
         warn_at = 2.0
         while not self._stop.is_set():
             asked = time.monotonic()
-            key = keys.key(self._run_id, verb.name)
+            key = key_expressions.key(self._run_id, verb.name)
             for answer in self._transport.ask(key, payload, attempt_s):
                 if answer.is_problem:
                     problem = decode(answer.data, Problem)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import zenoh
 
 from udrl.errors import ConfigError, Interrupted, Unreachable
-from udrl_proto import PROTOCOL, keys
+from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.access import access_control
 from udrl_proto.codec import decode, encode
 from udrl_proto.credentials import Credentials
@@ -290,12 +290,12 @@ def _hellos(session: zenoh.Session) -> dict[str, tuple[str, bytes]]:
     """Return protocol and payload of every run's answer, by run id."""
     found = {}
     for reply in session.get(
-        keys.every_hello(),
+        key_expressions.every_hello(),
         payload=encode(HelloRequest()),
         timeout=1.0,
         consolidation=zenoh.ConsolidationMode.NONE,
     ):
         if reply.ok is not None:
-            protocol, run_id, _ = keys.parse(str(reply.ok.key_expr))
+            protocol, run_id, _ = key_expressions.parse(str(reply.ok.key_expr))
             found[run_id] = protocol, reply.ok.payload.to_bytes()
     return found

@@ -58,7 +58,7 @@ class Declaration(Protocol):
 
 
 class Transport(Protocol):
-    """One service's access to the keys of a run (:mod:`udrl_proto.keys`)."""
+    """One service's access to the keys of a run (:mod:`udrl_proto.key_expressions`)."""
 
     def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
         """Yield the answers to a question; none where nobody answers in time."""

@@ -17,7 +17,7 @@ from udrl.spaces import Vector
 from udrl.streams import Purpose, stream_key
 from udrl.weights import encode_weights
 from udrl_actor.courier import Courier, Order
-from udrl_proto import PROTOCOL, keys, verbs
+from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     CommandsReply,
@@ -132,7 +132,7 @@ def test_weights_that_were_announced_are_not_asked_for(
     courier = start()
     courier.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS), "a question", DEADLINE_S)
-    replay.publish(keys.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
+    replay.publish(key_expressions.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
     replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
     (order,) = take(courier, 1)
     assert order.behavior is not None

@@ -13,7 +13,7 @@ from udrl.errors import InvalidData, Unreachable
 from udrl.spaces import Vector
 from udrl_board.feed import FRESH_S, Feed
 from udrl_board.source import Place
-from udrl_inspect.obedience import Agreement, Obedience, Point
+from udrl_inspect.obedience_report import Agreement, Obedience, Point
 from udrl_proto.messages import Hello, Weights
 from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 

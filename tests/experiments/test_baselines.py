@@ -26,7 +26,7 @@ from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run
 from udrl_experiments.records import Evaluated
 from udrl_experiments.tuned import complete, tuned
-from udrl_inspect.tables import read
+from udrl_inspect.csv_tables import read
 
 ALGORITHMS = ("DQN", "A2C")
 FAST: dict[str, dict[str, KeywordValue]] = {

@@ -14,7 +14,7 @@ from udrl_experiments import jobs
 from udrl_experiments.job import carry_out as do
 from udrl_experiments.jobs import Job, carry_out, furthest, read_job
 from udrl_experiments.records import Evaluated
-from udrl_inspect.tables import write
+from udrl_inspect.csv_tables import write
 
 CONFIG = build(Config, {"environment": "CartPole-v1", "eval_every": 100})
 

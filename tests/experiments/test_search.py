@@ -14,7 +14,7 @@ from udrl_experiments.protocol import TASKS, Algorithm, Plan
 from udrl_experiments.records import Evaluated
 from udrl_experiments.search import Scored, draw, search, space
 from udrl_experiments.study import Place
-from udrl_inspect.tables import read, write
+from udrl_inspect.csv_tables import read, write
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
 ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)

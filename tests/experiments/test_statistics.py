@@ -22,7 +22,7 @@ from udrl_experiments.statistics import (
     reached,
     score,
 )
-from udrl_inspect.tables import read, write
+from udrl_inspect.csv_tables import read, write
 
 RETURNS = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=12)
 

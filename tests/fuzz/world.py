@@ -22,7 +22,7 @@ from udrl.inference import ActingFunction
 from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.codec import decode, decode_episode, encode, encode_episode
 from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import (
@@ -44,7 +44,7 @@ from udrl_proto.messages import (
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
 from udrl_proto.transport import Answer
 from udrl_replay.creation import create
-from udrl_replay.service import ReplayService
+from udrl_replay.replay_service import ReplayService
 
 CONFIG = build(
     Config,
@@ -109,7 +109,7 @@ class World:
         """Ask with any bytes and return the answer, after checking all that must hold."""
         query = Query(data)
         accepted = self.service.run.progress.accepted
-        self._exchange.answering[keys.key(self._run_id, verb)](query)
+        self._exchange.answering[key_expressions.key(self._run_id, verb)](query)
         self.service.answer_waiting(0.0)
         assert not query.dropped
         (answer,) = query.answers

@@ -10,7 +10,7 @@ import pytest
 
 from udrl.config import Budget, Config
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.reports import Status
 from whole_run import Cli, assert_conserved, small
 

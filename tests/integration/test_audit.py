@@ -13,7 +13,7 @@ from udrl.episode import Episode
 from udrl.errors import Deceived, UdrlError
 from udrl_inspect.inspection import status_of
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.codec import encode_episode
 from udrl_proto.reports import Status
 from whole_run import assert_conserved, digests, toy

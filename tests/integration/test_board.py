@@ -24,13 +24,13 @@ from udrl.errors import ConfigError, StoreError, Unreachable
 from udrl_board import app as board
 from udrl_board import source
 from udrl_board.app import make_app
-from udrl_board.command import board as command
+from udrl_board.board_command import board as command
 from udrl_board.feed import Feed
 from udrl_board.source import Directory, Served, Stored
 from udrl_inspect.address import ENDPOINT_FILE, Address
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
-from udrl_inspect.obedience import keep, measure, plan_commands
+from udrl_inspect.obedience_report import keep, measure, plan_commands
 from udrl_inspect.obedience_text import summary
 from udrl_launch.cli import cli as command_line
 from udrl_proto.reports import Status

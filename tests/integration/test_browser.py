@@ -22,10 +22,10 @@ from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
-from udrl_inspect.obedience import keep, measure, plan_commands
+from udrl_inspect.obedience_report import keep, measure, plan_commands
 from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 from whole_run import (

@@ -66,7 +66,7 @@ def test_what_cannot_be_compared_is_not(agent: Agent, ended_run: Path, greedy: C
 
 @pytest.mark.parametrize(
     ("command", "module"),
-    [("evaluate", "looking"), ("play", "playing")],
+    [("evaluate", "inspection_commands"), ("play", "play_command")],
 )
 def test_commands_say_it_beside_their_results(
     ended_run: Path, monkeypatch: pytest.MonkeyPatch, command: str, module: str
@@ -77,7 +77,7 @@ def test_commands_say_it_beside_their_results(
         given.extend(returns)
         return f"temperature {told.temperature:g}"
 
-    monkeypatch.setattr(f"udrl_launch.commands.{module}.caution", said)
+    monkeypatch.setattr(f"udrl_launch.subcommands.{module}.caution", said)
     result = CliRunner().invoke(
         cli, [command, str(ended_run), "--episodes", "2", "--greedy", "--json"],
         standalone_mode=False, catch_exceptions=False,

@@ -25,10 +25,10 @@ from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl.rollout import Rollout
 from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, load_agent
 from udrl_inspect.inspection import read_status
-from udrl_inspect.runs import find
+from udrl_inspect.run_list import find
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_replay.store import Store
 from udrl_show import curve
 from udrl_show.curve import compare

@@ -15,11 +15,11 @@ from udrl.config import Budget, Config, build, change
 from udrl.errors import ConfigError, UdrlError
 from udrl.replay import ReplayBuffer
 from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
-from udrl_inspect.obedience import Obedience, keep, kept, measure, plan_commands
+from udrl_inspect.obedience_report import Obedience, keep, kept, measure, plan_commands
 from udrl_inspect.obedience_text import answer, markdown
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from whole_run import OBEDIENT
 
 

@@ -22,7 +22,7 @@ from udrl.spaces import Image, Vector
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 from whole_run import digests, small

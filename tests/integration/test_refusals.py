@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import zenoh
 
-import udrl_actor.service
+import udrl_actor.actor_service
 from udrl.config import Budget
 from udrl.errors import ConfigError, Refused
-from udrl_actor.service import ActorService
+from udrl_actor.actor_service import ActorService
 from udrl_inspect.address import Address
 from udrl_launch import roles
 from udrl_proto import verbs
@@ -110,7 +110,9 @@ def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
 def test_actor_whose_environment_does_something_else_is_refused(
     hosted: Hosted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udrl_actor.service, "environment_digest", lambda _: "0123456789abcdef")
+    monkeypatch.setattr(
+        udrl_actor.actor_service, "environment_digest", lambda _: "0123456789abcdef"
+    )
     with pytest.raises(Refused, match=r"gives other observations or rewards.*0123456789abc") as no:
         ActorService(hosted.transport, hosted.hello, "other", 1, hosted.stop).run()
     assert no.value.code == "other_environment"

@@ -18,7 +18,7 @@ from udrl.rollout import Rollout
 from udrl_inspect.agents import Agent, evaluation_commands, load_agent
 from udrl_inspect.exporting import export_buffer
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training import train
+from udrl_launch.training_run import train
 from udrl_proto.reports import Status
 from whole_run import SMALL, digests, reference
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from udrl_launch.commands.runs import _narrow
+from udrl_launch.subcommands.runs_commands import _narrow
 
 
 def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -112,7 +112,7 @@ def test_end_does_not_wait_for_callbacks() -> None:
 import sys, threading, click, zenoh
 from udrl_launch import cli
 from udrl_proto.session import listen
-from udrl_launch.training import free_port
+from udrl_launch.training_run import free_port
 
 @click.command()
 def busy():

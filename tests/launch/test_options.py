@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl_launch.commands.options import STEPS
+from udrl_launch.subcommands.options import STEPS
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import pytest
 
 from udrl.config import OPEN, preset, preset_names
 from udrl.errors import ConfigError
-from udrl_launch.commands.training import warn_of_idle_environments
 from udrl_launch.settings import gather
+from udrl_launch.subcommands.train_command import warn_of_idle_environments
 
 
 def test_preset_named_like_the_environment_is_taken() -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from udrl_proto import keys
+from udrl_proto import key_expressions
 from udrl_proto.codec import decode, encode
 from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import Message, Problem
@@ -36,11 +36,11 @@ class Scripted:
             answer = script(request)
             query.reply(Answer(encode(answer), is_problem=isinstance(answer, Problem)))
 
-        self.transport.answer(keys.key(self._run_id, verb.name), receive)
+        self.transport.answer(key_expressions.key(self._run_id, verb.name), receive)
 
     def publish(self, name: str, message: Message) -> None:
         """Publish a message."""
-        self.transport.publish(keys.key(self._run_id, name), encode(message))
+        self.transport.publish(key_expressions.key(self._run_id, name), encode(message))
 
     def requests(self, verb: Verb[Any, Any]) -> list[Any]:
         """Return the questions of a verb."""

@@ -18,7 +18,7 @@ import zenoh
 from tests.markdown import ROOT, section
 from udrl.errors import ConfigError, Unreachable
 from udrl_launch import authority
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto import session as sessions
 from udrl_proto.access import RIGHTS, ROLES
 from udrl_proto.credentials import load
@@ -51,10 +51,12 @@ class Replay:
         self.asked: list[str] = []
         self.tokens: queue.Queue[str] = queue.Queue()
         for verb in verbs.BY_NAME:
-            key = keys.key("run", verb)
+            key = key_expressions.key("run", verb)
             self.session.declare_queryable(key, partial(self._answer, key), complete=True)
         self.heard = Heard(session, "**")
-        self.session.liveliness().declare_subscriber(keys.alive("run", "*", "*"), self._note)
+        self.session.liveliness().declare_subscriber(
+            key_expressions.alive("run", "*", "*"), self._note
+        )
 
     def _answer(self, key: str, query: zenoh.Query) -> None:
         with query:
@@ -95,7 +97,7 @@ def connect(replay: Replay, secure_endpoint: str, keys_dir: Path) -> Iterator[Co
 def ask(session: zenoh.Session, verb: str) -> list[str]:
     """Return who answers a query, of all that could."""
     replies = session.get(
-        keys.key("run", verb),
+        key_expressions.key("run", verb),
         timeout=DEADLINE_S,
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
@@ -215,7 +217,7 @@ def test_role_gets_answers_to_its_own_verbs_only(
     client = connect(role)
     assert {verb for verb in verbs.BY_NAME if ask(client, verb)} == MAY_ASK[role]
     assert replay.asked == [
-        keys.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
+        key_expressions.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
     ]
 
 
@@ -224,8 +226,8 @@ def test_wildcards_open_nothing(expression: str, replay: Replay, connect: Connec
     client = connect("actor")
     expression = expression.replace("st*", "st$*")
     assert list(client.get(expression, timeout=DEADLINE_S, target=zenoh.QueryTarget.ALL)) == []
-    assert len(list(client.get(keys.every_hello(), timeout=DEADLINE_S))) == 1
-    assert replay.asked == [keys.key("run", verbs.HELLO.name)]
+    assert len(list(client.get(key_expressions.every_hello(), timeout=DEADLINE_S))) == 1
+    assert replay.asked == [key_expressions.key("run", verbs.HELLO.name)]
 
 
 def pose_as_replay(thief: zenoh.Session) -> list[str]:
@@ -237,16 +239,16 @@ def pose_as_replay(thief: zenoh.Session) -> list[str]:
             stolen.append(str(query.key_expr))
             query.reply(query.key_expr, b"thief")
 
-    for expression in [*(keys.key("run", verb.name) for verb in verbs.VERBS), "udrl/**"]:
+    for expression in [*(key_expressions.key("run", verb.name) for verb in verbs.VERBS), "udrl/**"]:
         thief.declare_queryable(expression, answer, complete=True)
     # What was declared before this token is known to the router when the token is.
-    thief.liveliness().declare_token(keys.alive("run", "actor", "thief"))
+    thief.liveliness().declare_token(key_expressions.alive("run", "actor", "thief"))
     return stolen
 
 
 def test_nobody_answers_in_the_replay_services_place(replay: Replay, connect: Connect) -> None:
     stolen = pose_as_replay(connect("actor"))
-    assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
+    assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", "actor", "thief")
     for role, asked in MAY_ASK.items():
         victim = connect(role)
         for verb in asked:
@@ -267,7 +269,9 @@ def test_peer_with_an_actors_key_may_no_more_than_a_client(
     config.insert_json5("transport/link/tls/enable_mtls", "true")
     with zenoh.open(config) as thief:
         stolen = pose_as_replay(thief)
-        assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", "actor", "thief")
+        assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive(
+            "run", "actor", "thief"
+        )
         assert ask(connect("learner"), verbs.STATE.name) == ["replay"]
         assert stolen == []
 
@@ -292,15 +296,15 @@ def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
 @pytest.mark.parametrize("mallory", ["actor", "observer", "replay"])
 def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connect: Connect) -> None:
     listener, thief = connect("actor"), connect(mallory)
-    heard = Heard(listener, keys.key("run", keys.NEW_WEIGHTS))
+    heard = Heard(listener, key_expressions.key("run", key_expressions.NEW_WEIGHTS))
     ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
-    for name in (keys.NEW_WEIGHTS, keys.PROGRESS, verbs.EPISODE.name):
-        thief.put(keys.key("run", name), b"false")
-    thief.delete(keys.key("run", keys.NEW_WEIGHTS))
+    for name in (key_expressions.NEW_WEIGHTS, key_expressions.PROGRESS, verbs.EPISODE.name):
+        thief.put(key_expressions.key("run", name), b"false")
+    thief.delete(key_expressions.key("run", key_expressions.NEW_WEIGHTS))
     ask(thief, verbs.HELLO.name)  # when this ends the router has seen what was sent before
-    connect("learner").put(keys.key("run", keys.NEW_WEIGHTS), b"true")
+    connect("learner").put(key_expressions.key("run", key_expressions.NEW_WEIGHTS), b"true")
     heard.wait_for("true")
-    expected = [(keys.key("run", keys.NEW_WEIGHTS), "true")]
+    expected = [(key_expressions.key("run", key_expressions.NEW_WEIGHTS), "true")]
     assert heard.messages == expected
     # Nothing of this is for the replay service, which hears all that passes in its own session.
     if replay.hosts_router:
@@ -309,7 +313,10 @@ def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connec
 
 
 def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> None:
-    progress, weights = (keys.key("run", name) for name in (keys.PROGRESS, keys.NEW_WEIGHTS))
+    progress, weights = (
+        key_expressions.key("run", name)
+        for name in (key_expressions.PROGRESS, key_expressions.NEW_WEIGHTS)
+    )
     everything = ("udrl/**", progress, weights)
     learner, actor = connect("learner"), connect("actor")
     of_learner, of_actor = Heard(learner, *everything), Heard(actor, *everything)
@@ -327,18 +334,18 @@ def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> Non
 
 def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> None:
     learner, listener = connect("learner"), connect("learner")
-    heard = Heard(listener, keys.key("run", keys.PROGRESS))
+    heard = Heard(listener, key_expressions.key("run", key_expressions.PROGRESS))
     ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
-    learner.put(keys.key("run", keys.PROGRESS), b"false")
+    learner.put(key_expressions.key("run", key_expressions.PROGRESS), b"false")
     ask(learner, verbs.HELLO.name)
-    replay.session.put(keys.key("run", keys.PROGRESS), b"true")
+    replay.session.put(key_expressions.key("run", key_expressions.PROGRESS), b"true")
     heard.wait_for("true")
-    assert heard.messages == [(keys.key("run", keys.PROGRESS), "true")]
+    assert heard.messages == [(key_expressions.key("run", key_expressions.PROGRESS), "true")]
 
 
 def there(client: zenoh.Session, role: str) -> list[str]:
     """Return the tokens of a role that a client is told of."""
-    replies = client.liveliness().get(keys.alive("run", role, "t$*"), timeout=DEADLINE_S)
+    replies = client.liveliness().get(key_expressions.alive("run", role, "t$*"), timeout=DEADLINE_S)
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
@@ -348,9 +355,12 @@ def test_role_is_here_under_its_own_name_only(
 ) -> None:
     client = connect(role)
     declare = client.liveliness().declare_token
-    _kept = declare(keys.alive("run", other, "one")), declare(keys.alive("run", role, "two"))
-    assert replay.tokens.get(timeout=DEADLINE_S) == keys.alive("run", role, "two")
-    assert there(connect(role), role) == [keys.alive("run", role, "two")]
+    _kept = (
+        declare(key_expressions.alive("run", other, "one")),
+        declare(key_expressions.alive("run", role, "two")),
+    )
+    assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", role, "two")
+    assert there(connect(role), role) == [key_expressions.alive("run", role, "two")]
     # Nor does it see who of another role is here.
     assert there(connect(other), role) == []
     assert list(connect(other).liveliness().get("udrl/**", timeout=DEADLINE_S)) == []

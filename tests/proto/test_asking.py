@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from udrl.errors import Interrupted, InvalidMessage, Refused, Unreachable
-from udrl_proto import asking, keys, verbs
+from udrl_proto import asking, key_expressions, verbs
 from udrl_proto.answering import Question, serve
 from udrl_proto.asking import Asker
 from udrl_proto.codec import SMALL, encode
@@ -72,12 +72,14 @@ def first(inbox: Inbox[Any]) -> Any:
 def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
     """Treat the first query with the first function, and so on."""
     remaining = iter(answers)
-    session.declare_queryable(keys.key(RUN, "state"), lambda query: next(remaining)(query))
+    session.declare_queryable(
+        key_expressions.key(RUN, "state"), lambda query: next(remaining)(query)
+    )
 
 
 def answer(query: zenoh.Query) -> None:
     with query:
-        query.reply(keys.key(RUN, "state"), encode(ANSWER))
+        query.reply(key_expressions.key(RUN, "state"), encode(ANSWER))
 
 
 def test_answer_is_returned(inbox: Questions, ask: Ask) -> None:
@@ -263,7 +265,7 @@ def test_answer_to_somebody_who_is_gone_is_forgotten(
     inbox: Questions, router: zenoh.Session, endpoint: str
 ) -> None:
     with connect(endpoint, patience_s=5.0) as client:
-        client.get(keys.key(RUN, "state"), payload=encode(REQUEST))
+        client.get(key_expressions.key(RUN, "state"), payload=encode(REQUEST))
         question = first(inbox)
     question.answer(ANSWER)
     assert inbox.take(1, 1, 0.0) == []

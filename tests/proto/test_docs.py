@@ -16,7 +16,7 @@ from udrl.commands import Command
 from udrl.config import Config, FlatSettings, Keywords
 from udrl.environments import EnvironmentSpec
 from udrl.spaces import Bits, Categories, Category, Image, Leaf, Record, Vector
-from udrl_proto import PROTOCOL, keys, verbs
+from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto.codec import LARGEST, SMALL
 
 ROOT = Path(__file__).parents[2]
@@ -159,10 +159,14 @@ def test_limits_of_replies_are_described() -> None:
 
 
 def test_every_key_expression_is_described() -> None:
-    for verb in (keys.NEW_WEIGHTS, keys.PROGRESS, keys.alive("<run id>", "<role>", "<id>")):
+    for verb in (
+        key_expressions.NEW_WEIGHTS,
+        key_expressions.PROGRESS,
+        key_expressions.alive("<run id>", "<role>", "<id>"),
+    ):
         assert verb.replace(f"udrl/{PROTOCOL}/", "udrl/<protocol>/") in PAGE
-    assert keys.every_hello() in PAGE
-    assert keys.RUN_ID.pattern in PAGE
+    assert key_expressions.every_hello() in PAGE
+    assert key_expressions.RUN_ID.pattern in PAGE
 
 
 def codes_in_the_code() -> set[str]:

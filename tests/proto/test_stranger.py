@@ -28,11 +28,11 @@ from udrl.numerics import acting_class
 from udrl.repeating import environment_digest
 from udrl.streams import Purpose, stream_key
 from udrl.training import untrained
-from udrl_learner.service import LearnerService
+from udrl_learner.learner_service import LearnerService
 from udrl_proto.session import find_run
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import create
-from udrl_replay.service import ReplayService
+from udrl_replay.replay_service import ReplayService
 
 CONFIG = build(
     Config,

@@ -8,7 +8,7 @@ import pytest
 from tests.replay.synthetic import finish
 from udrl.config import Budget
 from udrl.setting_groups import NetworkSettings
-from udrl_launch.training import Adviser
+from udrl_launch.training_run import Adviser
 from udrl_proto.reports import IterationStatus
 from udrl_replay.advice import advice, cause
 from udrl_replay.reporting import Throughput, Waits, status

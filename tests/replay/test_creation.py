@@ -18,7 +18,7 @@ from udrl.graph import acting_graph
 from udrl.repeating import environment_digest
 from udrl.spaces import Category
 from udrl.version import __version__
-from udrl_proto import PROTOCOL, keys
+from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.messages import Hello
 from udrl_replay import creation
 from udrl_replay.database import FILE
@@ -107,7 +107,7 @@ def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["run", "My Run.2", "-", "x" * 200, "läufe", "a" * 49 + "--b"])
 def test_id_of_a_run_fits_a_key_expression(name: str, tmp_path: Path) -> None:
     with closing(creation.create(tmp_path / name, TOY)) as store:
-        assert keys.RUN_ID.fullmatch(store.fact("hello", Hello).run_id)
+        assert key_expressions.RUN_ID.fullmatch(store.fact("hello", Hello).run_id)
 
 
 def test_runs_of_one_name_have_different_ids(tmp_path: Path) -> None:

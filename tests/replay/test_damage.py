@@ -20,8 +20,8 @@ from udrl.errors import DamagedStore, OtherConfiguration
 from udrl_proto.codec import LARGEST
 from udrl_replay.database import FILE
 from udrl_replay.run import Run
+from udrl_replay.schema import SEALED, seal
 from udrl_replay.store import Store, Version
-from udrl_replay.tables import SEALED, seal
 
 TABLES_THERE = [*SEALED, "bodies"]
 

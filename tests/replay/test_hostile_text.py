@@ -13,13 +13,13 @@ from tests.proto.test_text import HOSTILE
 from tests.replay.synthetic import create, join
 from udrl.config import Budget
 from udrl.errors import Refused
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
 from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import Status, StatusRequest
-from udrl_replay.service import ReplayService
+from udrl_replay.replay_service import ReplayService
 
 RUN = "synthetic"
 
@@ -48,7 +48,7 @@ def tell_everything(transport: MemoryTransport) -> Status:
             asker.ask(verbs.COMMANDS, unknown)
     hostile = replace(join("a"), host=HOSTILE, software=HOSTILE, numerics_class=HOSTILE)
     asker.ask(verbs.JOIN, hostile)
-    transport.appear(keys.alive(RUN, "actor", HOSTILE)).undeclare()
+    transport.appear(key_expressions.alive(RUN, "actor", HOSTILE)).undeclare()
     spec = hostile.environment
     assert spec is not None
     with pytest.raises(Refused, match="the run's environment is"):

@@ -14,8 +14,8 @@ from udrl.evaluation import summarise
 from udrl_proto.codec import LARGEST
 from udrl_replay.database import FILE
 from udrl_replay.run import Run
+from udrl_replay.schema import SCHEMA
 from udrl_replay.store import EvaluationRow, Store, Version
-from udrl_replay.tables import SCHEMA
 
 
 @pytest.fixture

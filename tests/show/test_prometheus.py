@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.show.test_display import STATUS
 from udrl.errors import ConfigError
-from udrl_launch.training import Watchers
+from udrl_launch.training_run import Watchers
 from udrl_proto.reports import ActorStatus, Quarantined, Status
 from udrl_show.prometheus import Exporter
 

@@ -14,7 +14,7 @@ from udrl.commands import Command
 from udrl.errors import Refused
 from udrl.inference import ActingFunction
 from udrl_actor.behaviors import Behaviors
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     CommandsRequest,
@@ -115,7 +115,7 @@ class Courier(threading.Thread):
 
     def run(self) -> None:
         """Fetch until the run ends, ``stop`` is set, or the replay service says no."""
-        key = keys.key(self._hello.run_id, keys.NEW_WEIGHTS)
+        key = key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS)
         subscriber = self._transport.subscribe(key, self._behaviors.note)
         try:
             self._work()

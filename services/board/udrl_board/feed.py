@@ -10,7 +10,7 @@ import msgspec
 from udrl.errors import InvalidData, UdrlError
 from udrl.version import __version__
 from udrl_board.source import Place, Source
-from udrl_inspect.obedience import Obedience
+from udrl_inspect.obedience_report import Obedience
 from udrl_inspect.obedience_text import summary
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Status

@@ -14,7 +14,7 @@ from udrl.errors import ConfigError, PeerError, Refused, Unreachable
 from udrl_inspect.address import Address, connected, served_at
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
-from udrl_inspect.obedience import Obedience, kept
+from udrl_inspect.obedience_report import Obedience, kept
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Weights, WeightsRequest

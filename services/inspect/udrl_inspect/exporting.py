@@ -11,7 +11,7 @@ from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.inspection import budget_of
-from udrl_inspect.obedience import Obedience, kept_of
+from udrl_inspect.obedience_report import Obedience, kept_of
 from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import msgspec
 
 from udrl.evaluation import return_text
-from udrl_inspect.obedience import TOLERANCE, Obedience, Point
+from udrl_inspect.obedience_report import TOLERANCE, Obedience, Point
 
 #: Correlation from which on means follow their commands, even if they are not what is commanded.
 _FOLLOWS = 0.8
@@ -176,7 +176,7 @@ def _cells(report: Obedience, points: Sequence[Point]) -> Iterator[list[str]]:
 
 
 def _exact(value: float) -> str:
-    """Return a commanded return unrounded (:func:`udrl.obedience.evenly` rounds them)."""
+    """Return a commanded return unrounded, unlike `obedience_statistics.evenly`."""
     return f"{value:.10g}"
 
 

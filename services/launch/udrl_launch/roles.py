@@ -9,7 +9,7 @@ from pathlib import Path
 from udrl.config import Budget, Config
 from udrl.errors import ConfigError, Deceived, RunFailed
 from udrl.numerics import has_cuda
-from udrl_actor.service import ActorService
+from udrl_actor.actor_service import ActorService
 from udrl_inspect.address import Address, announced, connected, unique_name
 from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
@@ -22,8 +22,8 @@ from udrl_replay.creation import (
     no_empty_folder_left,
     write_config,
 )
+from udrl_replay.replay_service import ReplayService
 from udrl_replay.resuming import closed_on_error, resume
-from udrl_replay.service import ReplayService
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -145,7 +145,7 @@ def learner(address: Address, stop: threading.Event) -> None:
         ConfigError: torch or the run's device is missing.
     """
     require_torch()
-    from udrl_learner.service import LearnerService  # the only one that needs torch
+    from udrl_learner.learner_service import LearnerService  # the only one that needs torch
 
     with connected("learner", address, stop) as (transport, hello):
         require_device(hello.config)

@@ -17,7 +17,7 @@ import msgspec
 
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl_replay.remedies import remedy
-from udrl_replay.tables import SCHEMA, SEALED, TABLES, Value, marks, seal
+from udrl_replay.schema import SCHEMA, SEALED, TABLES, Value, marks, seal
 from udrl_replay.tallies import TALLIES, Tallies, Tally
 
 FILE = "run.sqlite"

@@ -1,6 +1,6 @@
 """One SQLite file per run, the only thing in the system that is worth saving.
 
-What it holds is described in :mod:`udrl_replay.tables`, and how it is kept in
+What it holds is described in :mod:`udrl_replay.schema`, and how it is kept in
 :mod:`udrl_replay.database`.
 """
 
@@ -15,7 +15,7 @@ from udrl.evaluation import Evaluation
 from udrl.replay import Entry
 from udrl_proto.reports import IterationStatus
 from udrl_replay.database import Database
-from udrl_replay.tables import SEALED, sha256
+from udrl_replay.schema import SEALED, sha256
 
 _FIELDS = IterationStatus.__struct_fields__
 #: Columns of evaluations in ``metrics.csv``, and in the store.

@@ -9,7 +9,7 @@ its tally as it was.
 import sqlite3
 from typing import NamedTuple
 
-from udrl_replay.tables import SEALED
+from udrl_replay.schema import SEALED
 
 #: The fact that holds them; it is the only row that no tally counts.
 TALLIES = "tallies"

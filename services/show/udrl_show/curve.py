@@ -18,7 +18,7 @@ import msgspec
 from udrl.config import flat
 from udrl.errors import StoreError, UdrlError
 from udrl.evaluation import Evaluation
-from udrl_inspect.runs import run_directories
+from udrl_inspect.run_list import run_directories
 from udrl_proto.messages import Hello
 from udrl_replay.database import FILE
 from udrl_replay.store import EvaluationRow, Store

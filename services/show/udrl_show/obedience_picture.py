@@ -4,7 +4,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
-from udrl_inspect.obedience import Obedience
+from udrl_inspect.obedience_report import Obedience
 from udrl_inspect.obedience_text import answer
 from udrl_show import pictures
 from udrl_show.styles import line_style

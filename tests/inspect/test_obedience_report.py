@@ -10,10 +10,10 @@ import msgspec
 import pytest
 
 from udrl.errors import ConfigError, InvalidData, StoreError
-from udrl_inspect import tables
-from udrl_inspect.obedience import FILE, Agreement, Obedience, Point, keep, kept
+from udrl_inspect import csv_tables
+from udrl_inspect.obedience_report import FILE, Agreement, Obedience, Point, keep, kept
 from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
-from udrl_launch.commands.options import RETURNS
+from udrl_launch.subcommands.options import RETURNS
 from udrl_show.obedience_picture import draw
 
 
@@ -122,7 +122,7 @@ def test_a_card_has_the_table_and_begins_with_the_answer() -> None:
 
 def test_the_csv_file_has_every_point(tmp_path: Path) -> None:
     told = report(obeyed=(30.0, 80.0))
-    tables.write(tmp_path / "obedience.csv", Row, rows(told))
+    csv_tables.write(tmp_path / "obedience.csv", Row, rows(told))
     with (tmp_path / "obedience.csv").open(newline="") as file:
         found = list(csv.DictReader(file))
     assert [row["sweep"] for row in found] == ["return"] * 4 + ["horizon"] * 2

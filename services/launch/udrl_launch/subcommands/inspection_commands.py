@@ -10,7 +10,8 @@ from udrl.errors import EnvironmentFault
 from udrl.evaluation import return_text
 from udrl_inspect import agents, inspection
 from udrl_inspect.greedy import caution
-from udrl_launch.commands.options import (
+from udrl_launch.output import print_json, print_text
+from udrl_launch.subcommands.options import (
     CONNECT,
     DESIRED_HORIZON,
     DESIRED_RETURN,
@@ -24,7 +25,6 @@ from udrl_launch.commands.options import (
     place,
     version,
 )
-from udrl_launch.output import print_json, print_text
 from udrl_show.display import panel
 
 #: Characters of a line in a pipe or a file, so that none is wrapped.

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import click
 
 from udrl.errors import ConfigError
-from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 from udrl_launch.process import GRACE_S, log_to_stderr, run_service
+from udrl_launch.subcommands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 
 if TYPE_CHECKING:
     import uvicorn

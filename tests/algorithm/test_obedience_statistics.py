@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.obedience import (
+from udrl.obedience_statistics import (
     Means,
     correlation,
     evenly,

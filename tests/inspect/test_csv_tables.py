@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from udrl.errors import InvalidData
 from udrl_experiments.records import Evaluated, Obtained
 from udrl_experiments.statistics import Reached
-from udrl_inspect.tables import read, write
+from udrl_inspect.csv_tables import read, write
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 COUNTS = st.integers(0, 2**53)

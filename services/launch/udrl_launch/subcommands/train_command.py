@@ -11,7 +11,11 @@ import click
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
 from udrl_launch import completions
-from udrl_launch.commands.options import (
+from udrl_launch.output import print_json, print_text
+from udrl_launch.paths import new_run_dir, shown
+from udrl_launch.process import PARENTS_GRACE_S, log_to_stderr, run_service
+from udrl_launch.settings import Settings
+from udrl_launch.subcommands.options import (
     ALLOW_INEXACT,
     AUDIT,
     INSECURE,
@@ -20,13 +24,9 @@ from udrl_launch.commands.options import (
     RESUME,
     RUN_DIR_OPTION,
 )
-from udrl_launch.commands.settings import gather_settings, settings_options
-from udrl_launch.output import print_json, print_text
-from udrl_launch.paths import new_run_dir, shown
-from udrl_launch.process import PARENTS_GRACE_S, log_to_stderr, run_service
-from udrl_launch.settings import Settings
-from udrl_launch.training import Adviser, Watchers
-from udrl_launch.training import train as run_training
+from udrl_launch.subcommands.settings_options import gather_settings, settings_options
+from udrl_launch.training_run import Adviser, Watchers
+from udrl_launch.training_run import train as run_training
 from udrl_proto.reports import Status
 from udrl_proto.text import printable
 from udrl_replay.creation import directory_name

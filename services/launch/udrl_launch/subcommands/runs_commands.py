@@ -10,9 +10,9 @@ from typing import Literal
 import click
 
 from udrl.evaluation import return_text
-from udrl_inspect.runs import Summary, find
-from udrl_launch.commands.options import FILE, RUN_DIR
+from udrl_inspect.run_list import Summary, find
 from udrl_launch.output import print_json
+from udrl_launch.subcommands.options import FILE, RUN_DIR
 from udrl_proto.text import printable
 from udrl_show import curve
 from udrl_show.display import duration, wrapped

@@ -6,8 +6,8 @@ import click
 
 from udrl.errors import Unreachable
 from udrl_inspect.address import Address, connected, host_name, is_of_this_machine
-from udrl_launch.commands.options import KEYS, PATIENCE, RUN
-from udrl_proto import keys as expressions
+from udrl_launch.subcommands.options import KEYS, PATIENCE, RUN
+from udrl_proto import key_expressions
 from udrl_proto.access import REPLAY
 from udrl_proto.session import check_endpoint
 
@@ -35,7 +35,7 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
         if role == REPLAY:
             click.echo(f"run {hello.run_id} answers at {connect}")
             return 0
-        wanted = expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
+        wanted = key_expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
         found = [key.rpartition("/")[2] for key in transport.present(wanted, _ANSWER_S)]
     there = [name for name in found if is_of_this_machine(name, role)]
     if not there:

@@ -7,10 +7,11 @@ import click
 import msgspec
 
 from udrl.errors import ConfigError, StoreError
-from udrl_inspect import obedience as reports
-from udrl_inspect import obedience_text, tables
+from udrl_inspect import csv_tables, obedience_text
+from udrl_inspect import obedience_report as reports
 from udrl_inspect.agents import load_agent
-from udrl_launch.commands.options import (
+from udrl_launch.output import print_json, print_text
+from udrl_launch.subcommands.options import (
     FILE,
     GREEDY,
     RETURNS,
@@ -20,7 +21,6 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.output import print_json, print_text
 from udrl_show import pictures
 from udrl_show.obedience_picture import draw
 
@@ -97,7 +97,7 @@ def _keep(run_dir: Path, report: reports.Obedience, *, draws: bool) -> list[str]
     """Write the files in the run's directory, and return what went wrong."""
     try:
         reports.keep(run_dir, report)
-        tables.write(
+        csv_tables.write(
             run_dir / _NAME.with_suffix(".csv"), obedience_text.Row, obedience_text.rows(report)
         )
     except (OSError, StoreError) as error:

@@ -15,7 +15,7 @@ from msgspec import Meta
 from udrl.commands import Command
 from udrl.errors import ConfigError, InvalidData, StoreError
 from udrl.evaluation import summarise
-from udrl.obedience import (
+from udrl.obedience_statistics import (
     Means,
     correlation,
     evenly,
@@ -28,7 +28,7 @@ from udrl.setting_groups import Temperature
 from udrl.strategies import nearest
 from udrl.targets import ReturnInTime
 from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
-from udrl_inspect.tables import put
+from udrl_inspect.csv_tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
@@ -96,7 +96,7 @@ class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         weights_version: the agent's weights version.
         temperature: sampling temperature; 0 = most likely action.
         episodes: number of episodes for each command.
-        reachable_low: lowest reachable return (:func:`udrl.obedience.spread`).
+        reachable_low: lowest reachable return (:func:`udrl.obedience_statistics.spread`).
         reachable_high: highest reachable return.
         tolerance: largest difference between a mean and its command that counts as obeyed.
         by_return: results by commanded return in increasing order, each with its horizon.

@@ -10,8 +10,8 @@ import click
 from udrl.errors import UdrlError
 from udrl_inspect.address import Address
 from udrl_inspect.inspection import status_from
-from udrl_launch.commands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.subcommands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 from udrl_proto.reports import Status
 from udrl_show.prometheus import Exporter
 

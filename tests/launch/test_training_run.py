@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from udrl.errors import Interrupted
-from udrl_launch import training
+from udrl_launch import training_run
 from udrl_launch.settings import gather
 from udrl_replay.store import Store
 
@@ -34,12 +34,12 @@ class Silent:
 def test_a_stop_while_connecting_says_how_to_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training, "Threads", Silent)
+    monkeypatch.setattr(training_run, "Threads", Silent)
     stop = threading.Event()
     timer = threading.Timer(0.3, stop.set)
     timer.start()
     settings = gather("Figure2-v0", preset_name="none", options=TOY)
     command = f"udrl train Figure2-v0 --run-dir {tmp_path / 'run'} --resume"
     with pytest.raises(Interrupted, match=f"^stopped; resume with: {command}$"):
-        training.train(settings, tmp_path / "run", stop, in_process=True)
+        training_run.train(settings, tmp_path / "run", stop, in_process=True)
     assert Silent.ended

@@ -24,7 +24,7 @@ from udrl.training import TrainingState, exact_arithmetic, train, untrained
 from udrl.training_class import training_class
 from udrl.version import __version__
 from udrl.weights import encode_weights
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode
 from udrl_proto.messages import (
@@ -99,9 +99,10 @@ class LearnerService:
         try:
             self._asker.ask(verbs.JOIN, self._join)
             declared += [
-                self._transport.appear(keys.alive(run_id, "learner", self._name)),
+                self._transport.appear(key_expressions.alive(run_id, "learner", self._name)),
                 self._transport.subscribe(
-                    keys.key(run_id, keys.PROGRESS), lambda _: self._progress.set()
+                    key_expressions.key(run_id, key_expressions.PROGRESS),
+                    lambda _: self._progress.set(),
                 ),
             ]
             self._train_until_ended()
@@ -259,4 +260,6 @@ class LearnerService:
         # Not acknowledged: one stopped actor must not stall training, and whoever misses
         # this asks the replay service.
         announcement = encode(Weights(version=message.version, weights=message.weights))
-        self._transport.publish(keys.key(self._hello.run_id, keys.NEW_WEIGHTS), announcement)
+        self._transport.publish(
+            key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS), announcement
+        )

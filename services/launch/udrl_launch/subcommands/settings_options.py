@@ -9,8 +9,8 @@ import click
 from udrl.config import preset_names
 from udrl_inspect import inspection
 from udrl_launch import completions
-from udrl_launch.commands.options import FILE, STEPS
 from udrl_launch.settings import Settings, gather
+from udrl_launch.subcommands.options import FILE, STEPS
 from udrl_replay.creation import exists
 
 Command = TypeVar("Command", bound=Callable[..., Any])

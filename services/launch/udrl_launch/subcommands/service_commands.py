@@ -13,7 +13,15 @@ import click
 from udrl.errors import ConfigError
 from udrl_inspect.address import Address
 from udrl_launch import completions, roles
-from udrl_launch.commands.options import (
+from udrl_launch.paths import new_run_dir, shown
+from udrl_launch.process import (
+    die_with_parent,
+    keep_freed_memory,
+    log_to_stderr,
+    run_service,
+    switch_threads_soon,
+)
+from udrl_launch.subcommands.options import (
     ALLOW_INEXACT,
     AUDIT,
     INSECURE,
@@ -24,15 +32,7 @@ from udrl_launch.commands.options import (
     RUN,
     RUN_DIR_OPTION,
 )
-from udrl_launch.commands.settings import gather_settings, settings_options
-from udrl_launch.paths import new_run_dir, shown
-from udrl_launch.process import (
-    die_with_parent,
-    keep_freed_memory,
-    log_to_stderr,
-    run_service,
-    switch_threads_soon,
-)
+from udrl_launch.subcommands.settings_options import gather_settings, settings_options
 from udrl_proto.access import REPLAY
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint

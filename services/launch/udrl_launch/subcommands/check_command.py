@@ -8,10 +8,10 @@ import click
 from udrl_inspect.checking import Check
 from udrl_inspect.checking import check as check_environment
 from udrl_launch import completions
-from udrl_launch.commands.options import FILE
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
 from udrl_launch.settings import gather
+from udrl_launch.subcommands.options import FILE
 
 
 @click.command()

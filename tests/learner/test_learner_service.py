@@ -19,7 +19,7 @@ from udrl.segments import Experience
 from udrl.spaces import Vector
 from udrl.training import train, untrained
 from udrl.weights import encode_weights
-from udrl_learner.service import LearnerService
+from udrl_learner.learner_service import LearnerService
 from udrl_proto import PROTOCOL, verbs
 from udrl_proto.codec import encode_episode
 from udrl_proto.messages import (

@@ -7,8 +7,8 @@ import click
 from udrl.errors import ConfigError
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_buffer, export_folder, export_model
-from udrl_inspect.obedience import kept_of
-from udrl_launch.commands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
+from udrl_inspect.obedience_report import kept_of
+from udrl_launch.subcommands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
 
 
 @click.command()

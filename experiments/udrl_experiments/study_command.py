@@ -18,8 +18,8 @@ from udrl_experiments.study import Study, conduct
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
 from udrl_experiments.variants import segments as make_segments
-from udrl_launch.commands.options import STEPS
 from udrl_launch.process import log_to_stderr, run_service
+from udrl_launch.subcommands.options import STEPS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -7,7 +7,9 @@ import click
 from udrl.evaluation import return_text
 from udrl_inspect.agents import evaluation_commands, load_agent
 from udrl_inspect.greedy import caution
-from udrl_launch.commands.options import (
+from udrl_launch.output import print_json, print_text
+from udrl_launch.paths import shown
+from udrl_launch.subcommands.options import (
     DESIRED_HORIZON,
     DESIRED_RETURN,
     FILE,
@@ -18,8 +20,6 @@ from udrl_launch.commands.options import (
     chosen_temperature,
     version,
 )
-from udrl_launch.output import print_json, print_text
-from udrl_launch.paths import shown
 from udrl_show import film
 from udrl_show.playing import play as play_episodes
 from udrl_show.playing import with_seeds

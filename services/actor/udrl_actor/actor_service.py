@@ -17,7 +17,7 @@ from udrl.repeating import environment_digest
 from udrl.version import __version__
 from udrl_actor.courier import Courier
 from udrl_actor.outbox import Outbox, deliver
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, JoinRequest
 from udrl_proto.transport import Transport
@@ -89,7 +89,7 @@ class ActorService:
                 environment_digest=environment_digest(generator),
             )
             asker.ask(verbs.JOIN, join)
-            token = self._transport.appear(keys.alive(run_id, "actor", self._name))
+            token = self._transport.appear(key_expressions.alive(run_id, "actor", self._name))
             courier = Courier(self._transport, self._hello, join, asker, self._stop)
 
             def deliver_one(outcome: Episode | Failure) -> None:

@@ -7,21 +7,21 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl_proto import PROTOCOL, keys, verbs
+from udrl_proto import PROTOCOL, key_expressions, verbs
 
-run_ids = st.from_regex(keys.RUN_ID, fullmatch=True)
+run_ids = st.from_regex(key_expressions.RUN_ID, fullmatch=True)
 names = st.from_regex(re.compile(r"[A-Za-z0-9._-]{1,100}", re.ASCII), fullmatch=True)
-ends = st.sampled_from([*verbs.BY_NAME, keys.NEW_WEIGHTS, keys.PROGRESS])
+ends = st.sampled_from([*verbs.BY_NAME, key_expressions.NEW_WEIGHTS, key_expressions.PROGRESS])
 
 
 @given(run_ids, ends)
 def test_key_can_be_taken_apart_again(run_id: str, verb: str) -> None:
-    assert keys.parse(keys.key(run_id, verb)) == (str(PROTOCOL), run_id, verb)
+    assert key_expressions.parse(key_expressions.key(run_id, verb)) == (str(PROTOCOL), run_id, verb)
 
 
 @given(run_ids, ends)
 def test_key_is_a_key_expression_without_wildcards(run_id: str, verb: str) -> None:
-    expression = zenoh.KeyExpr(keys.key(run_id, verb))
+    expression = zenoh.KeyExpr(key_expressions.key(run_id, verb))
     assert "*" not in str(expression)
     assert "$" not in str(expression)
 
@@ -30,9 +30,9 @@ def test_key_is_a_key_expression_without_wildcards(run_id: str, verb: str) -> No
 def test_token_of_any_name_is_among_all_tokens_of_its_run(
     run_id: str, role: str, name: str
 ) -> None:
-    token = zenoh.KeyExpr(keys.alive(run_id, role, name))
-    assert zenoh.KeyExpr(keys.alive(run_id, "*", "*")).includes(token)
-    assert not zenoh.KeyExpr(keys.alive(run_id + "x", "*", "*")).intersects(token)
+    token = zenoh.KeyExpr(key_expressions.alive(run_id, role, name))
+    assert zenoh.KeyExpr(key_expressions.alive(run_id, "*", "*")).includes(token)
+    assert not zenoh.KeyExpr(key_expressions.alive(run_id + "x", "*", "*")).intersects(token)
 
 
 @given(st.integers(0, 99), run_ids, ends)
@@ -40,14 +40,17 @@ def test_every_hello_finds_runs_of_every_protocol_and_nothing_else(
     protocol: int, run_id: str, verb: str
 ) -> None:
     key = zenoh.KeyExpr(f"udrl/{protocol}/{run_id}/{verb}")
-    assert zenoh.KeyExpr(keys.every_hello()).includes(key) == (verb == verbs.HELLO.name)
+    assert zenoh.KeyExpr(key_expressions.every_hello()).includes(key) == (verb == verbs.HELLO.name)
 
 
 @pytest.mark.parametrize("expression", ["", "udrl", "udrl/1/run", "other/1/run/hello"])
 def test_foreign_key_is_refused(expression: str) -> None:
     with pytest.raises(ValueError, match=f"key '{expression}': expected udrl/"):
-        keys.parse(expression)
+        key_expressions.parse(expression)
 
 
 def test_verbs_are_distinct() -> None:
-    assert len({*verbs.BY_NAME, keys.NEW_WEIGHTS, keys.PROGRESS}) == len(verbs.VERBS) + 2
+    assert (
+        len({*verbs.BY_NAME, key_expressions.NEW_WEIGHTS, key_expressions.PROGRESS})
+        == len(verbs.VERBS) + 2
+    )

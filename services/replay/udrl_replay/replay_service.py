@@ -20,7 +20,7 @@ from udrl.digests import arrays_digest
 from udrl.errors import InvalidData, InvalidMessage, Refused
 from udrl.graph import critic_shapes, weight_shapes
 from udrl.weights import decode_weights, optimizer_shapes
-from udrl_proto import keys, verbs
+from udrl_proto import key_expressions, verbs
 from udrl_proto.answering import Question, serve
 from udrl_proto.codec import PAGE, encode
 from udrl_proto.inbox import Inbox
@@ -196,7 +196,7 @@ class ReplayService:
         episode = replace(verbs.EPISODE, limit=longest)
         run_id = self.run.hello.run_id
         return [
-            self._transport.watch(keys.alive(run_id, "*", "*"), self._inbox.must_put),
+            self._transport.watch(key_expressions.alive(run_id, "*", "*"), self._inbox.must_put),
             *serve(
                 self._transport,
                 run_id,
@@ -235,7 +235,9 @@ class ReplayService:
             question.answer(reply)
         if run.progress.iteration != before:
             news = encode(Progress(iteration=run.progress.iteration))
-            self._transport.publish(keys.key(run.hello.run_id, keys.PROGRESS), news)
+            self._transport.publish(
+                key_expressions.key(run.hello.run_id, key_expressions.PROGRESS), news
+            )
 
     def _reply(self, question: Question, now: float) -> Message:
         request: Any = question.request
@@ -255,7 +257,7 @@ class ReplayService:
             return Problem(code=error.code, message=str(error)[:4000])
 
     def _note_presence(self, presence: Presence, now: float) -> None:
-        _, _, token = keys.parse(presence.key)
+        _, _, token = key_expressions.parse(presence.key)
         _, role, name = token.split("/", 2)
         peer = role, name
         if presence.here:
