@@ -20,7 +20,7 @@ from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Child, Supervisor
 from udrl_proto.reports import Status
 from udrl_replay.creation import create, write_config
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 _POLL_S = 0.02
@@ -158,7 +158,7 @@ class DisturbedRun:
     def _observe(self) -> None:
         try:
             with closing(Store(self.run_dir, read_only=True)) as store:
-                progress = store.fact("progress", Progress)
+                progress = store.fact("progress", RunProgress)
                 arrived = store.pending_ids()
                 waiting = [c.id for c in store.commands(cancelled=False) if c.id not in arrived]
         except StoreError as error:

@@ -43,7 +43,7 @@ from udrl.inference import ActingFunction, probe_weights
 from udrl.streams import Purpose, stream_key
 from udrl_launch.settings import Settings, gather
 from udrl_launch.training_run import train
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 #: Seconds on this machine, in runs (docs/performance.md): CPU of the replay service for an episode;
 #: between a question and its answer; from an episode's end to its acknowledgement, besides; from an
@@ -67,9 +67,9 @@ class Real(NamedTuple):
 def record(settings: Settings) -> Recorded:
     """Make a run in this process."""
     found: dict[int, dict[int, int]] = defaultdict(dict)
-    accept = Run.accept
+    accept = StoredRun.accept
 
-    def note_episode(self: Run, arrival: Any, now: float) -> Any:
+    def note_episode(self: StoredRun, arrival: Any, now: float) -> Any:
         iteration, index = divmod(arrival.entry.id, COMMANDS_PER_ITERATION)
         if index < CLOSING:
             found[iteration][index] = arrival.entry.length
@@ -77,7 +77,7 @@ def record(settings: Settings) -> Recorded:
 
     with (
         tempfile.TemporaryDirectory() as folder,
-        mock.patch.object(Run, "accept", note_episode),
+        mock.patch.object(StoredRun, "accept", note_episode),
     ):
         status = train(settings, Path(folder) / "run", threading.Event(), in_process=True)
     complete = range(status.iteration + 1)

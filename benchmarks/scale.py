@@ -45,7 +45,7 @@ from udrl_proto.messages import ChangesRequest, Hello, JoinRequest, VersionMessa
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import write_config
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -142,7 +142,7 @@ class Sample(NamedTuple):
 @contextlib.contextmanager
 def replay_service(run_dir: Path, hello: Hello, endpoint: str) -> Iterator[int]:
     """Run a real replay service; yield its process id."""
-    Store.create(run_dir, hello=hello, progress=Progress()).close()
+    Store.create(run_dir, hello=hello, progress=RunProgress()).close()
     write_config(run_dir, hello.config, Budget(max_env_steps=2**50))
     command = [
         sys.executable, "-m", "udrl_launch", "replay", hello.config.environment, "--resume",

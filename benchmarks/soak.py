@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from udrl.errors import UdrlError
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 ROLES = ("replay", "learner", "actor")
@@ -114,7 +114,7 @@ def _look(parent: int, now: float) -> Iterator[Sample]:
 def _pace(run_dir: Path, now: float) -> Iterator[Pace]:
     try:
         with closing(Store(run_dir, read_only=True)) as store:
-            progress = store.fact("progress", Progress)
+            progress = store.fact("progress", RunProgress)
     except UdrlError:
         return
     size = sum(f.stat().st_size for f in run_dir.glob(f"{FILE}*")) / 2**20

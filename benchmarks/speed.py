@@ -54,7 +54,7 @@ from udrl_inspect.inspection import status_of
 from udrl_launch.process import keep_freed_memory
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
@@ -238,7 +238,7 @@ def _recorded(run_dir: Path) -> tuple[Config, list[Episode]]:
     """Return a run's settings and the episodes in its buffer."""
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)
-        held = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
+        held = [p.entry.id for p in store.buffer(store.fact("progress", RunProgress).iteration)]
         bodies = [store.episode_bodies([i], LARGEST)[0] for i in held]
     space = hello.environment.observation_space
     messages = [decode(body, EpisodeMessage, LARGEST) for body in bodies]

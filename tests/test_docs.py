@@ -33,7 +33,7 @@ from udrl_launch.settings import Fleet, gather
 from udrl_launch.supervisor import FINAL_CODES
 from udrl_proto.reports import Status
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import COLUMNS, Store
 
 # Settings.
@@ -224,7 +224,7 @@ def test_every_counter_of_the_store_is_in_the_status_or_in_operations() -> None:
     shown = {path.rpartition(".")[2] for path in fields(inspect.type_info(Status))}
     shown |= {"latest_version"}  # the status' weights_version
     text = section("docs/operations-reference.md", "## The store")
-    assert set(Progress.__struct_fields__) - shown <= set(codes(text))
+    assert set(RunProgress.__struct_fields__) - shown <= set(codes(text))
 
 
 def log_formats() -> Iterator[tuple[Path, str]]:

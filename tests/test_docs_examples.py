@@ -15,7 +15,7 @@ import udrl.environments  # noqa: F401 - registers environments
 from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
 from udrl.config import Budget, Config, parse_assignment, setting_names
 from udrl.errors import UdrlError
-from udrl_experiments.protocol import TASKS, Plan, parse_seeds
+from udrl_experiments.protocol import TASKS, StudyPlan, parse_seeds
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, gather
 from udrl_proto.session import check_endpoint
@@ -89,7 +89,7 @@ def check_udrl(words: list[str]) -> None:
         if endpoint is not None:
             check_endpoint(endpoint, secure=given.get("keys") is not None)
     if "side_by_side" in given:  # a study: its callback parses more
-        Plan(
+        StudyPlan(
             given["scale"],
             parse_seeds(given["seeds"] or "1"),
             given["max_env_steps"],

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.markdown import ROOT, text_of
-from udrl_experiments.records import Evaluated, Obtained
+from udrl_experiments.records import EvaluationRecord, Obtained
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_inspect.csv_tables import read
 
@@ -25,7 +25,7 @@ def anchor(heading: str) -> str:
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)
 def test_tables_are_made_of_the_evaluations(folder: Path) -> None:
-    rows = read(folder / "evaluations.csv", Evaluated)
+    rows = read(folder / "evaluations.csv", EvaluationRecord)
     points = read(folder / "curves.csv", CurvePoint)
     assert points == curves(rows, EVERY)
     found = read(folder / "reached.csv", Reached)

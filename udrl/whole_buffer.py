@@ -19,7 +19,7 @@ Network = Callable[[Seen, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
 _AT_ONCE = 128
 
 
-class Evaluated(NamedTuple):
+class BufferOutputs(NamedTuple):
     """What a network says of the buffer.
 
     Attributes:
@@ -35,7 +35,7 @@ class Evaluated(NamedTuple):
 
 def at_all_steps(
     network: Network, size: int, experience: RankedExperience, config: Config
-) -> Evaluated:
+) -> BufferOutputs:
     """Evaluate a network at every step of the buffer.
 
     Args:
@@ -51,7 +51,7 @@ def at_all_steps(
         else:
             outputs, states = _part_by_part(network, experience, device), None
     # Training cannot use what was made in inference mode, but a copy of it.
-    return Evaluated(outputs, None if states is None else states.clone())
+    return BufferOutputs(outputs, None if states is None else states.clone())
 
 
 def _part_by_part(

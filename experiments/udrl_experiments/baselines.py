@@ -26,7 +26,7 @@ from udrl.evaluation import summarise
 from udrl.memory import FrameStack
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
 from udrl_inspect.csv_tables import write
 
@@ -71,7 +71,7 @@ class _State(msgspec.Struct, frozen=True, kw_only=True):
 
     exploration_steps: int
     counters: dict[str, int]
-    rows: list[Evaluated]
+    rows: list[EvaluationRecord]
 
 
 def run(
@@ -81,7 +81,7 @@ def run(
     *,
     exploration_steps: int | None = None,
     stop: threading.Event | None = None,
-) -> list[Evaluated]:
+) -> list[EvaluationRecord]:
     """Train, or go on with the training in a folder, and evaluate every ``eval_every`` env steps.
 
     Who asks for more env steps than a run has made extends it. What is resumed goes on from its
@@ -118,7 +118,9 @@ def run(
     if path.exists():
         with _reading(path):
             state, held = _load(path)
-        write(folder / "evaluations.csv", Evaluated, state.rows)  # it may have stopped before that
+        write(
+            folder / "evaluations.csv", EvaluationRecord, state.rows
+        )  # it may have stopped before that
     else:
         if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
             exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
@@ -154,7 +156,7 @@ def run(
             commands = _commands(baseline, generator, len(rows) + 1)
             episodes = generate_episodes(generator, commands, behavior)
             evaluation = summarise([episode.episode_return for episode in episodes])
-            row = Evaluated(
+            row = EvaluationRecord(
                 environment=config.environment, algorithm=baseline.algorithm, variant="",
                 seed=config.seed, env_steps=model.num_timesteps,
                 wall_s=time.monotonic() - began, mean=evaluation.mean, std=evaluation.std,
@@ -163,7 +165,7 @@ def run(
             rows.append(row)
             state = msgspec.structs.replace(state, counters=policies.counters(model))
             _save(path, state, policies.tensors(model))
-            write(folder / "evaluations.csv", Evaluated, rows)
+            write(folder / "evaluations.csv", EvaluationRecord, rows)
     return rows
 
 

@@ -7,17 +7,17 @@ from typing import Literal
 from udrl.config import Config, KeywordValue, flat
 from udrl_experiments import figures
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import TASKS, Algorithm, Plan, Task
-from udrl_experiments.records import Evaluated
+from udrl_experiments.protocol import TASKS, Algorithm, StudyPlan, Task
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
-from udrl_experiments.study import Place, Study
+from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
 _PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
 
 
-def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
+def comparison(name: str, plan: StudyPlan, algorithms: Sequence[Algorithm]) -> Study:
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
 
     Args:
@@ -32,13 +32,13 @@ def comparison(name: str, plan: Plan, algorithms: Sequence[Algorithm]) -> Study:
         for seed in plan.seeds_of_runs()
     ]
 
-    def report(place: Place) -> str:
+    def report(place: StudyFolders) -> str:
         return report_curves(jobs, task, task.title, place)
 
     return Study(name, jobs, report)
 
 
-def job(task: Task, plan: Plan, algorithm: Algorithm, seed: int) -> Job:
+def job(task: Task, plan: StudyPlan, algorithm: Algorithm, seed: int) -> Job:
     """Return an algorithm's run on a task."""
     steps = plan.steps(task, algorithm)
     if algorithm == "UDRL":
@@ -65,15 +65,15 @@ def baseline(
     )
 
 
-def report_curves(jobs: Sequence[Job], task: Task, title: str, place: Place) -> str:
+def report_curves(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> str:
     """Write all evaluations, their curves, and when returns were reached; draw the curves.
 
     Returns:
         A line for each curve: where it ends.
     """
-    rows: list[Evaluated] = [row for job in jobs for row in job.evaluations(place.root)]
+    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(place.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
-    write(place.folder / "evaluations.csv", Evaluated, rows)
+    write(place.folder / "evaluations.csv", EvaluationRecord, rows)
     write(place.folder / "curves.csv", CurvePoint, points)
     write(place.folder / "reached.csv", Reached, reached(rows, task.thresholds))
     draw_curves(place.folder, title, task.landmarks)

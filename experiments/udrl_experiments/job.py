@@ -18,7 +18,7 @@ from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
 from udrl_experiments.jobs import Job, read_job
 from udrl_experiments.provenance import provenance
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import put, read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
@@ -80,8 +80,8 @@ def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
         # What closed a run that goes on now was an evaluation too, and stays.
         rows = {row.env_steps: row for row in _evaluations(job, folder / "run", status)}
         if (folder / "done.json").exists():
-            rows |= {row.env_steps: row for row in read(table, Evaluated)}
-        write(table, Evaluated, (rows[steps] for steps in sorted(rows)))
+            rows |= {row.env_steps: row for row in read(table, EvaluationRecord)}
+        write(table, EvaluationRecord, (rows[steps] for steps in sorted(rows)))
     else:
         baselines.run(
             baselines.Baseline(
@@ -96,9 +96,9 @@ def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
     put(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")
 
 
-def _evaluations(job: Job, run_dir: Path, status: Status) -> list[Evaluated]:
-    def row(env_steps: int, wall_s: float, mean: float, std: float) -> Evaluated:
-        return Evaluated(
+def _evaluations(job: Job, run_dir: Path, status: Status) -> list[EvaluationRecord]:
+    def row(env_steps: int, wall_s: float, mean: float, std: float) -> EvaluationRecord:
+        return EvaluationRecord(
             environment=job.config.environment, algorithm=job.algorithm, variant="",
             seed=job.config.seed, env_steps=env_steps, wall_s=wall_s, mean=mean, std=std,
             episodes=job.config.evaluation.eval_episodes,

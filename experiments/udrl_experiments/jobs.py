@@ -19,7 +19,7 @@ import msgspec
 from udrl.config import Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import put, read
 
 #: What is said when a study is stopped.
@@ -79,11 +79,13 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         try:
             done = json.loads((self.folder(root) / "done.json").read_text(encoding="utf-8"))
             far_enough = int(done["max_env_steps"]) >= self.max_env_steps
-            return far_enough and bool(read(self.folder(root) / "evaluations.csv", Evaluated))
+            return far_enough and bool(
+                read(self.folder(root) / "evaluations.csv", EvaluationRecord)
+            )
         except (OSError, ValueError, KeyError, TypeError, OverflowError, InvalidData):
             return False
 
-    def evaluations(self, root: Path) -> list[Evaluated]:
+    def evaluations(self, root: Path) -> list[EvaluationRecord]:
         """Return the run's evaluations up to the last multiple of ``eval_every`` asked for.
 
         Raises:
@@ -92,7 +94,7 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         every = self.config.evaluation.eval_every
         return [
             msgspec.structs.replace(row, variant=self.variant)
-            for row in read(self.folder(root) / "evaluations.csv", Evaluated)
+            for row in read(self.folder(root) / "evaluations.csv", EvaluationRecord)
             if row.env_steps // every * every <= self.max_env_steps
         ]
 

@@ -67,7 +67,7 @@ _SHARED = (
 )  # fmt: skip
 
 
-class Plan(NamedTuple):
+class StudyPlan(NamedTuple):
     """What a study is to do.
 
     Attributes:

@@ -3,7 +3,7 @@
 import msgspec
 
 
-class Evaluated(msgspec.Struct, frozen=True, kw_only=True):
+class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
     """An evaluation of one agent in training (section 3.2).
 
     Attributes:

@@ -16,10 +16,10 @@ from udrl.config import flat, preset
 from udrl.streams import Stream
 from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import LAST, Algorithm, Plan, Task
+from udrl_experiments.protocol import LAST, Algorithm, StudyPlan, Task
 from udrl_experiments.ray_tune import carry_out
 from udrl_experiments.statistics import score
-from udrl_experiments.study import Place, Study
+from udrl_experiments.study import Study, StudyFolders
 from udrl_inspect.csv_tables import put, write
 
 #: Configurations of each algorithm, and env steps of each run, at the small scale.
@@ -70,7 +70,7 @@ def draw(environment: str, algorithm: Algorithm, configuration: int) -> dict[str
 
 
 def search(
-    plan: Plan,
+    plan: StudyPlan,
     tasks: Sequence[Task],
     algorithms: Sequence[Algorithm],
     configurations: int | None = None,
@@ -92,7 +92,7 @@ def search(
         for number in range(_configurations(plan, task, configurations))
     }
 
-    def report(place: Place) -> str:
+    def report(place: StudyFolders) -> str:
         rows = [
             Scored(
                 environment=task.environment,
@@ -116,13 +116,13 @@ def search(
     )
 
 
-def _seeds(plan: Plan, task: Task) -> tuple[int, ...]:
+def _seeds(plan: StudyPlan, task: Task) -> tuple[int, ...]:
     if plan.seeds is not None:
         return plan.seeds
     return tuple(range(1, 1 + (space(task.environment)["seeds"] if plan.scale == "paper" else 1)))
 
 
-def _configurations(plan: Plan, task: Task, given: int | None) -> int:
+def _configurations(plan: StudyPlan, task: Task, given: int | None) -> int:
     if given is not None:
         return given
     if plan.scale == "paper":
@@ -130,7 +130,7 @@ def _configurations(plan: Plan, task: Task, given: int | None) -> int:
     return SMALL_CONFIGURATIONS
 
 
-def _job(plan: Plan, task: Task, algorithm: Algorithm, number: int, seed: int) -> Job:
+def _job(plan: StudyPlan, task: Task, algorithm: Algorithm, number: int, seed: int) -> Job:
     if plan.scale == "small" and plan.max_env_steps is None:
         plan = plan._replace(max_env_steps=SMALL_STEPS)
     drawn = draw(task.environment, algorithm, number)

@@ -7,9 +7,9 @@ from udrl.obedience_statistics import correlation
 from udrl_experiments import figures
 from udrl_experiments.comparison import job
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import Plan, Task
+from udrl_experiments.protocol import StudyPlan, Task
 from udrl_experiments.records import Obtained
-from udrl_experiments.study import Place, Study
+from udrl_experiments.study import Study, StudyFolders
 from udrl_inspect.agents import evaluate_all, evaluation_commands, load_agent
 from udrl_inspect.csv_tables import read, write
 from udrl_inspect.inspection import read_status
@@ -18,7 +18,7 @@ from udrl_inspect.inspection import read_status
 EPISODES = 100
 
 
-def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
+def sensitivity(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
     """Return the study; it tells the agents of the studies of Figures 4 and 5.
 
     Args:
@@ -30,7 +30,7 @@ def sensitivity(plan: Plan, tasks: Sequence[Task], episodes: int = EPISODES) -> 
         task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
     }
 
-    def report(place: Place) -> str:
+    def report(place: StudyFolders) -> str:
         said = []
         for task, runs in jobs.items():
             table = place.folder / f"{task.title}.csv"

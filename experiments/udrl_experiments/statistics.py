@@ -13,7 +13,7 @@ import numpy as np
 
 from udrl.errors import ConfigError
 from udrl.streams import Stream
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 
 _KEY = hashlib.sha256(b"udrl/study/bootstrap/1").digest()[:16]
 
@@ -110,7 +110,7 @@ def score(means: Sequence[float], last: int = 20) -> float:
     return fmean(means[-last:])
 
 
-def curves(rows: Iterable[Evaluated], every: int) -> list[CurvePoint]:
+def curves(rows: Iterable[EvaluationRecord], every: int) -> list[CurvePoint]:
     """Return the learning curves of runs that differ in their seeds (section 3.3).
 
     An evaluation belongs to the last multiple of ``every`` that the run had passed; if several of a
@@ -129,7 +129,7 @@ def curves(rows: Iterable[Evaluated], every: int) -> list[CurvePoint]:
     """
     if every < 1:
         raise ConfigError(f"points every {every} env steps; expected at least 1")
-    agents: dict[tuple[str, str, str], dict[int, dict[int, Evaluated]]] = {}
+    agents: dict[tuple[str, str, str], dict[int, dict[int, EvaluationRecord]]] = {}
     for row in rows:
         bins = agents.setdefault((row.environment, row.algorithm, row.variant), {})
         runs = bins.setdefault(row.env_steps // every * every, {})
@@ -152,7 +152,7 @@ def curves(rows: Iterable[Evaluated], every: int) -> list[CurvePoint]:
     return points
 
 
-def reached(rows: Iterable[Evaluated], thresholds: Sequence[float]) -> list[Reached]:
+def reached(rows: Iterable[EvaluationRecord], thresholds: Sequence[float]) -> list[Reached]:
     """Return when each run first reached each threshold.
 
     Args:
@@ -162,7 +162,7 @@ def reached(rows: Iterable[Evaluated], thresholds: Sequence[float]) -> list[Reac
     Returns:
         A row for each run and threshold, runs in the order of their first rows.
     """
-    runs: dict[tuple[str, str, str, int], list[Evaluated]] = {}
+    runs: dict[tuple[str, str, str, int], list[EvaluationRecord]] = {}
     for one in rows:
         key = (one.environment, one.algorithm, one.variant, one.seed)
         runs.setdefault(key, []).append(one)

@@ -16,7 +16,7 @@ from udrl_experiments.provenance import provenance
 from udrl_inspect.csv_tables import put
 
 
-class Place(NamedTuple):
+class StudyFolders(NamedTuple):
     """Where a study works.
 
     Attributes:
@@ -43,7 +43,7 @@ class Study(NamedTuple):
 
     name: str
     jobs: Sequence[Job]
-    report: Callable[[Place], str]
+    report: Callable[[StudyFolders], str]
     carry_out: Callable[
         [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
     ] = carry_out
@@ -79,7 +79,7 @@ def conduct(
     _require(study)
     root = root.resolve()
     folder = root / study.name
-    place = Place(root if study.shares_runs else folder, folder)
+    place = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         _open(study, place, resume=resume)
         study.carry_out(study.jobs, place.root, side_by_side, stop, say)
@@ -112,7 +112,7 @@ def _require(study: Study) -> None:
         make_strategy(config)
 
 
-def _open(study: Study, place: Place, *, resume: bool) -> None:
+def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
     """Write down what is about to be done; it may be more than what was begun, but not less."""
     file = place.folder / "study.json"
     if file.exists():

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import click
 
 from udrl_experiments.comparison import comparison
-from udrl_experiments.protocol import TASKS, Algorithm, Plan, Scale, parse_seeds, tasks
+from udrl_experiments.protocol import TASKS, Algorithm, Scale, StudyPlan, parse_seeds, tasks
 from udrl_experiments.search import search as make_search
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
@@ -73,7 +73,7 @@ def _algorithms(command: Command) -> Command:
 
 
 def _conduct(
-    make: Callable[[Plan], Study],
+    make: Callable[[StudyPlan], Study],
     *,
     scale: Scale,
     seeds: str | None,
@@ -84,7 +84,7 @@ def _conduct(
     resume: bool,
 ) -> int:
     log_to_stderr(logging.WARNING)
-    plan = Plan(
+    plan = StudyPlan(
         scale,
         None if seeds is None else parse_seeds(seeds),
         max_env_steps,

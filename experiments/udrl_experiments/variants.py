@@ -11,8 +11,8 @@ from udrl.config import flat
 from udrl.strategies import STRATEGIES
 from udrl_experiments.comparison import draw_curves, report_curves
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import Plan, Task
-from udrl_experiments.study import Place, Study
+from udrl_experiments.protocol import StudyPlan, Task
+from udrl_experiments.study import Study, StudyFolders
 
 #: Env steps of a run at the small scale.
 SMALL_STEPS = 1_000_000
@@ -20,20 +20,20 @@ SMALL_STEPS = 1_000_000
 LEADS = (0, 1, 2, 4, 8)
 
 
-def lead(plan: Plan, tasks: Sequence[Task]) -> Study:
+def lead(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
     """Return the study of what asynchrony costs: against env steps, and against wall time."""
     variants = {f"lead {n}": {"lead": n} for n in LEADS}
     return _variants("lead", plan, tasks, variants, wall_time=True)
 
 
-def segments(plan: Plan, tasks: Sequence[Task]) -> Study:
+def segments(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
     """Return the study of trailing segments against all, 0 <= t1 < t2 <= T (section 2.3.3)."""
     # A baseline's labels are of trailing segments only.
     variants = {name: {"segments": name, "baseline": "none"} for name in ("trailing", "all")}
     return _variants("segments", plan, tasks, variants)
 
 
-def commands(plan: Plan, tasks: Sequence[Task], strategies: Sequence[str]) -> Study:
+def commands(plan: StudyPlan, tasks: Sequence[Task], strategies: Sequence[str]) -> Study:
     """Return the study of strategies for exploratory commands (sections 2.3.4 and 6).
 
     Args:
@@ -48,7 +48,7 @@ def commands(plan: Plan, tasks: Sequence[Task], strategies: Sequence[str]) -> St
 
 def _variants(
     name: str,
-    plan: Plan,
+    plan: StudyPlan,
     tasks: Sequence[Task],
     variants: Mapping[str, Mapping[str, Any]],
     *,
@@ -70,7 +70,7 @@ def _variants(
         for task in tasks
     }
 
-    def report(place: Place) -> str:
+    def report(place: StudyFolders) -> str:
         said = []
         for task, runs in jobs.items():
             folder = place.folder if len(jobs) == 1 else place.folder / task.title

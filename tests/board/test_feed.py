@@ -12,8 +12,8 @@ from udrl.environments import EnvironmentSpec
 from udrl.errors import InvalidData, Unreachable
 from udrl.spaces import Vector
 from udrl_board.feed import FRESH_S, Feed
-from udrl_board.source import Place
-from udrl_inspect.obedience_report import Agreement, Obedience, Point
+from udrl_board.source import RunLocation
+from udrl_inspect.obedience_report import Agreement, ObediencePoint, ObedienceReport
 from udrl_proto.messages import Hello, Weights
 from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 
@@ -50,15 +50,15 @@ class CountingSource:
         self.queries: Counter[str] = Counter()
         self.is_gone = False
         self.is_doubtful = False
-        self.report: Obedience | InvalidData | None = None
+        self.report: ObedienceReport | InvalidData | None = None
 
     def _query(self, what: str) -> None:
         self.queries[what] += 1
         if self.is_gone:
             raise Unreachable("no reply")
 
-    def place(self) -> Place:
-        return Place("runs/mine", "tcp/127.0.0.1:7447")
+    def place(self) -> RunLocation:
+        return RunLocation("runs/mine", "tcp/127.0.0.1:7447")
 
     def doubt(self) -> str:
         return "out of date" if self.is_doubtful else ""
@@ -94,7 +94,7 @@ class CountingSource:
     def weights(self, version: object) -> Weights:
         raise AssertionError("a feed needs no weights")
 
-    def obedience(self) -> Obedience | None:
+    def obedience(self) -> ObedienceReport | None:
         if isinstance(self.report, InvalidData):
             raise self.report
         return self.report
@@ -183,7 +183,7 @@ def test_without_a_reply_the_page_keeps_what_it_has(
 
 
 def test_the_page_gets_the_place_and_doubts(feed: Feed, run: CountingSource, clock: Clock) -> None:
-    assert feed.news().place == Place("runs/mine", "tcp/127.0.0.1:7447")
+    assert feed.news().place == RunLocation("runs/mine", "tcp/127.0.0.1:7447")
     run.is_doubtful = True
     clock.now += FRESH_S
     news = feed.news(4, "run")
@@ -210,11 +210,11 @@ def test_a_run_restored_from_a_backup_is_sent_again(
     assert [i.iteration for i in news.iterations] == [0, 1, 2]
 
 
-def report(run_id: str = "run", *, obeys: bool) -> Obedience:
+def report(run_id: str = "run", *, obeys: bool) -> ObedienceReport:
     every = Agreement(low=0.0, high=4.0, mean_absolute_error=0.1, correlation=0.5)
-    numbers: dict[str, float] = dict.fromkeys(Point.__struct_fields__, 1)
-    points = [Point(**numbers | {"desired_return": r}) for r in (0.0, 4.0)]  # type: ignore[arg-type]
-    return Obedience(
+    numbers: dict[str, float] = dict.fromkeys(ObediencePoint.__struct_fields__, 1)
+    points = [ObediencePoint(**numbers | {"desired_return": r}) for r in (0.0, 4.0)]  # type: ignore[arg-type]
+    return ObedienceReport(
         run_id=run_id, environment="CartPole-v1", weights_version=3, temperature=1.0, episodes=1,
         reachable_low=0.0, reachable_high=4.0, tolerance=0.4, by_return=points, by_horizon=[],
         all_returns=every, obeyed=every if obeys else None, all_horizons=None,

@@ -24,7 +24,7 @@ from udrl.memory import FrameStack
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import complete, tuned
 from udrl_inspect.csv_tables import read
 
@@ -107,7 +107,7 @@ class Stopped(Exception):
 def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stop a run after its n-th evaluation, before its table is written."""
 
-    def write(path: Path, kind: type[Evaluated], rows: list[Evaluated]) -> None:
+    def write(path: Path, kind: type[EvaluationRecord], rows: list[EvaluationRecord]) -> None:
         if len(rows) == n:
             raise Stopped
 
@@ -130,7 +130,7 @@ def test_it_learns(
     rows = run(msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path)
     assert [row.env_steps for row in rows] == [steps // 2, steps]
     assert rows[-1].mean > 60  # acting at random: 22
-    assert rows == read(tmp_path / "evaluations.csv", Evaluated)
+    assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
     first = rows[0]
     assert (first.environment, first.algorithm, first.seed) == ("Balance-v0", algorithm, 1)
     assert first.episodes == 20
@@ -273,7 +273,7 @@ def test_stopped_and_resumed(
     monkeypatch.setattr(policies, "restore", restore)
     rows = run(make(algorithm), 600, tmp_path)
     assert [row.env_steps for row in rows] == [200, 400, 600]
-    assert rows == read(tmp_path / "evaluations.csv", Evaluated)
+    assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
     assert 0 < rows[0].wall_s < rows[1].wall_s < rows[2].wall_s
 
     (tensors,), (counters,) = restored, counted

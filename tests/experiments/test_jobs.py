@@ -13,7 +13,7 @@ from udrl.errors import Interrupted, InvalidData, RunFailed, RunInUse
 from udrl_experiments import jobs
 from udrl_experiments.job import carry_out as do
 from udrl_experiments.jobs import Job, carry_out, furthest, read_job
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import write
 
 CONFIG = build(Config, {"environment": "CartPole-v1", "eval_every": 100})
@@ -30,9 +30,11 @@ TABLE = (
 )
 
 
-def evaluated(env_steps: int) -> Evaluated:
-    return Evaluated(environment="CartPole-v1", algorithm="UDRL", variant="", seed=1,
-                     env_steps=env_steps, wall_s=1.0, mean=2.0, std=3.0, episodes=4)  # fmt: skip
+def evaluated(env_steps: int) -> EvaluationRecord:
+    return EvaluationRecord(
+        environment="CartPole-v1", algorithm="UDRL", variant="", seed=1,
+        env_steps=env_steps, wall_s=1.0, mean=2.0, std=3.0, episodes=4,
+    )  # fmt: skip
 
 
 def test_runs_of_equal_settings_are_one_run_as_far_as_anyone_asks() -> None:
@@ -58,7 +60,7 @@ def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
     one = job(300, "mine")
     one.folder(tmp_path).mkdir(parents=True)
     rows = [evaluated(n) for n in (105, 203, 310, 400, 950)]
-    write(one.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
+    write(one.folder(tmp_path) / "evaluations.csv", EvaluationRecord, rows)
     found = one.evaluations(tmp_path)
     assert [(row.env_steps, row.variant) for row in found] == [
         (105, "mine"),
@@ -77,7 +79,7 @@ def test_done_is_done_as_far_as_asked(tmp_path: Path, text: str, *, done: bool) 
     folder.mkdir(parents=True)
     (folder / "done.json").write_text(text, encoding="utf-8")
     assert not job().done(tmp_path), "it has no evaluations"
-    write(folder / "evaluations.csv", Evaluated, [evaluated(105)])
+    write(folder / "evaluations.csv", EvaluationRecord, [evaluated(105)])
     assert job().done(tmp_path) is done
 
 

@@ -2,7 +2,7 @@ import pytest
 
 from udrl.config import flat, preset
 from udrl.errors import ConfigError
-from udrl_experiments.protocol import TASKS, Plan, parse_seeds, tasks
+from udrl_experiments.protocol import TASKS, StudyPlan, parse_seeds, tasks
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ def test_other_seeds_are_refused(text: str) -> None:
 
 
 def test_the_papers_scale_is_the_papers() -> None:
-    plan = Plan("paper")
+    plan = StudyPlan("paper")
     assert plan.seeds_of_runs() == tuple(range(1, 21))
     assert {plan.steps(task, "DQN") for task in TASKS.values()} == {10_000_000}
     assert {plan.config(task, 1).evaluation.eval_every for task in TASKS.values()} == {50_000}
@@ -28,7 +28,7 @@ def test_the_papers_scale_is_the_papers() -> None:
 
 
 def test_what_is_given_wins_over_the_scale() -> None:
-    plan = Plan("paper", (4, 5), 1000, ("batch_size=64", "eval_every=77"))
+    plan = StudyPlan("paper", (4, 5), 1000, ("batch_size=64", "eval_every=77"))
     assert plan.seeds_of_runs() == (4, 5)
     assert plan.steps(TASKS["lander"]) == 1000
     config = plan.config(TASKS["lander"], 5, lead=3)
@@ -38,7 +38,7 @@ def test_what_is_given_wins_over_the_scale() -> None:
 
 def test_a_config_is_the_preset_but_for_the_protocol() -> None:
     for task in TASKS.values():
-        config = Plan().config(task, 2)
+        config = StudyPlan().config(task, 2)
         expected = preset(task.environment) | {"eval_every": 50_000, "seed": 2}
         del expected["max_env_steps"]
         assert flat(config).items() >= expected.items()
@@ -46,7 +46,7 @@ def test_a_config_is_the_preset_but_for_the_protocol() -> None:
 
 def test_an_unknown_setting_is_refused() -> None:
     with pytest.raises(ConfigError, match="bach_size"):
-        Plan(assignments=("bach_size=3",)).config(TASKS["lander"], 1)
+        StudyPlan(assignments=("bach_size=3",)).config(TASKS["lander"], 1)
 
 
 def test_tasks_by_name() -> None:
@@ -58,12 +58,14 @@ def test_tasks_by_name() -> None:
 @pytest.mark.parametrize("name", ["lead", "seed", "environment"])
 def test_what_a_study_sets_itself_cannot_be_set(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
-        Plan(assignments=(f"{name}=1",)).config(TASKS["lander"], 1, lead=2)
+        StudyPlan(assignments=(f"{name}=1",)).config(TASKS["lander"], 1, lead=2)
 
 
 def test_a_baseline_is_the_same_whatever_udrl_does() -> None:
-    usual = Plan().baseline(TASKS["lander"], 3)
-    other = Plan(assignments=("last_few=7", "lead=3", "command_strategy=record", "batch_size=9"))
+    usual = StudyPlan().baseline(TASKS["lander"], 3)
+    other = StudyPlan(
+        assignments=("last_few=7", "lead=3", "command_strategy=record", "batch_size=9")
+    )
     assert other.baseline(TASKS["lander"], 3) == usual
-    shared = Plan(assignments=("hidden=[8]",)).baseline(TASKS["lander"], 3)
+    shared = StudyPlan(assignments=("hidden=[8]",)).baseline(TASKS["lander"], 3)
     assert (shared.network.hidden, shared.seed, shared.environment) == ((8,), 3, "LunarLander-v3")

@@ -10,10 +10,10 @@ import pytest
 
 from udrl.config import Config, build, preset
 from udrl.errors import ConfigError
-from udrl_experiments.protocol import TASKS, Algorithm, Plan
-from udrl_experiments.records import Evaluated
+from udrl_experiments.protocol import TASKS, Algorithm, StudyPlan
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.search import Scored, draw, search, space
-from udrl_experiments.study import Place
+from udrl_experiments.study import StudyFolders
 from udrl_inspect.csv_tables import read, write
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
@@ -61,7 +61,7 @@ def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -
 
 
 def test_the_papers_scale_is_the_papers() -> None:
-    study = search(Plan("paper"), list(TASKS.values()), ["UDRL"])
+    study = search(StudyPlan("paper"), list(TASKS.values()), ["UDRL"])
     runs = [job.config.environment for job in study.jobs]
     assert [runs.count(name) for name in ENVIRONMENTS] == [256 * 3, 256, 72]
     assert {job.config.evaluation.eval_seeds for job in study.jobs} == {"search"}
@@ -69,7 +69,7 @@ def test_the_papers_scale_is_the_papers() -> None:
 
 
 def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
-    (job,) = search(Plan(), [TASKS["lander"]], ["UDRL"], 1).jobs
+    (job,) = search(StudyPlan(), [TASKS["lander"]], ["UDRL"], 1).jobs
     buffer = job.config.buffer
     assert (buffer.max_age, buffer.recent_size, job.config.lead) == (None, 0, 0)
     drawn = draw("LunarLander-v3", "UDRL", 0)
@@ -78,7 +78,7 @@ def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
 
 
 def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
-    plan = Plan(seeds=(1, 2), assignments=("eval_every=10",))
+    plan = StudyPlan(seeds=(1, 2), assignments=("eval_every=10",))
     study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN", "DQN"], 4)
     scores = dict[tuple[str, int], list[float]]()
     for index, job in enumerate(study.jobs):
@@ -89,15 +89,16 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
         scores.setdefault((job.algorithm, number), []).append(fmean(means[5:]))
         job.folder(tmp_path).mkdir(parents=True)
         rows = [
-            Evaluated(environment="LunarLanderSparse-v3", algorithm=job.algorithm, variant="",
-                      seed=job.config.seed, env_steps=10 * n, wall_s=0.0, mean=mean, std=0.0,
-                      episodes=1)
+            EvaluationRecord(
+                environment="LunarLanderSparse-v3", algorithm=job.algorithm, variant="",
+                seed=job.config.seed, env_steps=10 * n, wall_s=0.0, mean=mean, std=0.0, episodes=1,
+            )
             for n, mean in enumerate(means)
         ]  # fmt: skip
-        write(job.folder(tmp_path) / "evaluations.csv", Evaluated, rows)
+        write(job.folder(tmp_path) / "evaluations.csv", EvaluationRecord, rows)
         done = json.dumps({"max_env_steps": job.max_env_steps})
         (job.folder(tmp_path) / "done.json").write_text(done)
-    place = Place(tmp_path, tmp_path / "search")
+    place = StudyFolders(tmp_path, tmp_path / "search")
     place.folder.mkdir()
     said = study.report(place)
 
@@ -116,12 +117,12 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
 @pytest.mark.parametrize("name", ["batch_size", "eval_seeds", "hidden", "seed", "environment"])
 def test_what_a_search_draws_cannot_be_set(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
-        search(Plan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
+        search(StudyPlan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
 
 
 def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
-    study = search(Plan(), [TASKS["lander"]], ["A2C"], 2)
+    study = search(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()
-    said = study.report(Place(tmp_path, tmp_path / "search"))
+    said = study.report(StudyFolders(tmp_path, tmp_path / "search"))
     assert "no configuration got to its end" in said
     assert not list((tmp_path / "search").glob("*.toml"))

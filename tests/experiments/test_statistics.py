@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from udrl.errors import ConfigError
 from udrl.streams import Purpose, Stream, stream_key
-from udrl_experiments.records import Evaluated
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.statistics import (
     CurvePoint,
     Reached,
@@ -35,8 +35,8 @@ def evaluated(
     algorithm: str = "UDRL",
     variant: str = "",
     wall_s: float = 0.0,
-) -> Evaluated:
-    return Evaluated(
+) -> EvaluationRecord:
+    return EvaluationRecord(
         environment="LunarLander-v3", algorithm=algorithm, variant=variant, seed=seed,
         env_steps=env_steps, wall_s=wall_s, mean=mean, std=1.0, episodes=100,
     )  # fmt: skip
@@ -166,7 +166,7 @@ ROWS = st.lists(
 )
 
 
-def slow_curves(rows: Sequence[Evaluated], every: int) -> Iterator[CurvePoint]:
+def slow_curves(rows: Sequence[EvaluationRecord], every: int) -> Iterator[CurvePoint]:
     agents = []
     for row in rows:
         if (row.algorithm, row.variant) not in agents:
@@ -192,7 +192,7 @@ def slow_curves(rows: Sequence[Evaluated], every: int) -> Iterator[CurvePoint]:
 
 
 @given(ROWS, st.integers(1, 20))
-def test_curves_are_those_of_a_slow_search(rows: list[Evaluated], every: int) -> None:
+def test_curves_are_those_of_a_slow_search(rows: list[EvaluationRecord], every: int) -> None:
     assert curves(rows, every) == list(slow_curves(rows, every))
 
 
@@ -239,7 +239,9 @@ def test_an_interval_that_is_not_positive_is_an_error(every: int) -> None:
 # Thresholds.
 
 
-def slow_reached(rows: Sequence[Evaluated], thresholds: Sequence[float]) -> Iterator[Reached]:
+def slow_reached(
+    rows: Sequence[EvaluationRecord], thresholds: Sequence[float]
+) -> Iterator[Reached]:
     runs = []
     for row in rows:
         if (row.algorithm, row.variant, row.seed) not in runs:
@@ -261,7 +263,7 @@ def slow_reached(rows: Sequence[Evaluated], thresholds: Sequence[float]) -> Iter
 
 @given(ROWS, st.lists(st.floats(-1e3, 1e3), max_size=3))
 def test_reached_is_what_a_slow_search_finds(
-    rows: list[Evaluated], thresholds: list[float]
+    rows: list[EvaluationRecord], thresholds: list[float]
 ) -> None:
     assert reached(rows, thresholds) == list(slow_reached(rows, thresholds))
 

@@ -14,7 +14,7 @@ from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import provenance
-from udrl_experiments.study import Place, Study, conduct
+from udrl_experiments.study import Study, StudyFolders, conduct
 
 
 def job(seed: int, max_env_steps: int = 100) -> Job:
@@ -28,9 +28,9 @@ class World:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.done: list[Job] = []
-        self.reported: list[Place] = []
+        self.reported: list[StudyFolders] = []
 
-    def report(self, place: Place) -> str:
+    def report(self, place: StudyFolders) -> str:
         self.reported.append(place)
         return "all is well"
 
@@ -51,7 +51,7 @@ def world(tmp_path: Path) -> World:
 def test_runs_first_and_then_the_report(world: World) -> None:
     world.conduct(job(1), job(2))
     assert world.done == [job(1), job(2)]
-    assert world.reported == [Place(world.root, world.root / "try")]
+    assert world.reported == [StudyFolders(world.root, world.root / "try")]
     assert world.said == "all is well"
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udrl.errors import InvalidData
-from udrl_experiments.records import Evaluated, Obtained
+from udrl_experiments.records import EvaluationRecord, Obtained
 from udrl_experiments.statistics import Reached
 from udrl_inspect.csv_tables import read, write
 
@@ -36,7 +36,7 @@ def test_what_is_no_table_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rows.csv"
     path.write_text(text + "environment\nx\n", encoding="latin-1")
     with pytest.raises(InvalidData, match=r"rows\.csv: .*delete it"):
-        read(path, Evaluated)
+        read(path, EvaluationRecord)
 
 
 def test_a_missing_table_is_told(tmp_path: Path) -> None:

@@ -11,14 +11,23 @@ import pytest
 
 from udrl.errors import ConfigError, InvalidData, StoreError
 from udrl_inspect import csv_tables
-from udrl_inspect.obedience_report import FILE, Agreement, Obedience, Point, keep, kept
+from udrl_inspect.obedience_report import (
+    FILE,
+    Agreement,
+    ObediencePoint,
+    ObedienceReport,
+    keep,
+    kept,
+)
 from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
 from udrl_launch.subcommands.options import RETURNS
 from udrl_show.obedience_picture import draw
 
 
-def point(desired_return: float, desired_horizon: int, mean: float, length: float = 50) -> Point:
-    return Point(
+def point(
+    desired_return: float, desired_horizon: int, mean: float, length: float = 50
+) -> ObediencePoint:
+    return ObediencePoint(
         desired_return=desired_return, desired_horizon=desired_horizon, episodes=10,
         return_mean=mean, return_std=3.0, return_ci95_low=mean - 2, return_ci95_high=mean + 2,
         length_mean=length, length_std=1.0, length_ci95_low=length - 1, length_ci95_high=length + 1,
@@ -30,10 +39,10 @@ def report(
     obeyed: tuple[float, float] | None = None,
     correlation: float = 0.5,
     tolerance: float = 20.0,
-) -> Obedience:
+) -> ObedienceReport:
     commanded = [-20.0, 30.0, 80.0, 130.0]
     agree = {"mean_absolute_error": 7.25, "correlation": correlation}
-    return Obedience(
+    return ObedienceReport(
         run_id="run", environment="Some-v0", weights_version=7, temperature=1.0, episodes=10,
         reachable_low=-20.0, reachable_high=180.0, tolerance=tolerance,
         by_return=[point(r, 40 + i, obtained(r)) for i, r in enumerate(commanded)],
@@ -127,7 +136,7 @@ def test_the_csv_file_has_every_point(tmp_path: Path) -> None:
         found = list(csv.DictReader(file))
     assert [row["sweep"] for row in found] == ["return"] * 4 + ["horizon"] * 2
     assert [row["obeyed"] for row in found] == ["False", "True", "True", "False"] + ["False"] * 2
-    shared = [f.name for f in msgspec.structs.fields(Point)]
+    shared = [f.name for f in msgspec.structs.fields(ObediencePoint)]
     for row, measured in zip(found, told.by_return + told.by_horizon, strict=True):
         assert [float(row[name]) for name in shared] == list(msgspec.structs.astuple(measured))
 

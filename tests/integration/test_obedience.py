@@ -15,7 +15,7 @@ from udrl.config import Budget, Config, build, change
 from udrl.errors import ConfigError, UdrlError
 from udrl.replay import ReplayBuffer
 from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
-from udrl_inspect.obedience_report import Obedience, keep, kept, measure, plan_commands
+from udrl_inspect.obedience_report import ObedienceReport, keep, kept, measure, plan_commands
 from udrl_inspect.obedience_text import answer, markdown
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
@@ -71,7 +71,7 @@ def test_one_document_and_the_same_each_time(run_dir: Path) -> None:
     report = kept(run_dir)
     assert report is not None
     assert document.pop("answer") == answer(report)
-    assert msgspec.convert(document, Obedience) == report
+    assert msgspec.convert(document, ObedienceReport) == report
     agent = load_agent(run_dir)
     assert (report.run_id, report.weights_version) == (agent.run_id, agent.version)
     with (run_dir / "obedience.csv").open(newline="") as file:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.replay.synthetic import create, reopen
 from udrl.config import Budget
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 
 @pytest.fixture
@@ -19,24 +19,24 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.fixture
-def make_run(stack: ExitStack, tmp_path: Path) -> Callable[..., Run]:
+def make_run(stack: ExitStack, tmp_path: Path) -> Callable[..., StoredRun]:
     """Makes a new run in ``tmp_path``."""
 
     def make(
         lead: int = 0, max_env_steps: int = 1_000_000, stop_return: float | None = None
-    ) -> Run:
+    ) -> StoredRun:
         store = create(tmp_path, lead)
         stack.callback(store.close)
-        return Run(store, Budget(max_env_steps=max_env_steps, stop_return=stop_return))
+        return StoredRun(store, Budget(max_env_steps=max_env_steps, stop_return=stop_return))
 
     return make
 
 
 @pytest.fixture
-def reopened(stack: ExitStack, tmp_path: Path) -> Callable[..., Run]:
+def reopened(stack: ExitStack, tmp_path: Path) -> Callable[..., StoredRun]:
     """Ends a run's process and starts another."""
 
-    def start(run: Run, budget: Budget | None = None) -> Run:
+    def start(run: StoredRun, budget: Budget | None = None) -> StoredRun:
         again = reopen(run, tmp_path, budget)
         stack.callback(again.store.close)
         return again

@@ -28,8 +28,8 @@ from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
 from udrl_replay.arrival import Arrival, inspect
-from udrl_replay.progress import Progress
-from udrl_replay.run import Run
+from udrl_replay.progress import RunProgress
+from udrl_replay.run import StoredRun
 from udrl_replay.standing import Standing
 from udrl_replay.store import Store, Version
 
@@ -73,7 +73,7 @@ def hello(lead: int = 0) -> Hello:
 
 def create(run_dir: Path, lead: int = 0) -> Store:
     """Make a new run's file."""
-    return Store.create(run_dir, hello=hello(lead), progress=Progress())
+    return Store.create(run_dir, hello=hello(lead), progress=RunProgress())
 
 
 def join(name: str, environments: int = 4) -> JoinRequest:
@@ -189,7 +189,7 @@ def result(run: Standing) -> Result:
     )
 
 
-def train_next(run: Run) -> Version:
+def train_next(run: StoredRun) -> Version:
     """Do a learner's work: return the version that the run waits for."""
     number = run.progress.latest_version + 1
     before = run.store.version(number - 1)
@@ -197,7 +197,7 @@ def train_next(run: Run) -> Version:
     return trained(number, before.weights if before else b"", (p.digest for p in buffer))
 
 
-def weights_of(run: Run, command: Command) -> bytes:
+def weights_of(run: StoredRun, command: Command) -> bytes:
     """Return the weights that a command names, which the run must have."""
     if command.weights_version == 0:
         return b""
@@ -207,7 +207,7 @@ def weights_of(run: Run, command: Command) -> bytes:
     return version.weights
 
 
-def work(run: Run) -> None:
+def work(run: StoredRun) -> None:
     """Deliver a version if one is awaited, and an episode for each command that can be obeyed."""
     with run.store.transaction():
         if run.awaits_version() is not None:
@@ -220,16 +220,16 @@ def work(run: Run) -> None:
         run.save()
 
 
-def finish(run: Run) -> None:
+def finish(run: StoredRun) -> None:
     """Work until the run has ended."""
     while run.progress.state in ("running", "closing"):
         work(run)
 
 
-def reopen(run: Run, run_dir: Path, budget: Budget | None = None) -> Run:
+def reopen(run: StoredRun, run_dir: Path, budget: Budget | None = None) -> StoredRun:
     """End a replay service and start another on the same file."""
     run.store.close()
-    return Run(Store(run_dir), budget or run.budget)
+    return StoredRun(Store(run_dir), budget or run.budget)
 
 
 def edit(path: Path, statement: str, *values: object) -> None:

@@ -10,9 +10,9 @@ from udrl.errors import Refused
 from udrl_proto.messages import Hello, JoinRequest, Role
 from udrl_replay import admission
 from udrl_replay.admission import Admission
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 
 
 def request(role: Role, name: str, numerics_class: str = "c") -> JoinRequest:

@@ -12,7 +12,7 @@ from udrl_launch.training_run import Adviser
 from udrl_proto.reports import IterationStatus
 from udrl_replay.advice import advice, cause
 from udrl_replay.reporting import Throughput, Waits, status
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 WARM_UP = IterationStatus(
     iteration=0, commands=50, env_steps=5000, eval_env_steps=0, wall_s=1.0, weights_version=0,
@@ -23,14 +23,14 @@ NETWORK = NetworkSettings(return_scale=0.05, horizon_scale=0.01)
 
 
 @pytest.fixture
-def run(make_run: Callable[..., Run]) -> Run:
+def run(make_run: Callable[..., StoredRun]) -> StoredRun:
     made = make_run(max_env_steps=60)
     finish(made)
     made.progress.best_mean = -1.0  # its returns are 0 and more
     return made
 
 
-def test_a_run_that_does_not_learn_says_so_after_a_third_of_its_budget(run: Run) -> None:
+def test_a_run_that_does_not_learn_says_so_after_a_third_of_its_budget(run: StoredRun) -> None:
     said = advice(run)
     assert said.startswith(
         "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
@@ -42,7 +42,7 @@ def test_a_run_that_does_not_learn_says_so_after_a_third_of_its_budget(run: Run)
 
 
 @pytest.mark.parametrize("best", [None, 100.0])
-def test_there_is_no_advice_without_need(run: Run, best: float | None) -> None:
+def test_there_is_no_advice_without_need(run: StoredRun, best: float | None) -> None:
     run.progress.best_mean = best
     assert advice(run) == ""
 
@@ -73,7 +73,7 @@ def test_the_most_likely_cause(
     assert found.startswith(expected)
 
 
-def test_the_terminal_is_told_once(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_terminal_is_told_once(run: StoredRun, caplog: pytest.LogCaptureFixture) -> None:
     adviser = Adviser()
     for _ in range(3):
         adviser.show(status(run, Throughput(), Waits(), 0.0, 0.0))

@@ -22,7 +22,7 @@ from udrl.errors import Deceived, Refused
 from udrl_proto.messages import CommandsRequest
 from udrl_replay.auditing import MOST_OPEN, Auditor, Verdict
 from udrl_replay.quarantine import OFFENCES
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
 
@@ -107,19 +107,19 @@ def test_open_audits_are_bounded() -> None:
 # In a run.
 
 
-def deliver(run: Run, name: str, made: Command, *, lies: bool = False) -> str:
+def deliver(run: StoredRun, name: str, made: Command, *, lies: bool = False) -> str:
     with run.store.transaction():
         reply = run.accept(arrive(episode(made, weights_of(run, made), lies), name), 0.0)
         run.save()
     return reply
 
 
-def ask(run: Run, name: str, wanted: int = 1) -> list[Command]:
+def ask(run: StoredRun, name: str, wanted: int = 1) -> list[Command]:
     return run.deal(CommandsRequest(actor=name, wanted=wanted), 0.0)
 
 
 @pytest.fixture
-def audited_run(make_run: Callable[..., Run]) -> Run:
+def audited_run(make_run: Callable[..., StoredRun]) -> StoredRun:
     run = make_run()
     run.auditor = Auditor(1.0)
     for name in "abc":
@@ -127,7 +127,9 @@ def audited_run(make_run: Callable[..., Run]) -> Run:
     return run
 
 
-def test_audit_changes_no_result(audited_run: Run, make_run: Callable[..., Run]) -> None:
+def test_audit_changes_no_result(
+    audited_run: StoredRun, make_run: Callable[..., StoredRun]
+) -> None:
     run = audited_run
     run.budget = Budget(max_env_steps=40)
     while run.progress.state != "ended":
@@ -144,7 +146,7 @@ def test_audit_changes_no_result(audited_run: Run, make_run: Callable[..., Run])
     assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
 
 
-def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: Run, tmp_path: Path) -> None:
+def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: StoredRun, tmp_path: Path) -> None:
     run = audited_run
     (made,) = ask(run, "a")
     assert deliver(run, "a", made, lies=True) == "accepted"
@@ -157,12 +159,12 @@ def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: Run, tmp_path: Pat
     assert set(run.quarantined.reasons) == {"a"}
     run.store.close()
     with closing(Store(tmp_path)) as store, pytest.raises(Deceived, match="actor a lied"):
-        Run(store, run.budget)
+        StoredRun(store, run.budget)
     assert Deceived.exit_code == 10
 
 
 def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
-    audited_run: Run, reopened: Callable[..., Run]
+    audited_run: StoredRun, reopened: Callable[..., StoredRun]
 ) -> None:
     run = audited_run
     (made,) = ask(run, "a")
@@ -182,7 +184,7 @@ def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
 
 
 def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
-    make_run: Callable[..., Run], reopened: Callable[..., Run]
+    make_run: Callable[..., StoredRun], reopened: Callable[..., StoredRun]
 ) -> None:
     run = make_run()
     run.dealer.join(join("b"), 0.0)
@@ -202,7 +204,7 @@ def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
     assert "actor b lied" in run.progress.problem
 
 
-def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: Run) -> None:
+def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: StoredRun) -> None:
     run = audited_run
     (made,) = ask(run, "a")
     for name, weights in zip("abc", (b"1", b"2", b"3"), strict=True):
@@ -216,7 +218,7 @@ def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: Run)
     assert run.auditor.rate == 0
 
 
-def test_repeated_offender_is_quarantined(make_run: Callable[..., Run]) -> None:
+def test_repeated_offender_is_quarantined(make_run: Callable[..., StoredRun]) -> None:
     run = make_run()
     work(run)  # the warm-up
     with run.store.transaction():

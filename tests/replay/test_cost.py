@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from tests.replay.synthetic import work
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 #: Tables whose size the settings bound; the others keep a row of every iteration for good.
 BOUNDED = {"facts", "commands", "episodes", "bodies", "CONSTANT"}
@@ -11,7 +11,7 @@ BOUNDED = {"facts", "commands", "episodes", "bodies", "CONSTANT"}
 SMALL = ("weights_kept", "optimizers_kept")
 
 
-def test_no_statement_reads_a_whole_table_that_grows(make_run: Callable[..., Run]) -> None:
+def test_no_statement_reads_a_whole_table_that_grows(make_run: Callable[..., StoredRun]) -> None:
     run = make_run(lead=1)
     for _ in range(5):
         work(run)

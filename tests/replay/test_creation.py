@@ -22,7 +22,7 @@ from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.messages import Hello
 from udrl_replay import creation
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.resuming import resume
 from udrl_replay.store import Store
 
@@ -50,7 +50,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
         environment_digest=environment_digest(EpisodeGenerator(TOY, 1)),
         graph=acting_graph(TOY.network, hello.environment),
     )
-    assert created.fact("progress", Progress) == Progress()
+    assert created.fact("progress", RunProgress) == RunProgress()
 
 
 def test_environment_that_does_not_replay_marks_the_run(
@@ -58,7 +58,7 @@ def test_environment_that_does_not_replay_marks_the_run(
 ) -> None:
     monkeypatch.setattr(creation, "repeated_digest", lambda generator: "")
     with closing(creation.create(tmp_path, TOY)) as store:
-        progress = store.fact("progress", Progress)
+        progress = store.fact("progress", RunProgress)
         assert not progress.exact
         hello = store.fact("hello", Hello)
         assert not hello.exact

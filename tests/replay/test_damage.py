@@ -19,7 +19,7 @@ from udrl.config import Budget
 from udrl.errors import DamagedStore, OtherConfiguration
 from udrl_proto.codec import LARGEST
 from udrl_replay.database import FILE
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.schema import SEALED, seal
 from udrl_replay.store import Store, Version
 
@@ -30,7 +30,7 @@ TABLES_THERE = [*SEALED, "bodies"]
 def written(tmp_path: Path) -> Path:
     """The closed file of a run that has ended, with episodes and weights of several pages."""
     with closing(create(tmp_path)) as store:
-        finish(Run(store, Budget(max_env_steps=60)))
+        finish(StoredRun(store, Budget(max_env_steps=60)))
         with store.transaction():
             store.add_version(Version(1000, b"digest", 0.5, BLOB, BLOB), 0.1)
             store.add_episode(store.buffer(1000)[0].entry._replace(id=10**9), b"digest", BLOB)
@@ -41,7 +41,7 @@ def written(tmp_path: Path) -> Path:
 def unfinished(tmp_path: Path) -> Path:
     """The closed file of a run that goes on, with rows in all tables."""
     with closing(create(tmp_path, lead=1)) as store:
-        run = Run(store, Budget(max_env_steps=1000))
+        run = StoredRun(store, Budget(max_env_steps=1000))
         for _ in range(8):
             work(run)
     return tmp_path / FILE
@@ -50,7 +50,7 @@ def unfinished(tmp_path: Path) -> Path:
 def read_everything(run_dir: Path) -> object:
     """Return all that a service can ask a store for."""
     with closing(Store(run_dir)) as store:
-        run = Run(store, Budget(max_env_steps=60))
+        run = StoredRun(store, Budget(max_env_steps=60))
         ids = [*(e.id for e in run.buffer), 10**9]
         return (
             run.progress,
@@ -216,7 +216,7 @@ def test_table_that_is_as_it_was_before_is_noticed(tmp_path: Path) -> None:
     """All its rows were written once, and as many."""
 
     def work_on(store: Store) -> None:
-        run = Run(store, Budget(max_env_steps=1000))
+        run = StoredRun(store, Budget(max_env_steps=1000))
         work(run)
         while len(run.open_commands()) != 3:
             work(run)
@@ -262,7 +262,7 @@ def test_file_that_is_cut_anywhere_is_told(written: Path) -> None:
 def test_damaged_journal_costs_work_and_changes_nothing(tmp_path: Path) -> None:
     chance = random.Random(3)
     with closing(create(tmp_path / "whole")) as store:
-        run = Run(store, Budget(max_env_steps=60))
+        run = StoredRun(store, Budget(max_env_steps=60))
         for _ in range(5):
             work(run)
         for number in range(20):  # what a power cut leaves: the file and its journal
@@ -277,7 +277,7 @@ def test_damaged_journal_costs_work_and_changes_nothing(tmp_path: Path) -> None:
             held[chance.randrange(len(held))] ^= 1 << chance.randrange(8)
         journal.write_bytes(held)
         with closing(Store(tmp_path / f"cut{number}")) as store:
-            run = Run(store, Budget(max_env_steps=60))
+            run = StoredRun(store, Budget(max_env_steps=60))
             finish(run)
             assert result(run) == reference(0, 60)
 
@@ -287,10 +287,10 @@ import sys
 from pathlib import Path
 from tests.replay.synthetic import work
 from udrl.config import Budget
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
-run = Run(Store(Path(sys.argv[1])), Budget(max_env_steps=3000))
+run = StoredRun(Store(Path(sys.argv[1])), Budget(max_env_steps=3000))
 while run.progress.state in ("running", "closing"):
     work(run)
     print(run.progress.accepted, flush=True)
@@ -316,12 +316,12 @@ def test_writer_that_is_killed_at_any_moment_loses_nothing_acknowledged(tmp_path
             lines = [first, *writer.stdout]
         acknowledged = int([line for line in lines if line.endswith("\n")][-1])
         with closing(Store(tmp_path)) as store:
-            run = Run(store, Budget(max_env_steps=3000))
+            run = StoredRun(store, Budget(max_env_steps=3000))
             assert run.progress.accepted >= acknowledged
             assert run.progress.issued == run.progress.accepted + len(run.dealer.outstanding)
             assert run.progress.state == "running"
     with closing(Store(tmp_path)) as store:
-        run = Run(store, Budget(max_env_steps=3000))
+        run = StoredRun(store, Budget(max_env_steps=3000))
         finish(run)
         assert result(run) == reference(0, 3000)
     assert acknowledged

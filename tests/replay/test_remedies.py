@@ -12,7 +12,7 @@ from udrl.config import Budget
 from udrl.errors import StoreError
 from udrl_replay.remedies import unwritable
 from udrl_replay.reporting import MetricsFile
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
 MORE_FILES = "raise the limit of open files, e.g. ulimit -n 4096"
@@ -54,7 +54,7 @@ def test_service_that_runs_needs_no_more_files(tmp_path: Path) -> None:
         closing(MetricsFile(tmp_path, store)) as metrics,
         no_more_files(),
     ):
-        run = Run(store, Budget(max_env_steps=300))
+        run = StoredRun(store, Budget(max_env_steps=300))
         while run.progress.state in ("running", "closing"):
             work(run)
             metrics.update(run.progress.iteration)

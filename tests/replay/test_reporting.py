@@ -24,13 +24,13 @@ from udrl_replay.reporting import (
     history,
     status,
 )
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import COLUMNS
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 
 
-def shown(run: Run, now: float = 0.0) -> Status:
+def shown(run: StoredRun, now: float = 0.0) -> Status:
     return status(run, Throughput(), Waits(), 0.0, now)
 
 
@@ -174,7 +174,7 @@ def lines(run_dir: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def write_metrics(run: Run, run_dir: Path) -> None:
+def write_metrics(run: StoredRun, run_dir: Path) -> None:
     with closing(MetricsFile(run_dir, run.store)) as metrics:
         metrics.update(run.progress.iteration)
 

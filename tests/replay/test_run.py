@@ -41,9 +41,9 @@ from udrl_inspect.inspection import read_status
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import Status
 from udrl_replay.arrival import Arrival
-from udrl_replay.progress import KILLED, STOPPED, Progress
+from udrl_replay.progress import KILLED, STOPPED, RunProgress
 from udrl_replay.reporting import Throughput, Waits, status
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.standing import Standing
 from udrl_replay.store import Store, Version
 
@@ -65,7 +65,7 @@ class RunMachine(RuleBasedStateMachine):
         self.lead = lead
         self.folder = tempfile.TemporaryDirectory(dir=MEMORY)
         self.run_dir = Path(self.folder.name)
-        self.run = Run(create(self.run_dir, lead), Budget(max_env_steps=max_env_steps))
+        self.run = StoredRun(create(self.run_dir, lead), Budget(max_env_steps=max_env_steps))
         self.now = 0.0
         self.held: dict[tuple[str, int], tuple[Command, bytes]] = {}
         self.accepted: dict[int, tuple[Command, bytes]] = {}
@@ -272,7 +272,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def everything_is_on_disk(self) -> None:
-        assert self.run.store.fact("progress", Progress) == self.run.progress
+        assert self.run.store.fact("progress", RunProgress) == self.run.progress
 
     @invariant()
     def every_episode_has_its_body(self) -> None:
@@ -332,14 +332,14 @@ def assert_conserved(shown: Status) -> None:
 
 # The same, one thing at a time.
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 
 
-def outstanding(run: Run) -> list[Command]:
+def outstanding(run: StoredRun) -> list[Command]:
     return [item.command for item in run.dealer.outstanding.values()]
 
 
-def deliver(run: Run, command: Command, other: bool = False) -> str:
+def deliver(run: StoredRun, command: Command, other: bool = False) -> str:
     with run.store.transaction():
         try:
             return run.accept(arrive(episode(command, weights_of(run, command), other)), 0.0)
@@ -347,7 +347,7 @@ def deliver(run: Run, command: Command, other: bool = False) -> str:
             run.save()
 
 
-def until_closing(run: Run) -> None:
+def until_closing(run: StoredRun) -> None:
     """Work until only the closing evaluation is left."""
     while run.progress.state == "running":
         work(run)
@@ -356,7 +356,7 @@ def until_closing(run: Run) -> None:
             run.add_version(train_next(run), 0.0)
 
 
-def fail(run: Run, command_id: int, *actors: str) -> None:
+def fail(run: StoredRun, command_id: int, *actors: str) -> None:
     """Let actors get a command and fail on it, one after the other."""
     for name in actors:
         run.dealer.join(join(name), 0.0)
@@ -595,7 +595,7 @@ def test_failed_closing_evaluation_is_tried_again(make_run: MakeRun, reopened: M
     assert result(run) == reference(0, 20)
 
 
-def vanish(run: Run, *actors: str) -> set[int]:
+def vanish(run: StoredRun, *actors: str) -> set[int]:
     """Let actors get commands and vanish, one after the other; return what the last one held."""
     for name in actors:
         run.dealer.join(join(name), 0.0)

@@ -13,7 +13,7 @@ from udrl.errors import DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl.evaluation import summarise
 from udrl_proto.codec import LARGEST
 from udrl_replay.database import FILE
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.schema import SCHEMA
 from udrl_replay.store import EvaluationRow, Store, Version
 
@@ -160,13 +160,13 @@ def test_full_disk_is_reported_and_nothing_is_half_written(store: Store) -> None
 
 def test_run_goes_on_after_a_full_disk_as_if_it_had_not_been_full(tmp_path: Path) -> None:
     with closing(create(tmp_path)) as store:
-        run = Run(store, Budget(max_env_steps=600))
+        run = StoredRun(store, Budget(max_env_steps=600))
         work(run)
         limit_size(store, 0)
         with pytest.raises(StoreError, match="disk is full"):
             finish(run)
     with closing(Store(tmp_path)) as store:
-        run = Run(store, Budget(max_env_steps=600))
+        run = StoredRun(store, Budget(max_env_steps=600))
         finish(run)
         assert result(run) == reference(0, 600)
 
@@ -175,7 +175,7 @@ def test_run_goes_on_after_a_full_disk_as_if_it_had_not_been_full(tmp_path: Path
 
 
 def test_page_of_episodes_is_bounded_but_never_empty(store: Store, tmp_path: Path) -> None:
-    run = Run(store, Budget(max_env_steps=1000))
+    run = StoredRun(store, Budget(max_env_steps=1000))
     work(run)
     ids = [e.id for e in run.buffer]
     bodies = store.episode_bodies(ids, LARGEST)
@@ -185,7 +185,7 @@ def test_page_of_episodes_is_bounded_but_never_empty(store: Store, tmp_path: Pat
 
 
 def test_page_of_episodes_ends_before_one_that_is_not_kept(store: Store) -> None:
-    run = Run(store, Budget(max_env_steps=1000))
+    run = StoredRun(store, Budget(max_env_steps=1000))
     work(run)
     first, second, *_ = [e.id for e in run.buffer]
     assert len(store.episode_bodies([first, 999, second], LARGEST)) == 1

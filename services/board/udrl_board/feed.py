@@ -9,8 +9,8 @@ import msgspec
 
 from udrl.errors import InvalidData, UdrlError
 from udrl.version import __version__
-from udrl_board.source import Place, Source
-from udrl_inspect.obedience_report import Obedience
+from udrl_board.source import RunLocation, Source
+from udrl_inspect.obedience_report import ObedienceReport
 from udrl_inspect.obedience_text import summary
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Status
@@ -39,7 +39,7 @@ class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
     weights_version: int
 
     @classmethod
-    def of(cls, report: Obedience) -> "Obeyed":
+    def of(cls, report: ObedienceReport) -> "Obeyed":
         """Return the part of a report that the page shows."""
         found = report.obeyed
         return cls(
@@ -66,7 +66,7 @@ class News(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     software: str
-    place: Place
+    place: RunLocation
     hello: Hello | None
     status: Status | None
     iterations: list[IterationStatus]
@@ -85,7 +85,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         evaluations: so far.
     """
 
-    place: Place
+    place: RunLocation
     status: Status | None
     evaluations: list[EvaluationStatus]
 

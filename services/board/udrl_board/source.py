@@ -14,7 +14,7 @@ from udrl.errors import ConfigError, PeerError, Refused, Unreachable
 from udrl_inspect.address import Address, connected, served_at
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
-from udrl_inspect.obedience_report import Obedience, kept
+from udrl_inspect.obedience_report import ObedienceReport, kept
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Weights, WeightsRequest
@@ -40,7 +40,7 @@ _ANSWER_S = 3.0
 _SILENT_S = 10.0
 
 
-class Place(msgspec.Struct, frozen=True):
+class RunLocation(msgspec.Struct, frozen=True):
     """The place of a run, for the shell commands that the page shows; empty: unknown.
 
     Attributes:
@@ -55,7 +55,7 @@ class Place(msgspec.Struct, frozen=True):
 class Source(Protocol):
     """A source of a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
 
-    def place(self) -> Place:
+    def place(self) -> RunLocation:
         """Return the place of the run."""
         ...
 
@@ -83,7 +83,7 @@ class Source(Protocol):
         """Return a weights version that is kept."""
         ...
 
-    def obedience(self) -> Obedience | None:
+    def obedience(self) -> ObedienceReport | None:
         """Return the report of ``udrl obedience`` on the run, or None."""
         ...
 
@@ -102,9 +102,9 @@ class Stored:
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
 
-    def place(self) -> Place:
+    def place(self) -> RunLocation:
         """Return its directory."""
-        return Place(str(self._run_dir))
+        return RunLocation(str(self._run_dir))
 
     def doubt(self) -> str:
         """Return nothing: the file is always up to date."""
@@ -134,7 +134,7 @@ class Stored:
         agent = load_agent(self._run_dir, version)
         return Weights(version=agent.version, weights=agent.weights)
 
-    def obedience(self) -> Obedience | None:
+    def obedience(self) -> ObedienceReport | None:
         """Return the report in its directory, or None."""
         return kept(self._run_dir)
 
@@ -155,9 +155,9 @@ class Served:
         self._line: tuple[Asker, Hello] | None = None
         self._lock = threading.Lock()
 
-    def place(self) -> Place:
+    def place(self) -> RunLocation:
         """Return its endpoint."""
-        return Place("", self._address.endpoint)
+        return RunLocation("", self._address.endpoint)
 
     def doubt(self) -> str:
         """Return nothing: without a reply, methods raise."""
@@ -186,7 +186,7 @@ class Served:
         request = WeightsRequest(version=version)
         return self._query(lambda asker: asker.ask(verbs.WEIGHTS, request))
 
-    def obedience(self) -> Obedience | None:
+    def obedience(self) -> ObedienceReport | None:
         """Return nothing: it is in the run's directory, which may be on another machine."""
         return None
 
@@ -234,9 +234,9 @@ class Directory:
         self._why = ""
         self._lock = threading.Lock()
 
-    def place(self) -> Place:
+    def place(self) -> RunLocation:
         """Return its directory, and its endpoint while it is served."""
-        return Place(str(self._run_dir), served_at(self._run_dir) or "")
+        return RunLocation(str(self._run_dir), served_at(self._run_dir) or "")
 
     def doubt(self) -> str:
         """Return that the replay service does not reply, if there is one and it does not."""
@@ -264,7 +264,7 @@ class Directory:
         """Return a weights version that is kept."""
         return self._query(lambda source: source.weights(version))
 
-    def obedience(self) -> Obedience | None:
+    def obedience(self) -> ObedienceReport | None:
         """Return the report in its directory, or None."""
         return self._stored.obedience()
 

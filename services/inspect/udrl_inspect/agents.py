@@ -24,7 +24,7 @@ from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_proto.messages import Hello
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
 #: Seconds between tracebacks of a command that is reproduced.
@@ -65,7 +65,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
     """
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)
-        progress = store.fact("progress", Progress)
+        progress = store.fact("progress", RunProgress)
         named = {"latest": progress.latest_version, "best": progress.best_version}
         if version not in named and not isinstance(version, int):
             raise ConfigError(f"weights {version!r}: expected latest, best or a version number")

@@ -11,13 +11,13 @@ from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.inspection import budget_of
-from udrl_inspect.obedience_report import Obedience, kept_of
+from udrl_inspect.obedience_report import ObedienceReport, kept_of
 from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
 _CARD = """\
@@ -106,7 +106,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     if (folder / FILE).exists():
         raise ConfigError(f"{folder} is the directory of a run; name another folder")
     with closing(Store(run_dir, read_only=True)) as store:
-        progress = store.fact("progress", Progress)
+        progress = store.fact("progress", RunProgress)
         found = stored_evaluation(store, agent)
     policy = agent.policy
     if found is not None:  # the command of the card's results
@@ -138,7 +138,7 @@ def export_buffer(run_dir: Path, name: str) -> int:
     """
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)
-        ids = [p.entry.id for p in store.buffer(store.fact("progress", Progress).iteration)]
+        ids = [p.entry.id for p in store.buffer(store.fact("progress", RunProgress).iteration)]
         if not ids:
             raise StoreError(
                 f"{run_dir}: the replay buffer is empty; wait until the warm-up is complete"
@@ -153,7 +153,7 @@ def export_buffer(run_dir: Path, name: str) -> int:
     return len(ids)
 
 
-def _again(agent: Agent, progress: Progress) -> str:
+def _again(agent: Agent, progress: RunProgress) -> str:
     """Return a sentence about the weights that the card's command trains."""
     config = agent.config
     if progress.inexact_reason:
@@ -178,7 +178,7 @@ def _card(
     agent: Agent,
     folder: Path,
     found: EvaluationRow | None,
-    report: Obedience | None,
+    report: ObedienceReport | None,
     again: str,
 ) -> str:
     environment = agent.config.environment

@@ -15,7 +15,7 @@ from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Status, StatusRequest
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.reporting import Throughput, Waits, status
 from udrl_replay.standing import Standing
 from udrl_replay.store import Store
@@ -99,7 +99,7 @@ def read_run(run_dir: Path, store: Store) -> Standing:
 def last_iteration(run_dir: Path) -> int:
     """Return the last completed iteration of a run; -1 if its warm-up is not complete."""
     with closing(Store(run_dir, read_only=True)) as store:
-        return store.fact("progress", Progress).iteration
+        return store.fact("progress", RunProgress).iteration
 
 
 def budget_of(run_dir: Path) -> Budget:

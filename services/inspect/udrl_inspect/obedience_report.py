@@ -40,7 +40,7 @@ _AtLeast0 = Annotated[float, Meta(ge=0)]
 _Count = Annotated[int, Meta(ge=1)]
 
 
-class Point(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ObediencePoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The results of one command.
 
     Attributes:
@@ -86,7 +86,7 @@ class Agreement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     correlation: Annotated[float, Meta(ge=-1, le=1)]
 
 
-class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ObedienceReport(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The report on an agent.
 
     Attributes:
@@ -116,19 +116,19 @@ class Obedience(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     reachable_low: float
     reachable_high: float
     tolerance: _AtLeast0
-    by_return: Annotated[list[Point], Meta(min_length=2)]
-    by_horizon: list[Point]
+    by_return: Annotated[list[ObediencePoint], Meta(min_length=2)]
+    by_horizon: list[ObediencePoint]
     all_returns: Agreement
     obeyed: Agreement | None
     all_horizons: Agreement | None
 
     @property
-    def best(self) -> Point:
+    def best(self) -> ObediencePoint:
         """The command with the highest mean return."""
         return max(self.by_return, key=lambda point: point.return_mean)
 
 
-class Plan(NamedTuple):
+class ObediencePlan(NamedTuple):
     """The commands of a report.
 
     Attributes:
@@ -154,7 +154,7 @@ def plan_commands(
     episodes: int,
     temperature: float | None = None,
     desired_returns: tuple[float, float] | None = None,
-) -> Plan:
+) -> ObediencePlan:
     """Return the commands for a report on an agent.
 
     Args:
@@ -192,15 +192,15 @@ def plan_commands(
     horizons = spread(lengths, points) if has_horizon else []
     whole = sorted({max(1, nearest(value)) for value in horizons})
     by_horizon = [commands(None, value) for value in whole] if len(whole) > 1 else []
-    return Plan(by_return, by_horizon, (common[0], common[-1]))
+    return ObediencePlan(by_return, by_horizon, (common[0], common[-1]))
 
 
 def measure(
     agent: Agent,
-    plan: Plan,
+    plan: ObediencePlan,
     tolerance: float | None = None,
     ended: Callable[[], object] = lambda: None,
-) -> Obedience:
+) -> ObedienceReport:
     """Run the commands of a plan and return the report.
 
     Args:
@@ -228,7 +228,7 @@ def measure(
         tolerance = TOLERANCE * (high - low or float(np.ptp(means.commanded)))
     where = obeyed(means, tolerance)
     lengths = [point.length_mean for point in by_horizon]
-    return Obedience(
+    return ObedienceReport(
         run_id=agent.run_id,
         environment=agent.config.environment,
         weights_version=agent.version,
@@ -249,9 +249,9 @@ def measure(
     )
 
 
-def _point(result: Result) -> Point:
+def _point(result: Result) -> ObediencePoint:
     returns, lengths = result.evaluation, summarise(result.lengths)
-    return Point(
+    return ObediencePoint(
         desired_return=result.desired_return,
         desired_horizon=result.desired_horizon,
         episodes=returns.episodes,
@@ -275,7 +275,7 @@ def _agreement(commanded: Sequence[float], obtained: Sequence[float]) -> Agreeme
     )
 
 
-def keep(run_dir: Path, report: Obedience) -> Path:
+def keep(run_dir: Path, report: ObedienceReport) -> Path:
     """Write a report to a run's directory, and return the file's path.
 
     Raises:
@@ -289,7 +289,7 @@ def keep(run_dir: Path, report: Obedience) -> Path:
     return path
 
 
-def kept_of(agent: Agent, run_dir: Path) -> Obedience | None:
+def kept_of(agent: Agent, run_dir: Path) -> ObedienceReport | None:
     """Return the report in a run's directory if it is about this agent's weights, else None.
 
     Raises:
@@ -302,7 +302,7 @@ def kept_of(agent: Agent, run_dir: Path) -> Obedience | None:
     return report if mine else None
 
 
-def kept(run_dir: Path) -> Obedience | None:
+def kept(run_dir: Path) -> ObedienceReport | None:
     """Return the report in a run's directory; None if there is none.
 
     Raises:
@@ -310,7 +310,7 @@ def kept(run_dir: Path) -> Obedience | None:
     """
     path = run_dir / FILE
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Obedience)
+        return msgspec.json.decode(path.read_bytes(), type=ObedienceReport)
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import msgspec
 
 from udrl.evaluation import return_text
-from udrl_inspect.obedience_report import TOLERANCE, Obedience, Point
+from udrl_inspect.obedience_report import TOLERANCE, ObediencePoint, ObedienceReport
 
 #: Correlation from which on means follow their commands, even if they are not what is commanded.
 _FOLLOWS = 0.8
@@ -16,7 +16,7 @@ _HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "me
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """A row of the CSV file; its other attributes are those of :class:`Point`.
+    """A row of the CSV file; its other attributes are those of :class:`ObediencePoint`.
 
     Attributes:
         sweep: which part of the command is varied.
@@ -38,7 +38,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     obeyed: bool
 
 
-def rows(report: Obedience) -> Iterator[Row]:
+def rows(report: ObedienceReport) -> Iterator[Row]:
     """Yield the rows of the CSV file: commanded returns, then commanded horizons."""
     for point in report.by_return:
         yield Row(sweep="return", obeyed=is_obeyed(report, point), **_fields(point))
@@ -46,18 +46,18 @@ def rows(report: Obedience) -> Iterator[Row]:
         yield Row(sweep="horizon", obeyed=is_obeyed(report, point), **_fields(point))
 
 
-def _fields(point: Point) -> dict[str, Any]:
+def _fields(point: ObediencePoint) -> dict[str, Any]:
     fields: dict[str, Any] = msgspec.structs.asdict(point)
     return fields
 
 
-def is_obeyed(report: Obedience, point: Point) -> bool:
+def is_obeyed(report: ObedienceReport, point: ObediencePoint) -> bool:
     """Return whether a command is in the range in which the agent obeys."""
     found = report.obeyed
     return found is not None and found.low <= point.desired_return <= found.high
 
 
-def answer(report: Obedience) -> str:
+def answer(report: ObedienceReport) -> str:
     """Return a sentence about the returns that can be commanded."""
     every, found = report.all_returns, report.obeyed
     error = _number(report)
@@ -88,7 +88,7 @@ def answer(report: Obedience) -> str:
     )
 
 
-def best(report: Obedience) -> str:
+def best(report: ObedienceReport) -> str:
     """Return a sentence about the command with the highest mean return."""
     point, number = report.best, _number(report)
     return (
@@ -98,12 +98,12 @@ def best(report: Obedience) -> str:
     )
 
 
-def summary(report: Obedience) -> str:
+def summary(report: ObedienceReport) -> str:
     """Return the sentences of :func:`answer` and :func:`best`."""
     return f"{answer(report)} {best(report)}"
 
 
-def horizons(report: Obedience) -> str:
+def horizons(report: ObedienceReport) -> str:
     """Return a sentence about commanded horizons; empty if none were measured."""
     found = report.all_horizons
     if found is None:
@@ -117,7 +117,7 @@ def horizons(report: Obedience) -> str:
     )
 
 
-def rule(report: Obedience) -> str:
+def rule(report: ObedienceReport) -> str:
     """Return a sentence that defines when a command counts as obeyed."""
     is_usual = math.isclose(report.tolerance, _usual_tolerance(report))
     share = f" ({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns)"
@@ -127,7 +127,7 @@ def rule(report: Obedience) -> str:
     )
 
 
-def about(report: Obedience) -> str:
+def about(report: ObedienceReport) -> str:
     """Return a sentence about the measurement."""
     return (
         f"{report.environment}, weights version {report.weights_version}, temperature "
@@ -135,7 +135,7 @@ def about(report: Obedience) -> str:
     )
 
 
-def table(report: Obedience) -> str:
+def table(report: ObedienceReport) -> str:
     """Return the report for a terminal; it ends with the answer."""
     cells = [list(_HEAD), *_cells(report, report.by_return)]
     if report.by_horizon:
@@ -150,7 +150,7 @@ def table(report: Obedience) -> str:
     return "\n".join([said[0], "", *lines, "", *filter(None, said[1:])])
 
 
-def markdown(report: Obedience) -> str:
+def markdown(report: ObedienceReport) -> str:
     """Return the report for a model card."""
     lines = ["| " + " | ".join(_HEAD) + " |", "|" + "---:|" * len(_HEAD)]
     lines += ["| " + " | ".join(row) + " |" for row in _cells(report, report.by_return)]
@@ -161,7 +161,7 @@ def markdown(report: Obedience) -> str:
     )  # fmt: skip
 
 
-def _cells(report: Obedience, points: Sequence[Point]) -> Iterator[list[str]]:
+def _cells(report: ObedienceReport, points: Sequence[ObediencePoint]) -> Iterator[list[str]]:
     number = _number(report)
     varied = points is report.by_return
     for point in points:
@@ -180,7 +180,7 @@ def _exact(value: float) -> str:
     return f"{value:.10g}"
 
 
-def _number(report: Obedience) -> Callable[[float], str]:
+def _number(report: ObedienceReport) -> Callable[[float], str]:
     """Return a function that formats the returns of a report, all with the same precision.
 
     The precision is a tenth of the tolerance, or of the usual one if that is smaller.
@@ -192,5 +192,5 @@ def _number(report: Obedience) -> Callable[[float], str]:
     return lambda value: f"{round(value, digits) + 0.0:.{digits}f}"
 
 
-def _usual_tolerance(report: Obedience) -> float:
+def _usual_tolerance(report: ObedienceReport) -> float:
     return TOLERANCE * (report.reachable_high - report.reachable_low)

@@ -12,7 +12,7 @@ from udrl_inspect.address import served_at
 from udrl_inspect.inspection import budget_of
 from udrl_proto.messages import Hello
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 State = Literal["running", "stopped", "ended", "failed", "unreadable"]
@@ -84,7 +84,7 @@ def summarise(run_dir: Path) -> Summary:
     try:
         with closing(Store(run_dir, read_only=True)) as store:
             config = store.fact("hello", Hello).config
-            progress = store.fact("progress", Progress)
+            progress = store.fact("progress", RunProgress)
             best = store.best_evaluation()
         state: State = "stopped"
         because = progress.why_stopped()

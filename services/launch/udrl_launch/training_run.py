@@ -25,7 +25,7 @@ from udrl_proto.credentials import load
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.creation import config_of
 from udrl_replay.reporting import write_weights
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 log = logging.getLogger("udrl")
 
@@ -134,7 +134,7 @@ def train(
     settings = settings._replace(config=config_of(store), left_open=frozenset())
     with ExitStack() as unless_it_goes_on:
         unless_it_goes_on.callback(store.close)
-        progress = Run(store, settings.budget).progress
+        progress = StoredRun(store, settings.budget).progress
         if progress.state == "ended":
             write_weights(run_dir, store, progress.latest_version)
             return read_status(run_dir)

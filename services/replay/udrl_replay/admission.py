@@ -11,7 +11,7 @@ import msgspec
 from udrl.errors import Refused
 from udrl_proto.messages import JoinRequest, Role
 from udrl_replay.dealing import MOST_ACTORS
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 
 #: Learners that are remembered; the one that has not joined for the longest time goes first.
 _MOST_LEARNERS = 1000
@@ -24,7 +24,7 @@ class Admission:
         run: in what; its dealer knows the actors.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: StoredRun) -> None:
         self._run = run
         self._learners: dict[str, str] = {}  # numerics classes by name
 

@@ -28,10 +28,10 @@ from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect
 from udrl_replay.database import FILE
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.remedies import remedy
 from udrl_replay.resuming import closed_on_error
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -108,7 +108,7 @@ def _create(
             log.info("choosing settings by random episodes of %s", config.environment)
         config = fit(config, left_open, generator, offline)
     exact = digest != ""
-    progress = Progress(exact=exact)
+    progress = RunProgress(exact=exact)
     if not exact:
         progress.inexact_reason = (
             f"environment {config.environment} does not repeat an episode from its seed"
@@ -137,7 +137,7 @@ def _create(
 def _begin_with(store: Store, episodes: list[Episode]) -> None:
     """Let episodes of others answer the commands of the warm-up."""
     spec = store.fact("hello", Hello).environment
-    run = Run(store, Budget(max_env_steps=2**53))
+    run = StoredRun(store, Budget(max_env_steps=2**53))
     with store.transaction():
         for episode in episodes:
             message = decode(encode_episode(episode, OFFLINE), EpisodeMessage, LARGEST)

@@ -11,7 +11,7 @@ STOPPED = "stopped on request"
 KILLED = "stopped without notice: its replay service was killed, or its machine went down"
 
 
-class Progress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """What the store keeps as one fact, written at the end of every transaction that changed it.
 
     Attributes:

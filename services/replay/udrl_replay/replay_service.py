@@ -64,7 +64,7 @@ from udrl_replay.reporting import (
     status,
     write_weights,
 )
-from udrl_replay.run import Run
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store, Version
 
 log = logging.getLogger("udrl")
@@ -105,7 +105,7 @@ class ReplayService:
         run_dir: Path,
         audit: float = 0.0,
     ) -> None:
-        self.run = Run(store, budget, audit)
+        self.run = StoredRun(store, budget, audit)
         self._admission = Admission(self.run)
         self._transport = transport
         self._store = store

@@ -16,7 +16,7 @@ from udrl.numerics import settle_as
 from udrl.repeating import difference, environment_digest
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -56,7 +56,7 @@ def resume(
             hello = msgspec.structs.replace(hello, allow_inexact=True)
             with store.transaction():
                 store.set_fact("hello", hello)
-        if check_environment and store.fact("progress", Progress).exact:
+        if check_environment and store.fact("progress", RunProgress).exact:
             _check_environment(store, hello, allow_inexact=allow_inexact)
     return store
 
@@ -72,7 +72,7 @@ def _check_environment(store: Store, hello: Hello, *, allow_inexact: bool) -> No
             f"environment {environment} has changed since the run was created: {found}; restore "
             f"its package and what it computes with, or resume with --allow-inexact"
         )
-    progress = store.fact("progress", Progress)
+    progress = store.fact("progress", RunProgress)
     progress.exact = False
     progress.inexact_reason = f"environment {environment} has changed: {found}"
     log.warning("the run is no longer exact: %s", progress.inexact_reason)
@@ -112,7 +112,7 @@ def _changed(store: Store, hello: Hello) -> str | None:
 
 def _telling(store: Store, config: Config) -> Iterator[int]:
     """Yield ids of stored episodes: the longest, for late steps, then the newest."""
-    held = [p.entry for p in store.buffer(store.fact("progress", Progress).iteration)]
+    held = [p.entry for p in store.buffer(store.fact("progress", RunProgress).iteration)]
     if config.commands.dataset is not None:  # its episodes have no seeds
         held = [e for e in held if e.id >= COMMANDS_PER_ITERATION]
     by_length = sorted(held, key=lambda e: e.length, reverse=True)

@@ -29,7 +29,7 @@ from udrl_replay.versions import is_known
 log = logging.getLogger("udrl")
 
 
-class Run(Standing):
+class StoredRun(Standing):
     """A run that is worked on, new or resumed.
 
     Args:

@@ -9,7 +9,7 @@ from udrl.replay import ReplayBuffer
 from udrl_proto.messages import Hello
 from udrl_replay.auditing import Auditor
 from udrl_replay.dealing import Dealer
-from udrl_replay.progress import Progress
+from udrl_replay.progress import RunProgress
 from udrl_replay.quarantine import Quarantine
 from udrl_replay.store import Store
 
@@ -39,7 +39,7 @@ class Standing:
         self.budget = budget
         self.hello = store.fact("hello", Hello)
         self.config = self.hello.config
-        self.progress = store.fact("progress", Progress)
+        self.progress = store.fact("progress", RunProgress)
         self.dealer = Dealer()
         self.auditor = Auditor(audit)
         self.quarantined = Quarantine(store)

@@ -71,7 +71,7 @@ class Curve(NamedTuple):
 Line = list[Curve]
 
 
-class Point(NamedTuple):
+class LinePoint(NamedTuple):
     """A point of a line, and the ends of its interval."""
 
     at: float
@@ -248,13 +248,13 @@ def _evaluated(curve: Curve) -> list[Row]:
     return [r for r in curve.rows if not math.isnan(r["eval_mean"])]
 
 
-def _points(line: Line, x: X) -> list[Point]:
+def _points(line: Line, x: X) -> list[LinePoint]:
     """Return the evaluations of a line: of one run with their intervals, else mean and range."""
     column = "eval_at_env_steps" if x == "env_steps" else x
     unit = _X[x][1]
     if len(line) == 1:
         return [
-            Point(r[column] / unit, r["eval_mean"], r["eval_ci95_low"], r["eval_ci95_high"])
+            LinePoint(r[column] / unit, r["eval_mean"], r["eval_ci95_low"], r["eval_ci95_high"])
             for r in _evaluated(line[0])
         ]
     # Evaluation k of a run is the first after k times eval_every env steps.
@@ -266,13 +266,13 @@ def _points(line: Line, x: X) -> list[Point]:
     ]
 
 
-def _mean(found: Sequence[tuple[float, float]]) -> Point:
+def _mean(found: Sequence[tuple[float, float]]) -> LinePoint:
     """Return the mean of some evaluations, and their range."""
     returns = [value for _, value in found]
-    return Point(fmean(at for at, _ in found), fmean(returns), min(returns), max(returns))
+    return LinePoint(fmean(at for at, _ in found), fmean(returns), min(returns), max(returns))
 
 
-def _final(line: Line, x: X) -> Point | None:
+def _final(line: Line, x: X) -> LinePoint | None:
     """Return the final evaluations of a line; None unless all its runs have one."""
     found: list[tuple[float, Evaluation]] = []
     for curve in line:
@@ -282,7 +282,7 @@ def _final(line: Line, x: X) -> Point | None:
         found.append((at, curve.final.evaluation))
     if len(found) == 1:
         ((at, one),) = found
-        return Point(at, one.mean, one.ci95_low, one.ci95_high)
+        return LinePoint(at, one.mean, one.ci95_low, one.ci95_high)
     return _mean([(at, one.mean) for at, one in found])
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
-from udrl_inspect.obedience_report import Obedience
+from udrl_inspect.obedience_report import ObedienceReport
 from udrl_inspect.obedience_text import answer
 from udrl_show import pictures
 from udrl_show.styles import line_style
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _TITLE = 52
 
 
-def draw(report: Obedience, picture: Path) -> None:
+def draw(report: ObedienceReport, picture: Path) -> None:
     """Draw obtained against commanded returns, and lengths against commanded horizons.
 
     Args:
@@ -37,7 +37,7 @@ def draw(report: Obedience, picture: Path) -> None:
     pictures.save(figure, picture)
 
 
-def _returns(axes: "Axes", report: Obedience) -> None:
+def _returns(axes: "Axes", report: ObedienceReport) -> None:
     points, tolerance = report.by_return, report.tolerance
     commanded = [point.desired_return for point in points]
     ends = [commanded[0], commanded[-1]]
@@ -63,7 +63,7 @@ def _returns(axes: "Axes", report: Obedience) -> None:
     axes.legend(fontsize="small")
 
 
-def _horizons(axes: "Axes", report: Obedience) -> None:
+def _horizons(axes: "Axes", report: ObedienceReport) -> None:
     points = report.by_horizon
     commanded = [point.desired_horizon for point in points]
     ends = [commanded[0], commanded[-1]]

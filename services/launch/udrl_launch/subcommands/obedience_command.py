@@ -93,7 +93,7 @@ def obedience(
     return 0
 
 
-def _keep(run_dir: Path, report: reports.Obedience, *, draws: bool) -> list[str]:
+def _keep(run_dir: Path, report: reports.ObedienceReport, *, draws: bool) -> list[str]:
     """Write the files in the run's directory, and return what went wrong."""
     try:
         reports.keep(run_dir, report)
