@@ -36,7 +36,7 @@ from unittest import mock
 from simulation import Costs, Recorded, Simulation
 from speed import _random_speed, _window
 from udrl.acting import EpisodeGenerator
-from udrl.commands import CLOSING, TRAINING_SEEDS, Command
+from udrl.commands import FINAL_EVALUATION, TRAINING_SEEDS, Command
 from udrl.config import COMMANDS_PER_ITERATION, Config
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
@@ -71,7 +71,7 @@ def record(settings: Settings) -> Recorded:
 
     def note_episode(self: StoredRun, arrival: Any, now: float) -> Any:
         iteration, index = divmod(arrival.entry.id, COMMANDS_PER_ITERATION)
-        if index < CLOSING:
+        if index < FINAL_EVALUATION:
             found[iteration][index] = arrival.entry.length
         return accept(self, arrival, now)
 

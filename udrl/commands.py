@@ -1,4 +1,4 @@
-"""Commands: what an episode is told to achieve, and everything else that it depends on.
+"""Commands: what an episode is to achieve, and everything else that it depends on.
 
 An episode is a pure function of its command. Sections 2.3.4 (exploratory commands) and 2.3.6
 (evaluation commands) are here, and so are the warm-up's, which say "act at random".
@@ -32,8 +32,8 @@ EVALUATION_SEEDS = (1, 500_000)
 
 #: Exploratory episodes of an iteration that is to have ``n_steps_per_iter``, at most.
 MOST_EPISODES = 1_000
-#: Within an iteration, the closing evaluation of a run that ends there has indices from here on.
-CLOSING = 500_000
+#: Within an iteration, the final evaluation of a run that ends there has indices from here on.
+FINAL_EVALUATION = 500_000
 
 
 class Decisions(NamedTuple):
@@ -50,7 +50,7 @@ class Decisions(NamedTuple):
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An order to an actor.
+    """A command to an actor.
 
     Attributes:
         id: ``iteration * COMMANDS_PER_ITERATION + index``; the episode's id is the same.
@@ -212,10 +212,10 @@ class CommandSampler:
         first = episodes_due(self._settings, buffer)
         return self._evaluation(iteration, first, buffer)
 
-    def close(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
-        """Return the evaluation that closes a run at an iteration: fresh seeds, final weights."""
-        closing = self._evaluation(iteration, CLOSING, buffer)
-        return [msgspec.structs.replace(c, weights_version=iteration) for c in closing]
+    def evaluate_final(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
+        """Return a run's final evaluation after an iteration: fresh seeds, final weights."""
+        commands = self._evaluation(iteration, FINAL_EVALUATION, buffer)
+        return [msgspec.structs.replace(c, weights_version=iteration) for c in commands]
 
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
         evaluation = self._config.evaluation

@@ -33,7 +33,7 @@ class Rollout:
     Args:
         policy: the agent.
         env: its environment, from :func:`udrl.environments.make_environment`.
-        command: the order, the seeds and the temperature.
+        command: desired return and horizon, the seeds and the temperature.
 
     Attributes:
         temperature: of the next actions; may be set.
@@ -64,7 +64,7 @@ class Rollout:
         observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.network.frame_stack
         self._recent = deque([self._plain(observation)] * n, maxlen=n)
-        self.tell(command.desired_return, command.desired_horizon)
+        self.set_command(command.desired_return, command.desired_horizon)
 
     @property
     def over(self) -> bool:
@@ -81,8 +81,8 @@ class Rollout:
         """How many values there are of each component of an action."""
         return self._policy.spec.action_space.components
 
-    def tell(self, desired_return: float, desired_horizon: int) -> None:
-        """Give another order from here on."""
+    def set_command(self, desired_return: float, desired_horizon: int) -> None:
+        """Change the command for the remaining steps."""
         self._desired = np.array([[desired_return, desired_horizon]], np.float64)
         self._target.bound(self._desired, self._cap)
 

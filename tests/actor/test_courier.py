@@ -16,7 +16,7 @@ from udrl.inference import probe_weights
 from udrl.spaces import Vector
 from udrl.streams import Purpose, stream_key
 from udrl.weights import encode_weights
-from udrl_actor.courier import Courier, Order
+from udrl_actor.courier import Assignment, Courier
 from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import (
@@ -102,16 +102,16 @@ def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
         assert not courier.is_alive()
 
 
-def take(courier: Courier, n: int) -> list[Order]:
-    """Take until ``n`` orders have come."""
-    orders: list[Order] = []
+def take(courier: Courier, n: int) -> list[Assignment]:
+    """Take until ``n`` assignments have come."""
+    assignments: list[Assignment] = []
 
     def more() -> bool:
-        orders.extend(courier.take(n - len(orders), 0, wait_s=0.5))
-        return len(orders) == n
+        assignments.extend(courier.take(n - len(assignments), 0, wait_s=0.5))
+        return len(assignments) == n
 
-    wait_for(more, "orders", DEADLINE_S)
-    return orders
+    wait_for(more, "assignments", DEADLINE_S)
+    return assignments
 
 
 def test_commands_come_with_the_weights_that_they_name(
@@ -134,8 +134,8 @@ def test_weights_that_were_announced_are_not_asked_for(
     wait_for(lambda: replay.requests(verbs.COMMANDS), "a question", DEADLINE_S)
     replay.publish(key_expressions.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
     replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
-    (order,) = take(courier, 1)
-    assert order.behavior is not None
+    (assignment,) = take(courier, 1)
+    assert assignment.behavior is not None
     assert replay.requests(verbs.WEIGHTS) == []
 
 
@@ -144,7 +144,7 @@ def test_service_that_was_started_again_is_joined_again(
 ) -> None:
     unknown = Problem(code="join_first", message="who is that?")
     courier = start(unknown, CommandsReply(commands=(command(1),)))
-    assert [order.command.id for order in take(courier, 1)] == [1]
+    assert [assignment.command.id for assignment in take(courier, 1)] == [1]
     assert replay.requests(verbs.JOIN) == [JOIN]
 
 
@@ -154,7 +154,7 @@ def test_command_whose_weights_are_gone_is_dropped(
     gone = Problem(code="unknown_version", message="weights version 3 is not kept")
     replay.answers(verbs.WEIGHTS, lambda _: gone)
     courier = start(CommandsReply(commands=(command(1, version=3), command(2))))
-    assert [order.command.id for order in take(courier, 1)] == [2]
+    assert [assignment.command.id for assignment in take(courier, 1)] == [2]
     # It is no longer among those that the actor says it holds.
     courier.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)

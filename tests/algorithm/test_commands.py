@@ -176,17 +176,17 @@ def test_a_training_command_is_drawn_again_without_its_buffer() -> None:
 
 def test_a_closing_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
     sample, buffer = sampler(lead=3, eval_episodes=50), buffer_of([1.0, 3.0])
-    closing, usual = sample.close(9, buffer), sample.evaluate(9, buffer)
-    assert {command.weights_version for command in closing} == {9}
-    assert desired_returns(closing) == [2.0] * 50
-    assert {c.environment_seed for c in closing}.isdisjoint(c.environment_seed for c in usual)
-    assert {c.stream_key for c in closing}.isdisjoint(c.stream_key for c in usual)
+    final, usual = sample.evaluate_final(9, buffer), sample.evaluate(9, buffer)
+    assert {command.weights_version for command in final} == {9}
+    assert desired_returns(final) == [2.0] * 50
+    assert {c.environment_seed for c in final}.isdisjoint(c.environment_seed for c in usual)
+    assert {c.stream_key for c in final}.isdisjoint(c.stream_key for c in usual)
 
 
 def test_only_training_episodes_may_be_shortened() -> None:
     sample, buffer = sampler(max_train_steps=100), buffer_of([1.0])
     training = sample.warm_up() + sample.explore(1, buffer)
-    evaluation = sample.evaluate(1, buffer) + sample.close(1, buffer)
+    evaluation = sample.evaluate(1, buffer) + sample.evaluate_final(1, buffer)
     assert {command.max_steps for command in training} == {100}
     assert {command.max_steps for command in evaluation} == {500}
 
@@ -200,7 +200,7 @@ def test_only_evaluations_have_another_temperature_and_only_on_request() -> None
     for request in (1.0, 0.5, 0.0):
         sample = sampler(eval_temperature=request)
         training = sample.warm_up() + sample.explore(1, buffer)
-        evaluation = sample.evaluate(1, buffer) + sample.close(1, buffer)
+        evaluation = sample.evaluate(1, buffer) + sample.evaluate_final(1, buffer)
         assert {command.temperature for command in training} == {1.0}
         assert {command.temperature for command in evaluation} == {request}
 
@@ -227,7 +227,7 @@ def test_commands_of_a_run_are_distinct_and_keep_to_their_seeds(
     commands = sample.warm_up()
     for i in range(1, iterations + 1):
         commands += sample.explore(i, buffer) + sample.evaluate(i, buffer)
-        commands += sample.close(i, buffer)
+        commands += sample.evaluate_final(i, buffer)
 
     assert len({command.id for command in commands}) == len(commands)
     assert [command.id for command in commands] == sorted(command.id for command in commands)

@@ -89,7 +89,7 @@ def test_a_command_given_on_the_way_is_what_the_next_action_follows() -> None:
     rollout = Rollout(policy, env, command())
     rollout.step()
     observation = rollout._recent[-1]
-    rollout.tell(500.0, 9)
+    rollout.set_command(500.0, 9)
     rollout.temperature = 0.5
     assert rollout.probabilities.tolist() == (
         policy.probabilities(observation, 500.0, 9, temperature=0.5).tolist()

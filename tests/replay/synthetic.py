@@ -170,7 +170,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
     closing = None
     if i > 0:
         last = ReplayBuffer(settings.buffer, map(entry, buffer(i)))
-        closing = summarise([e.episode_return for e in carry_out(sample.close(i, last))])
+        closing = summarise([e.episode_return for e in carry_out(sample.evaluate_final(i, last))])
     return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
 
 

@@ -33,7 +33,7 @@ def test_who_is_not_known_must_join(role: Role, make_run: MakeRun) -> None:
     assert refusal(lambda: one.check(role, "a")) == "join_first"
     one.join(request(role, "a"), 0.0)
     one.check(role, "a")
-    one.leave(role, "a")
+    one.remove_service(role, "a")
     assert refusal(lambda: one.check(role, "a")) == "join_first"
 
 

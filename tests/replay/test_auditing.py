@@ -50,8 +50,8 @@ def test_two_that_agree_need_no_third() -> None:
     auditor.consider(command(5), "a", "c", b"x")
     assert auditor.versions == {5}
     assert auditor.assign("b", "c", (), 9) == [command(5)]
-    assert auditor.asked("b", 5)
-    assert not auditor.asked("a", 5)
+    assert auditor.is_assigned("b", 5)
+    assert not auditor.is_assigned("a", 5)
     assert auditor.compare("b", 5, b"x") is None
     assert (auditor.open, auditor.versions) == ({}, set())
 
@@ -59,11 +59,11 @@ def test_two_that_agree_need_no_third() -> None:
 @pytest.mark.parametrize(("digests", "liar"), [("xyx", "b"), ("xyy", "a")])
 def test_third_decides_between_two(digests: str, liar: str) -> None:
     made = zip("abc", (d.encode() for d in digests), strict=True)
-    assert audited(*made) == Verdict(5, liar)
+    assert audited(*made) == Verdict(liar)
 
 
 def test_three_that_differ_decide_nothing() -> None:
-    assert audited(("a", b"x"), ("b", b"y"), ("c", b"z")) == Verdict(5, None)
+    assert audited(("a", b"x"), ("b", b"y"), ("c", b"z")) == Verdict(None)
 
 
 def test_nobody_checks_himself_or_another_class() -> None:
@@ -82,7 +82,7 @@ def test_what_an_actor_lost_goes_to_another() -> None:
     auditor.assign("b", "c", (), 9)
     assert auditor.assign("b", "c", {5}, 9) == [], "it holds it still"
     assert len(auditor.assign("b", "c", (), 9)) == 1, "it lost it and may have it again"
-    auditor.leave("b")
+    auditor.remove_actor("b")
     assert len(auditor.assign("d", "c", (), 9)) == 1
 
 

@@ -113,7 +113,7 @@ def test_full_answer_is_a_small_message() -> None:
 
 def test_commands_of_an_actor_that_is_gone_go_to_others(dealer: Dealer) -> None:
     ask(dealer, "a")
-    dealer.leave("a")
+    dealer.remove_actor("a")
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
 
 
@@ -144,7 +144,7 @@ def test_reruns_and_failures_are_counted_by_actor(dealer: Dealer) -> None:
     assert ask(dealer, "b") == ids(0, 3, 4)
     assert (dealer.actors["a"].reruns, dealer.actors["a"].failures) == (0, 1)
     assert (dealer.actors["b"].reruns, dealer.actors["b"].failures) == (1, 0)
-    dealer.leave("a")
+    dealer.remove_actor("a")
     assert ask(dealer, "b", running=ids(0, 3, 4)) == ids(1, 2, 5)
     assert dealer.actors["b"].reruns == 3
     dealer.join(join("a"), 0.0)
@@ -153,7 +153,7 @@ def test_reruns_and_failures_are_counted_by_actor(dealer: Dealer) -> None:
 
 def test_command_that_ran_before_a_restart_is_a_rerun_elsewhere(dealer: Dealer) -> None:
     ask(dealer, "a", wanted=0, running=ids(0))
-    dealer.leave("a")
+    dealer.remove_actor("a")
     assert command(0).id in ask(dealer, "b")
     assert dealer.actors["b"].reruns == 1
 
@@ -162,14 +162,14 @@ def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     ask(dealer, "b", wanted=0, now=SILENCE_S)
     assert dealer.silent(set(), SILENCE_S + 1) == ["a"]
-    dealer.leave("a")
+    dealer.remove_actor("a")
     assert list(dealer.actors) == ["b"]
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
 
 
 def test_actor_that_delivers_is_not_silent(dealer: Dealer) -> None:
     for name in ("a", "b", "stranger"):
-        dealer.hear(name, SILENCE_S)
+        dealer.note_seen(name, SILENCE_S)
     assert dealer.silent(set(), SILENCE_S + 1) == []
     assert list(dealer.actors) == ["a", "b"]
 
@@ -187,7 +187,7 @@ def straggling(dealer: Dealer) -> Dealer:
     """``a`` has one command since 0 s, all others are done; an episode takes 2 s."""
     first, *others = [c for name in ("a", "b") for c in ask(dealer, name)]
     for command_id in others:
-        dealer.remove(command_id, now=2.0)
+        dealer.remove_command(command_id, now=2.0)
     assert dealer.holds("a", first)
     return dealer
 
@@ -224,16 +224,16 @@ def test_straggler_runs_on_two_actors_at_most(straggling: Dealer) -> None:
 def test_straggler_is_not_known_before_an_episode_has_come(dealer: Dealer) -> None:
     ask(dealer, "a")
     ask(dealer, "b", running=[])
-    dealer.leave("b")
+    dealer.remove_actor("b")
     dealer.join(join("b"), 0.0)
     for command_id in ids(3, 4, 5):
-        dealer.remove(command_id)
+        dealer.remove_command(command_id)
     assert ask(dealer, "b", now=1000.0, spare_cores=1.0) == []
 
 
 def test_straggler_whose_second_actor_dies_stays_with_the_first(straggling: Dealer) -> None:
     ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0)
-    straggling.leave("b")
+    straggling.remove_actor("b")
     assert straggling.holds("a", ids(0)[0])
     straggling.join(join("b"), 0.0)
     assert ask(straggling, "b", now=OVERDUE + 0.1) == []
@@ -258,7 +258,7 @@ def test_failures_of_one_actor_may_be_its_own_fault(dealer: Dealer) -> None:
 
 
 def test_failures_of_the_only_actor_are_hopeless(dealer: Dealer) -> None:
-    dealer.leave("b")
+    dealer.remove_actor("b")
     assert [fail(dealer, "a") for _ in range(3)] == [False, False, True]
 
 
@@ -280,9 +280,9 @@ def alone() -> Dealer:
     for name in ("x", "y", "z"):
         dealer.join(join(name), 0.0)
         assert ask(dealer, name) == ids(0, 1, 2)
-        assert [item.command.id for item in dealer.leave(name)] == ids(0, 1, 2)
+        assert [item.command.id for item in dealer.remove_actor(name)] == ids(0, 1, 2)
     for command_id in ids(1, 2):
-        dealer.remove(command_id)
+        dealer.remove_command(command_id)
     dealer.add(command(index) for index in range(3, 6))
     return dealer
 
@@ -291,7 +291,7 @@ def vanish(dealer: Dealer, name: str) -> bool:
     """Let an actor die of the first command; say whether that makes it hopeless."""
     dealer.join(join(name), 0.0)
     assert ask(dealer, name) == ids(0)
-    dealer.leave(name)
+    dealer.remove_actor(name)
     return dealer.is_hopeless(ids(0)[0])
 
 
@@ -317,15 +317,15 @@ def test_command_of_three_vanished_actors_waits_for_its_weights(alone: Dealer) -
 
 
 def test_commands_that_are_carried_out_alone_and_succeed_are_done(dealer: Dealer) -> None:
-    dealer.leave("b")
+    dealer.remove_actor("b")
     for name in ("a", "c", "d"):
         dealer.join(join(name), 0.0)
         held = ask(dealer, name)
-        dealer.leave(name)
+        dealer.remove_actor(name)
     dealer.join(join("e"), 0.0)
     for command_id in held:
         assert ask(dealer, "e") == [command_id]
-        dealer.remove(command_id, 1.0)
+        dealer.remove_command(command_id, 1.0)
     assert not dealer.outstanding
 
 
@@ -364,8 +364,8 @@ def test_neighbours_of_a_deadly_command_are_never_blamed() -> None:
         dealer.join(join(f"actor-{number}"), 0.0)
         while deadly not in (held := ask(dealer, f"actor-{number}", wanted=4)):
             for command_id in held:
-                dealer.remove(command_id, 1.0)
-        dealer.leave(f"actor-{number}")
+                dealer.remove_command(command_id, 1.0)
+        dealer.remove_actor(f"actor-{number}")
         if any(dealer.is_hopeless(i) for i in dealer.outstanding):
             break
     assert dealer.is_hopeless(deadly)
@@ -392,6 +392,6 @@ def test_iteration_is_left_with_what_is_outstanding(steps: list[tuple[str, int]]
         dealer.join(join(name), 0.0)
         ask(dealer, name)
         if command(index).id in dealer.outstanding:
-            dealer.remove(command(index).id, 1.0)
-    assert dealer.left(1) == len(dealer.outstanding)
-    assert dealer.left(2) == 0
+            dealer.remove_command(command(index).id, 1.0)
+    assert dealer.outstanding_in(1) == len(dealer.outstanding)
+    assert dealer.outstanding_in(2) == 0

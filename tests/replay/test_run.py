@@ -32,7 +32,7 @@ from tests.replay.synthetic import (
     weights_of,
     work,
 )
-from udrl.commands import CLOSING, Command
+from udrl.commands import FINAL_EVALUATION, Command
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Refused
 from udrl.replay import Entry
@@ -80,7 +80,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from("abc"), dies=st.booleans())
     def actor_leaves(self, name: str, dies: bool) -> None:
-        self.run.dealer.leave(name)
+        self.run.dealer.remove_actor(name)
         if dies:
             self.held = {key: item for key, item in self.held.items() if key[0] != name}
 
@@ -155,7 +155,7 @@ class RunMachine(RuleBasedStateMachine):
         assert self.deliver(arrive(episode(command, weights, other))) == "duplicate"
         assert not (other and known and self.run.progress.exact)
 
-    @rule(iteration=st.integers(0, 3), index=st.integers(6, CLOSING - 1))
+    @rule(iteration=st.integers(0, 3), index=st.integers(6, FINAL_EVALUATION - 1))
     def actor_delivers_what_nobody_wants(self, iteration: int, index: int) -> None:
         unknown = Command(
             id=iteration * COMMANDS_PER_ITERATION + index,
@@ -238,7 +238,9 @@ class RunMachine(RuleBasedStateMachine):
         self.run = reopen(self.run, self.run_dir, budget)
         if self.run.progress.state == "running":
             # Evaluations that closed the run before are forgotten.
-            self.accepted = {i: a for i, a in self.accepted.items() if a[0].index < CLOSING}
+            self.accepted = {
+                i: a for i, a in self.accepted.items() if a[0].index < FINAL_EVALUATION
+            }
 
     # What is true at every moment.
 
@@ -348,7 +350,7 @@ def deliver(run: StoredRun, command: Command, other: bool = False) -> str:
 
 
 def until_closing(run: StoredRun) -> None:
-    """Work until only the closing evaluation is left."""
+    """Work until only the final evaluation is left."""
     while run.progress.state == "running":
         work(run)
     while run.awaits_version() is not None:
@@ -431,7 +433,7 @@ def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) ->
     until_closing(run)
     final = run.progress.iteration
     assert [c.id for c in outstanding(run)] == [
-        final * COMMANDS_PER_ITERATION + CLOSING + n
+        final * COMMANDS_PER_ITERATION + FINAL_EVALUATION + n
         for n in range(config().evaluation.eval_episodes)
     ]
     assert {c.weights_version for c in outstanding(run)} == {final}
@@ -602,7 +604,7 @@ def vanish(run: StoredRun, *actors: str) -> set[int]:
         request = CommandsRequest(actor=name, wanted=100)
         held = run.dealer.deal(request, run.progress.latest_version, 0.0)
         with run.store.transaction():
-            run.lose(name)
+            run.remove_actor(name)
             run.save()
     return {command.id for command in held}
 
@@ -628,7 +630,7 @@ def test_command_that_ends_its_actors_stops_the_run_and_is_named(
 
 def test_end_of_an_actor_that_never_joined_is_no_news(make_run: MakeRun) -> None:
     run = make_run()
-    run.lose("stranger")
+    run.remove_actor("stranger")
     assert run.progress.state == "running"
 
 

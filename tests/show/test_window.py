@@ -19,7 +19,7 @@ class Episode:
         self.desired_return, self.desired_horizon = 150.0, 80
         self.temperature = 0.7
 
-    def tell(self, desired_return: float, desired_horizon: int) -> None:
+    def set_command(self, desired_return: float, desired_horizon: int) -> None:
         self.desired_return, self.desired_horizon = desired_return, desired_horizon
 
 
@@ -87,4 +87,4 @@ def test_without_a_screen_there_is_no_window(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_rollout_is_what_the_episode_here_stands_for() -> None:
     attributes = {"command", "desired_return", "desired_horizon", "temperature"}
     assert attributes <= set(vars(Episode()))
-    assert callable(Rollout.tell)
+    assert callable(Rollout.set_command)

@@ -119,11 +119,11 @@ class ActorService:
             if courier.error is not None:
                 raise courier.error
             busy = running and len(outbox) < self._environments
-            if outcomes or courier.has_orders or not busy:
+            if outcomes or courier.has_assignments or not busy:
                 outbox.put(outcomes)
-                orders = courier.take(generator.free, steps, wait_s=0.0 if busy else 0.5)
+                assignments = courier.take(generator.free, steps, wait_s=0.0 if busy else 0.5)
                 steps = 0
-                failures = [generator.start(*order) for order in orders]
+                failures = [generator.start(*assignment) for assignment in assignments]
                 outcomes = [f for f in failures if f is not None]
                 running = len(generator.running)
             if running and len(outbox) < self._environments:

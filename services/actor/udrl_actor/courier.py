@@ -26,7 +26,7 @@ from udrl_proto.transport import Transport
 log = logging.getLogger("udrl")
 
 
-class Order(NamedTuple):
+class Assignment(NamedTuple):
     """A command and the behavior function to obey it with; None: act at random."""
 
     command: Command
@@ -59,7 +59,7 @@ class Courier(threading.Thread):
         self._asker = asker
         self._stop_event = stop
         self._changed = threading.Condition()
-        self._orders: deque[Order] = deque()
+        self._assignments: deque[Assignment] = deque()
         self._held: set[int] = set()
         self._free = 0
         self._steps = 0
@@ -70,28 +70,30 @@ class Courier(threading.Thread):
 
     # Called by the loop that steps environments.
 
-    def take(self, free: int, steps: int, *, wait_s: float) -> list[Order]:
-        """Take orders for environments that have nothing to do.
+    def take(self, free: int, steps: int, *, wait_s: float) -> list[Assignment]:
+        """Take assignments for environments that have nothing to do.
 
         Args:
             free: how many have nothing to do.
             steps: env steps made since the last call.
-            wait_s: seconds to wait for news when there are no orders.
+            wait_s: seconds to wait for news when there are no assignments.
         """
         with self._changed:
             self._free = free
             self._steps += steps
             self._changed.notify_all()
-            if not self._orders and wait_s and self._alive():
+            if not self._assignments and wait_s and self._alive():
                 self._changed.wait(wait_s)
-            orders = [self._orders.popleft() for _ in range(min(free, len(self._orders)))]
-            self._free -= len(orders)
-            return orders
+            assignments = [
+                self._assignments.popleft() for _ in range(min(free, len(self._assignments)))
+            ]
+            self._free -= len(assignments)
+            return assignments
 
     @property
-    def has_orders(self) -> bool:
-        """Whether :meth:`take` would return orders at once."""
-        return bool(self._orders)
+    def has_assignments(self) -> bool:
+        """Whether :meth:`take` would return assignments at once."""
+        return bool(self._assignments)
 
     # Called by the lines of the outbox.
 
@@ -131,13 +133,13 @@ class Courier(threading.Thread):
         rate_at, rate = time.monotonic(), 0.0
         while self._alive():
             with self._changed:
-                wants = self._free > len(self._orders)
+                wants = self._free > len(self._assignments)
                 pause = ask_at - time.monotonic() if wants else 0.5
                 if pause > 0 and not (wants and self._has_news):
                     self._changed.wait(min(pause, 0.5))
                 if self._has_news:
                     ask_at, self._acknowledged = 0.0, False
-                wanted = self._free - len(self._orders)
+                wanted = self._free - len(self._assignments)
             if wanted > 0 and time.monotonic() >= ask_at:
                 now = time.monotonic()
                 if now - rate_at >= 1.0:
@@ -169,16 +171,18 @@ class Courier(threading.Thread):
             self.ended = True
         with self._changed:
             self._held |= {command.id for command in reply.commands}
-        orders = [order for c in reply.commands if (order := self._order(c)) is not None]
+        assignments = [
+            assignment for c in reply.commands if (assignment := self._assignment(c)) is not None
+        ]
         with self._changed:
-            self._orders.extend(orders)
+            self._assignments.extend(assignments)
             self._changed.notify_all()
         return time.monotonic() + (reply.wait.retry_after_s if reply.wait else 0.0)
 
-    def _order(self, command: Command) -> Order | None:
+    def _assignment(self, command: Command) -> Assignment | None:
         """Return a command with its weights; None when they are gone, and the command with them."""
         try:
-            return Order(command, self._behaviors.of(command.weights_version))
+            return Assignment(command, self._behaviors.of(command.weights_version))
         except Refused as refusal:
             if refusal.code != "unknown_version":
                 raise

@@ -191,7 +191,7 @@ class Stage(threading.Thread):
 
     def _change_command(self, rollout: Rollout, request: ChangeCommand) -> None:
         wanted_return, wanted_horizon = request.desired_return, request.desired_horizon
-        rollout.tell(
+        rollout.set_command(
             rollout.desired_return if wanted_return is None else wanted_return,
             rollout.desired_horizon if wanted_horizon is None else wanted_horizon,
         )

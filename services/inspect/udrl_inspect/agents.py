@@ -201,7 +201,7 @@ def evaluation_commands(
         temperature = agent.config.evaluation.eval_temperature
     config = change(agent.config, eval_episodes=episodes, eval_temperature=temperature)
     sampler = CommandSampler(config, agent.environment)
-    commands = sampler.close(agent.iteration, agent.buffer)
+    commands = sampler.evaluate_final(agent.iteration, agent.buffer)
     default = commands[0]
     desired = ReturnInTime(config.network).settle(
         default.desired_return if desired_return is None else desired_return,

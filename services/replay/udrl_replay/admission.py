@@ -73,7 +73,7 @@ class Admission:
         try:
             self._compare(role, numerics_class)
         except Refused:
-            self.leave(role, name)
+            self.remove_service(role, name)
             raise
 
     def note_accepted(self, role: Role, name: str) -> None:
@@ -86,10 +86,10 @@ class Admission:
         elif known != numerics_class:
             run.mark_inexact(f"{role} {name} is of another numerics class")
 
-    def leave(self, role: str, name: str) -> None:
-        """Forget a service, and give what an actor held to others."""
+    def remove_service(self, role: str, name: str) -> None:
+        """Remove a service, and give what an actor held to others."""
         if role == "actor":
-            self._run.lose(name)
+            self._run.remove_actor(name)
         elif role == "learner":
             self._learners.pop(name, None)
 

@@ -46,7 +46,6 @@ class Verdict(NamedTuple):
         liar: the one that differs from two that agree; None: all three differ.
     """
 
-    command_id: int
     liar: str | None
 
 
@@ -92,18 +91,18 @@ class Auditor:
                 assigned.append(audit.command)
         return assigned
 
-    def leave(self, actor: str) -> None:
+    def remove_actor(self, actor: str) -> None:
         """Give to others what an actor that is gone was to carry out."""
         for audit in self.open.values():
             if audit.at == actor:
                 audit.at = ""
 
-    def asked(self, actor: str, command_id: int) -> bool:
-        """Say whether an actor was told to carry out a command again."""
+    def is_assigned(self, actor: str, command_id: int) -> bool:
+        """Say whether an actor is to carry out a command again."""
         return command_id in self.open and self.open[command_id].at == actor
 
     def compare(self, actor: str, command_id: int, digest: bytes) -> Verdict | None:
-        """Take in what an actor delivered that was asked; return the verdict if three differ.
+        """Take in what an actor delivered that it was assigned; return the verdict if three differ.
 
         An audit in which the first two agree is over: it is no longer open.
         """
@@ -117,7 +116,7 @@ class Auditor:
         del self.open[command_id]
         count = Counter(audit.digests.values())
         odd = [name for name, held in audit.digests.items() if count[held] == 1]
-        return Verdict(command_id, odd[0] if len(odd) == 1 else None)
+        return Verdict(odd[0] if len(odd) == 1 else None)
 
     def stop(self) -> None:
         """Audit no more."""

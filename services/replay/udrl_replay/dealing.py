@@ -92,8 +92,8 @@ class Dealer:
             self._of_version[command.weights_version] += 1
             heapq.heappush(self._undealt, command.id)
 
-    def remove(self, command_id: int, now: float | None = None) -> Command:
-        """Return a command that is no longer outstanding; with a time: because it is done."""
+    def remove_command(self, command_id: int, now: float | None = None) -> None:
+        """Remove an outstanding command; with a time: because it is done."""
         item = self.outstanding.pop(command_id)
         command = item.command
         for counter, key in (
@@ -109,20 +109,19 @@ class Dealer:
         if now is not None and item.holders:
             took = now - min(item.holders.values())
             self._duration_s += (took - self._duration_s) * (0.05 if self._duration_s else 1.0)
-        return command
 
-    def left(self, iteration: int) -> int:
+    def outstanding_in(self, iteration: int) -> int:
         """Return how many commands of an iteration are outstanding."""
         return self._of_iteration[iteration]
 
     def join(self, request: JoinRequest, now: float) -> None:
         """Note a new actor; one of the same id that came back loses what it held."""
-        self.leave(request.id)
+        self.remove_actor(request.id)
         asked = CommandsRequest(actor=request.id, wanted=0)
         self.actors[request.id] = Actor(request, now, asked)
 
-    def leave(self, name: str) -> list[Outstanding]:
-        """Forget an actor and return what it held, which goes to others."""
+    def remove_actor(self, name: str) -> list[Outstanding]:
+        """Remove an actor and return what it held, which goes to others."""
         actor = self.actors.pop(name, None)
         held = [] if actor is None else [self.outstanding[i] for i in sorted(actor.holds)]
         for item in held:
@@ -210,8 +209,8 @@ class Dealer:
         item = self.outstanding.get(command_id)
         return item is not None and name in item.holders
 
-    def hear(self, name: str, now: float) -> None:
-        """Note that an actor, if it has joined, said something."""
+    def note_seen(self, name: str, now: float) -> None:
+        """Note the time of a message from an actor, if it has joined."""
         if name in self.actors:
             self.actors[name].last_seen = now
 

@@ -221,7 +221,7 @@ class ReplayService:
         with self._store.transaction():
             snapshot = msgspec.json.encode(run.progress)
             for name in silent:
-                run.lose(name)
+                run.remove_actor(name)
                 self._waits.end(f"actor {name}")
             for item in group:
                 if isinstance(item, Presence):
@@ -266,7 +266,7 @@ class ReplayService:
         else:
             self._here.discard(peer)
             self._waits.end(f"{role} {name}")
-            self._admission.leave(role, name)
+            self._admission.remove_service(role, name)
             log.info("%s left", printable(f"{role} {name}"))
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
@@ -344,7 +344,7 @@ class ReplayService:
             here = [n for r, n in self._here if r == "actor"]
             why = f"iteration {request.version - 1}" + ("" if here else ": no actor is here")
             if run.progress.state == "closing":
-                why = "the closing evaluation"
+                why = "the final evaluation"
             return ChangesReply(wait=self._wait(who, "actors", why, now))
         self._waits.end(who)
         iteration = request.version - 1

@@ -9,7 +9,7 @@ import logging
 import math
 from typing import Literal
 
-from udrl.commands import CLOSING, Command, CommandSampler
+from udrl.commands import FINAL_EVALUATION, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Deceived, Refused, RunFailed
 from udrl.evaluation import return_text, summarise
@@ -44,7 +44,7 @@ class StoredRun(Standing):
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
         super().__init__(store, budget, audit)
         self.sampler = CommandSampler(self.config, self.hello.environment)
-        self.trust = Trust(self, self.lose)
+        self.trust = Trust(self, self.remove_actor)
         self._evaluated = {
             weights_version(e.iteration, self.config.lead)
             for e in store.evaluations(-1, self.progress.iteration)
@@ -85,14 +85,14 @@ class StoredRun(Standing):
             Refused: it is not the answer to a command of this run, or to none that is still wanted.
         """
         self.progress.delivered += 1
-        self.dealer.hear(arrival.actor, now)
+        self.dealer.note_seen(arrival.actor, now)
         command_id = arrival.entry.id
         if arrival.actor in self.quarantined:
             self.progress.rejected += 1
             raise self.quarantined.refusal(arrival.actor)
         item = self.dealer.outstanding.get(command_id)
         if item is None:
-            if self.auditor.asked(arrival.actor, command_id):
+            if self.auditor.is_assigned(arrival.actor, command_id):
                 return self.trust.compare(arrival)
             return self._accept_again(arrival)
         if arrival.entry.length > item.command.max_steps:
@@ -102,12 +102,15 @@ class StoredRun(Standing):
                 f"{item.command.max_steps}"
             )
         self.trust.note(item.command, arrival)
-        self.dealer.remove(command_id, now)
+        self.dealer.remove_command(command_id, now)
         self.store.add_episode(arrival.entry, arrival.digest, arrival.body)
         self.progress.accepted += 1
         self._advance()
-        if self.progress.state == "closing" and command_id % COMMANDS_PER_ITERATION >= CLOSING:
-            self._end_if_closed()
+        if (
+            self.progress.state == "closing"
+            and command_id % COMMANDS_PER_ITERATION >= FINAL_EVALUATION
+        ):
+            self._end_if_evaluated()
         return "accepted"
 
     def _accept_again(self, arrival: Arrival) -> Literal["duplicate"]:
@@ -122,7 +125,7 @@ class StoredRun(Standing):
         if digest is not None or self._is_done(iteration, index):
             self.progress.duplicate += 1
             return "duplicate"
-        if index >= CLOSING or iteration > self.progress.iteration:
+        if index >= FINAL_EVALUATION or iteration > self.progress.iteration:
             raise self.reject(f"command {command_id} is cancelled or unknown; drop the episode")
         self.trust.offend(
             arrival.actor, f"an episode of command {command_id}, which was never issued"
@@ -131,10 +134,10 @@ class StoredRun(Standing):
 
     def _is_done(self, iteration: int, index: int) -> bool:
         """Say whether a command's episode has come and had its effect."""
-        if index < CLOSING:
+        if index < FINAL_EVALUATION:
             return iteration <= self.progress.iteration and index < self.store.issued_in(iteration)
         closed = self.progress.state == "ended" and iteration == self.progress.iteration > 0
-        return closed and index < CLOSING + self.config.evaluation.eval_episodes
+        return closed and index < FINAL_EVALUATION + self.config.evaluation.eval_episodes
 
     def deal(self, request: CommandsRequest, now: float) -> list[Command]:
         """Return commands for an actor that has joined; those to be checked come first."""
@@ -160,10 +163,10 @@ class StoredRun(Standing):
                 f"command {failure.command_id} failed three times: {error}",
             )
 
-    def lose(self, actor: str) -> None:
-        """Note that an actor is gone, perhaps through a command that it held."""
-        self.auditor.leave(actor)
-        for item in self.dealer.leave(actor):
+    def remove_actor(self, actor: str) -> None:
+        """Remove an actor that is gone, perhaps through a command that it held."""
+        self.auditor.remove_actor(actor)
+        for item in self.dealer.remove_actor(actor):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:
                 log.warning(
@@ -190,7 +193,7 @@ class StoredRun(Standing):
         """Complete every iteration whose turn it is and whose episodes are all there."""
         while self.progress.state == "running":
             following = self.progress.iteration + 1
-            if self.dealer.left(following):
+            if self.dealer.outstanding_in(following):
                 return
             self._complete(following)
 
@@ -250,7 +253,7 @@ class StoredRun(Standing):
                 self._issue(self.sampler.evaluate(opened, self.buffer))
             due = False
         if why := self._spent():
-            self._close(why)
+            self._begin_final_evaluation(why)
 
     def _note_evaluation(self, command: Command, entries: list[Entry], *, closing: bool) -> None:
         """Summarise what an evaluation's episodes obtained; ``command`` is one of theirs."""
@@ -295,28 +298,28 @@ class StoredRun(Standing):
             return f"spent its budget of {most:,} env steps"
         return ""
 
-    def _close(self, why: str) -> None:
+    def _begin_final_evaluation(self, why: str) -> None:
         """Iteration N is complete: cancel what was issued beyond and wait for version N."""
         self.progress.state, self.progress.ended_because = "closing", why
         self._cancel(list(self.dealer.outstanding))
         self.store.remove_versions(self.progress.iteration)
         self.progress.latest_version = min(self.progress.latest_version, self.progress.iteration)
         self._keep_needed_weights()
-        self._issue_closing()
+        self._issue_final_evaluation()
 
-    def _issue_closing(self) -> None:
-        """Issue the closing evaluation once version N is there; version 0 cannot act."""
+    def _issue_final_evaluation(self) -> None:
+        """Issue the final evaluation once version N is there; version 0 cannot act."""
         final = self.progress.iteration
         if final == 0:
             self.progress.state = "ended"
         elif self.progress.latest_version == final:
-            self._issue(self.sampler.close(final, self.buffer))
+            self._issue(self.sampler.evaluate_final(final, self.buffer))
 
-    def _end_if_closed(self) -> None:
+    def _end_if_evaluated(self) -> None:
         final = self.progress.iteration
         if self.dealer.outstanding:
             return
-        commands = self._closing_commands()
+        commands = self._final_commands()
         entries = [p.entry for p in self.store.pending(final)]
         self.progress.eval_env_steps += sum(e.length for e in entries)
         self._note_evaluation(commands[0], entries, closing=True)
@@ -325,24 +328,24 @@ class StoredRun(Standing):
         self.progress.wall_s = self.wall_s
         self.progress.state = "ended"
 
-    def _closing_commands(self) -> list[Command]:
-        return [c for c in self.open_commands() if c.index >= CLOSING]
+    def _final_commands(self) -> list[Command]:
+        return [c for c in self.open_commands() if c.index >= FINAL_EVALUATION]
 
     def _cancel(self, ids: list[int]) -> None:
         for i in ids:
-            self.dealer.remove(i)
+            self.dealer.remove_command(i)
         self.store.mark_commands(ids, cancelled=True)
         self.progress.cancelled += len(ids)
 
     def _reopen(self) -> None:
         """Go on after the end with a larger budget, as if it had not come."""
         final = self.progress.iteration
-        closing = [c.id for c in self._closing_commands()]
-        unfinished = [i for i in closing if i in self.dealer.outstanding]
+        final_ids = [c.id for c in self._final_commands()]
+        unfinished = [i for i in final_ids if i in self.dealer.outstanding]
         for i in unfinished:
-            self.dealer.remove(i)
+            self.dealer.remove_command(i)
         self.progress.cancelled += len(unfinished)
-        self.store.remove_commands(closing)
+        self.store.remove_commands(final_ids)
         self.store.remove_episodes(p.entry.id for p in self.store.pending(final))
         again = self.store.commands(cancelled=True)
         self.store.mark_commands((c.id for c in again), cancelled=False)
@@ -352,7 +355,7 @@ class StoredRun(Standing):
 
     def _try_again(self) -> None:
         """Go on with the command that could not be carried out."""
-        self.progress.state = "closing" if self._closing_commands() else "running"
+        self.progress.state = "closing" if self._final_commands() else "running"
         self.progress.problem = ""
 
     # Weights.
@@ -369,7 +372,7 @@ class StoredRun(Standing):
         self.progress.latest_version = version.version
         self._keep_needed_weights()
         if self.progress.state == "closing" and version.version == self.progress.iteration:
-            self._issue_closing()
+            self._issue_final_evaluation()
         return "accepted"
 
     def _keep_needed_weights(self) -> None:

@@ -32,8 +32,8 @@ EVALUATION_COLUMNS = {
 COLUMNS = (*_FIELDS, *EVALUATION_COLUMNS)
 
 
-class Pending(NamedTuple):
-    """An episode that arrived and is not admitted yet."""
+class StoredEpisode(NamedTuple):
+    """An episode in the store, without its steps."""
 
     entry: Entry
     digest: bytes
@@ -107,7 +107,7 @@ class Store(Database):
         rows = self._rows("SELECT digest FROM episodes WHERE id = ?", (episode_id,))
         return bytes(rows[0][0]) if rows else None
 
-    def pending(self, iteration: int) -> list[Pending]:
+    def pending(self, iteration: int) -> list[StoredEpisode]:
         """Return an iteration's episodes that are not admitted yet, by id."""
         first = iteration * COMMANDS_PER_ITERATION
         rows = self._rows(
@@ -115,7 +115,7 @@ class Store(Database):
             "WHERE admitted IS NULL AND id >= ? AND id < ? ORDER BY id",
             (first, first + COMMANDS_PER_ITERATION),
         )
-        return [Pending(Entry(*entry), digest) for *entry, digest in rows]
+        return [StoredEpisode(Entry(*entry), digest) for *entry, digest in rows]
 
     def pending_ids(self) -> set[int]:
         """Return the ids of all episodes that are not admitted yet."""
@@ -143,14 +143,14 @@ class Store(Database):
         rows = self._rows("SELECT id FROM episodes WHERE evicted <= ? ORDER BY id", (until,))
         self.remove_episodes(i for (i,) in rows)
 
-    def buffer(self, iteration: int) -> list[Pending]:
+    def buffer(self, iteration: int) -> list[StoredEpisode]:
         """Return the buffer as it was after an iteration, least return first."""
         rows = self._rows(
             "SELECT episode_return, id, length, digest FROM episodes "
             "WHERE admitted <= ? AND (evicted IS NULL OR evicted > ?) ORDER BY episode_return, id",
             (iteration, iteration),
         )
-        return [Pending(Entry(*entry), digest) for *entry, digest in rows]
+        return [StoredEpisode(Entry(*entry), digest) for *entry, digest in rows]
 
     def episode_bodies(self, ids: Sequence[int], limit: int) -> list[bytes]:
         """Return the first of the episodes asked for, up to ``limit`` bytes but at least one.

@@ -21,12 +21,12 @@ class Trust:
 
     Args:
         run: whose auditor, quarantine and progress these are.
-        lose: gives what an actor holds to others.
+        remove_actor: gives what an actor holds to others.
     """
 
-    def __init__(self, run: Standing, lose: Callable[[str], None]) -> None:
+    def __init__(self, run: Standing, remove_actor: Callable[[str], None]) -> None:
         self._run = run
-        self._lose = lose
+        self._remove_actor = remove_actor
         # The iteration in which an actor's first episode entered the run.
         self._entered = run.store.fact("entered", dict[str, int], {})
 
@@ -92,4 +92,4 @@ class Trust:
     def quarantine(self, actor: str, why: str) -> None:
         """Take nothing from an actor any more, and give what it holds to others."""
         self._run.quarantined.add(actor, why)
-        self._lose(actor)
+        self._remove_actor(actor)

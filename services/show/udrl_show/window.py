@@ -89,7 +89,9 @@ class Window:
         }  # fmt: skip
         if key in changes:
             by_return, by_horizon = changes[key]
-            rollout.tell(rollout.desired_return + by_return, rollout.desired_horizon + by_horizon)
+            rollout.set_command(
+                rollout.desired_return + by_return, rollout.desired_horizon + by_horizon
+            )
         elif key == "space":
             self._is_paused = not self._is_paused
         elif key == "g":
