@@ -64,7 +64,7 @@ class MemoryTransport:
             subscribed.append(entry)
         return _Declared(lambda: subscribed.remove(entry))
 
-    def appear(self, key: str) -> "_Declared":
+    def declare_presence(self, key: str) -> "_Declared":
         """Say that a service is here."""
         with self._exchange.lock:
             self._exchange.here.append(key)

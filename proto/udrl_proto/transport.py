@@ -76,7 +76,7 @@ class Transport(Protocol):
         """Have what is published on a key received, on the transport's threads."""
         ...
 
-    def appear(self, key: str) -> Declaration:
+    def declare_presence(self, key: str) -> Declaration:
         """Say that a service is here, until it is undeclared or the service is gone."""
         ...
 

@@ -56,7 +56,7 @@ class ZenohTransport:
             key, lambda sample: receive(sample.payload.to_bytes())
         )
 
-    def appear(self, key: str) -> Declaration:
+    def declare_presence(self, key: str) -> Declaration:
         """Declare a liveliness token, which goes with the process."""
         return self._session.liveliness().declare_token(key)
 

@@ -16,8 +16,8 @@ from udrl_inspect.obedience_report import (
     Agreement,
     ObediencePoint,
     ObedienceReport,
-    keep,
-    kept,
+    load_report,
+    save_report,
 )
 from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
 from udrl_launch.subcommands.options import RETURNS
@@ -154,12 +154,12 @@ def test_the_picture_shows_the_range(tmp_path: Path, obeyed: tuple[float, float]
 
 
 def test_what_is_kept_is_read(tmp_path: Path) -> None:
-    assert kept(tmp_path) is None
+    assert load_report(tmp_path) is None
     for told in (report(), report(obeyed=(30.0, 80.0))):
-        assert keep(tmp_path, told) == tmp_path / FILE
-        assert kept(tmp_path) == told
+        assert save_report(tmp_path, told) == tmp_path / FILE
+        assert load_report(tmp_path) == told
     with pytest.raises(StoreError, match="make the directory writable"):
-        keep(tmp_path / "nowhere", report())
+        save_report(tmp_path / "nowhere", report())
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_what_is_kept_is_read(tmp_path: Path) -> None:
      b'"correlation": 7', b'"surplus": 1, "format": 1'],
 )  # fmt: skip
 def test_a_report_that_nobody_wrote(tmp_path: Path, damage: bytes) -> None:
-    written = keep(tmp_path, report()).read_bytes()
+    written = save_report(tmp_path, report()).read_bytes()
     if damage.startswith(b'"'):
         name = damage.split(b":")[0] if b"surplus" not in damage else b'"format"'
         old = next(line for line in written.splitlines() if line.strip().startswith(name))
@@ -176,7 +176,7 @@ def test_a_report_that_nobody_wrote(tmp_path: Path, damage: bytes) -> None:
         assert damage != written
     (tmp_path / FILE).write_bytes(damage)
     with pytest.raises(InvalidData, match=r"obedience\.json: .*measure again: udrl obedience"):
-        kept(tmp_path)
+        load_report(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "5", "1:1", "2:1", "a:2", "1:nan", "1:2:3", "1e12:2e12"])

@@ -30,7 +30,7 @@ from udrl_board.source import Directory, Served, Stored
 from udrl_inspect.address import ENDPOINT_FILE, Address
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
-from udrl_inspect.obedience_report import keep, measure, plan_commands
+from udrl_inspect.obedience_report import measure, plan_commands, save_report
 from udrl_inspect.obedience_text import summary
 from udrl_launch.cli import cli as command_line
 from udrl_proto.reports import Status
@@ -85,7 +85,7 @@ def test_news_of_what_the_agent_obeys(ended_run: Path, tmp_path: Path) -> None:
     run_dir = Path(shutil.copytree(ended_run, tmp_path / "run"))
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=2, episodes=2))
-    keep(run_dir, report)
+    save_report(run_dir, report)
     with page(run_dir) as client:
         found = client.get("/news").json()["obeyed"]
     assert (found["answer"], found["weights_version"]) == (summary(report), agent.version)

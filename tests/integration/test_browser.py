@@ -22,7 +22,7 @@ from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
-from udrl_inspect.obedience_report import keep, measure, plan_commands
+from udrl_inspect.obedience_report import measure, plan_commands, save_report
 from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training_run import train
@@ -346,7 +346,7 @@ def test_the_map_shows_which_returns_the_agent_obeys(
     expect(shaded).to_have_count(0)
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=5, episodes=20, temperature=0.0))
-    keep(run_dir, report)
+    save_report(run_dir, report)
     expect(said).to_have_text(summary(report), timeout=SOON)
     expect(said).to_contain_text("Command returns between 0 and 4")
     expect(shaded).to_have_count(1)
@@ -355,7 +355,7 @@ def test_the_map_shows_which_returns_the_agent_obeys(
     assert right is not None
     assert 0.5 * right["width"] < left["width"] < right["width"]
     latest = report.weights_version
-    keep(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
+    save_report(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
     expect(said).to_contain_text(
         f"Measured with weights version {latest - 1}; the latest are {latest}.", timeout=SOON
     )

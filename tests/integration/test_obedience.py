@@ -15,7 +15,13 @@ from udrl.config import Budget, Config, build, change
 from udrl.errors import ConfigError, UdrlError
 from udrl.replay import ReplayBuffer
 from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
-from udrl_inspect.obedience_report import ObedienceReport, keep, kept, measure, plan_commands
+from udrl_inspect.obedience_report import (
+    ObedienceReport,
+    load_report,
+    measure,
+    plan_commands,
+    save_report,
+)
 from udrl_inspect.obedience_text import answer, markdown
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
@@ -49,7 +55,7 @@ def run_dir(ended_run: Path, tmp_path: Path) -> Path:
 
 def test_an_agent_that_obeys_is_said_to(obedient: Path) -> None:
     said, _ = call("obedience", obedient, "--episodes", 30, "--points", 5, "--greedy")
-    report = kept(obedient)
+    report = load_report(obedient)
     assert report is not None
     assert [p.desired_return for p in report.by_return] == [0, 1, 2, 3, 4]
     assert all(p.desired_horizon == 4 for p in report.by_return)
@@ -68,7 +74,7 @@ def test_one_document_and_the_same_each_time(run_dir: Path) -> None:
     assert call("obedience", run_dir, *options) == (first, errors)
     document: dict[str, Any] = json.loads(first)
     assert document.pop("run_dir") == str(run_dir)
-    report = kept(run_dir)
+    report = load_report(run_dir)
     assert report is not None
     assert document.pop("answer") == answer(report)
     assert msgspec.convert(document, ObedienceReport) == report
@@ -88,7 +94,7 @@ def test_a_tolerance_of_ones_own(obedient: Path) -> None:
     assert exact.obeyed is not None
     assert (exact.obeyed.low, exact.obeyed.mean_absolute_error) == (0.0, 0.0)
     call("obedience", obedient, "--episodes", 2, "--points", 5, "--tolerance", 1.5)
-    report = kept(obedient)
+    report = load_report(obedient)
     assert report is not None
     assert report.tolerance == 1.5
 
@@ -171,12 +177,12 @@ def test_the_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: P
     card = tmp_path / "agent" / "README.md"
     assert "Which returns it delivers" not in card.read_text()
     call("obedience", run_dir, "--episodes", 2, "--points", 2)
-    report = kept(run_dir)
+    report = load_report(run_dir)
     assert report is not None
     assert call("export", run_dir, "--folder", tmp_path / "agent")[1] == ""
     assert f"## Which returns it delivers\n\n{markdown(report)}\n" in card.read_text()
     for other in ({"weights_version": version + 1}, {"run_id": "another"}):
-        keep(run_dir, msgspec.structs.replace(report, **other))
+        save_report(run_dir, msgspec.structs.replace(report, **other))
         call("export", run_dir, "--folder", tmp_path / "agent")
         assert "Which returns it delivers" not in card.read_text()
     (run_dir / "obedience.json").write_text("{}")

@@ -87,12 +87,12 @@ def test_news_reach_who_listens_until_it_does_not(ends: Ends) -> None:
 
 def test_who_appears_and_goes_is_told(ends: Ends) -> None:
     service, client = ends
-    early = client.appear(f"{ALIVE}/early")
+    early = client.declare_presence(f"{ALIVE}/early")
     wait_for(lambda: service.present(f"{ALIVE}/*", WAIT_S), "the first")
     seen: queue.Queue[Presence] = queue.Queue()
     watching = service.watch("udrl/2/run/alive/*/*", seen.put)
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=True)
-    late = client.appear(f"{ALIVE}/late")
+    late = client.declare_presence(f"{ALIVE}/late")
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/late", here=True)
     assert service.present(f"{ALIVE}/ea$*", WAIT_S) == [f"{ALIVE}/early"]
     early.undeclare()

@@ -30,7 +30,7 @@ from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
 from udrl_replay.arrival import Arrival, inspect
 from udrl_replay.progress import RunProgress
 from udrl_replay.run import StoredRun
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import Store, Version
 
 #: Several pages of a file.
@@ -174,7 +174,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
     return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
 
 
-def result(run: Standing) -> Result:
+def result(run: RunState) -> Result:
     """Say where a run stands, in the terms of :func:`reference`."""
     version = run.store.version(run.progress.latest_version)
     last = run.store.last_evaluation(closing=False)

@@ -37,7 +37,7 @@ def audited(*digests: tuple[str, bytes]) -> Verdict | None:
     """Return the verdict over one command that actors deliver in this order."""
     auditor = Auditor(1.0)
     (first, digest), *others = digests
-    auditor.consider(command(5), first, "c", digest)
+    auditor.maybe_audit(command(5), first, "c", digest)
     verdict = None
     for name, other in others:
         assert [c.id for c in auditor.assign(name, "c", (), 9)] == [5]
@@ -47,7 +47,7 @@ def audited(*digests: tuple[str, bytes]) -> Verdict | None:
 
 def test_two_that_agree_need_no_third() -> None:
     auditor = Auditor(1.0)
-    auditor.consider(command(5), "a", "c", b"x")
+    auditor.maybe_audit(command(5), "a", "c", b"x")
     assert auditor.versions == {5}
     assert auditor.assign("b", "c", (), 9) == [command(5)]
     assert auditor.is_assigned("b", 5)
@@ -68,7 +68,7 @@ def test_three_that_differ_decide_nothing() -> None:
 
 def test_nobody_checks_himself_or_another_class() -> None:
     auditor = Auditor(1.0)
-    auditor.consider(command(5), "a", "c", b"x")
+    auditor.maybe_audit(command(5), "a", "c", b"x")
     assert auditor.assign("a", "c", (), 9) == []
     assert auditor.assign("b", "other", (), 9) == []
     assert auditor.assign("b", "c", (), 0) == []
@@ -78,7 +78,7 @@ def test_nobody_checks_himself_or_another_class() -> None:
 
 def test_what_an_actor_lost_goes_to_another() -> None:
     auditor = Auditor(1.0)
-    auditor.consider(command(5), "a", "c", b"x")
+    auditor.maybe_audit(command(5), "a", "c", b"x")
     auditor.assign("b", "c", (), 9)
     assert auditor.assign("b", "c", {5}, 9) == [], "it holds it still"
     assert len(auditor.assign("b", "c", (), 9)) == 1, "it lost it and may have it again"
@@ -90,17 +90,17 @@ def test_rate_is_the_share_that_is_checked() -> None:
     numbers = iter([0.0, 0.24, 0.25, 0.9])
     auditor = Auditor(0.25, lambda: next(numbers))
     for i in range(4):
-        auditor.consider(command(i), "a", "c", b"x")
+        auditor.maybe_audit(command(i), "a", "c", b"x")
     assert set(auditor.open) == {0, 1}
 
 
 def test_open_audits_are_bounded() -> None:
     auditor = Auditor(1.0)
     for i in range(MOST_OPEN + 10):
-        auditor.consider(command(i), "a", "c", b"x")
+        auditor.maybe_audit(command(i), "a", "c", b"x")
     assert len(auditor.open) == MOST_OPEN
     auditor.stop()
-    auditor.consider(command(1), "a", "c", b"x")
+    auditor.maybe_audit(command(1), "a", "c", b"x")
     assert not auditor.open
 
 

@@ -140,7 +140,7 @@ def test_running_command_that_is_not_outstanding_is_ignored(dealer: Dealer) -> N
 
 def test_reruns_and_failures_are_counted_by_actor(dealer: Dealer) -> None:
     ask(dealer, "a")
-    dealer.fail(command(0).id, "a")
+    dealer.note_failure(command(0).id, "a")
     assert ask(dealer, "b") == ids(0, 3, 4)
     assert (dealer.actors["a"].reruns, dealer.actors["a"].failures) == (0, 1)
     assert (dealer.actors["b"].reruns, dealer.actors["b"].failures) == (1, 0)
@@ -161,7 +161,7 @@ def test_command_that_ran_before_a_restart_is_a_rerun_elsewhere(dealer: Dealer) 
 def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     ask(dealer, "b", wanted=0, now=SILENCE_S)
-    assert dealer.silent(set(), SILENCE_S + 1) == ["a"]
+    assert dealer.silent_actors(set(), SILENCE_S + 1) == ["a"]
     dealer.remove_actor("a")
     assert list(dealer.actors) == ["b"]
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
@@ -170,13 +170,13 @@ def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
 def test_actor_that_delivers_is_not_silent(dealer: Dealer) -> None:
     for name in ("a", "b", "stranger"):
         dealer.note_seen(name, SILENCE_S)
-    assert dealer.silent(set(), SILENCE_S + 1) == []
+    assert dealer.silent_actors(set(), SILENCE_S + 1) == []
     assert list(dealer.actors) == ["a", "b"]
 
 
 def test_silent_actor_whose_token_is_alive_is_not_forgotten(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
-    assert dealer.silent({"a"}, SILENCE_S + 1) == ["b"]
+    assert dealer.silent_actors({"a"}, SILENCE_S + 1) == ["b"]
 
 
 # Stragglers.
@@ -244,7 +244,7 @@ def test_straggler_whose_second_actor_dies_stays_with_the_first(straggling: Deal
 
 def fail(dealer: Dealer, name: str) -> bool:
     ask(dealer, name, wanted=0, running=ids(0))
-    dealer.fail(ids(0)[0], name)
+    dealer.note_failure(ids(0)[0], name)
     return dealer.is_hopeless(ids(0)[0])
 
 
@@ -264,7 +264,7 @@ def test_failures_of_the_only_actor_are_hopeless(dealer: Dealer) -> None:
 
 def test_failed_command_is_dealt_again(dealer: Dealer) -> None:
     ask(dealer, "a")
-    dealer.fail(ids(0)[0], "a")
+    dealer.note_failure(ids(0)[0], "a")
     assert not dealer.holds("a", ids(0)[0])
     assert ask(dealer, "b", wanted=1) == ids(0)
 
@@ -337,7 +337,7 @@ def test_vanished_actors_and_reported_failures_count_together(alone: Dealer) -> 
     assert [vanish(alone, name) for name in "ab"] == [False, False]
     alone.join(join("c"), 0.0)
     assert ask(alone, "c") == ids(0)
-    alone.fail(ids(0)[0], "c")
+    alone.note_failure(ids(0)[0], "c")
     assert alone.is_hopeless(ids(0)[0])
 
 

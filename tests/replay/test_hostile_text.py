@@ -48,7 +48,7 @@ def tell_everything(transport: MemoryTransport) -> Status:
             asker.ask(verbs.COMMANDS, unknown)
     hostile = replace(join("a"), host=HOSTILE, software=HOSTILE, numerics_class=HOSTILE)
     asker.ask(verbs.JOIN, hostile)
-    transport.appear(key_expressions.alive(RUN, "actor", HOSTILE)).undeclare()
+    transport.declare_presence(key_expressions.alive(RUN, "actor", HOSTILE)).undeclare()
     spec = hostile.environment
     assert spec is not None
     with pytest.raises(Refused, match="the run's environment is"):

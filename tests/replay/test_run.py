@@ -44,7 +44,7 @@ from udrl_replay.arrival import Arrival
 from udrl_replay.progress import KILLED, STOPPED, RunProgress
 from udrl_replay.reporting import Throughput, Waits, status
 from udrl_replay.run import StoredRun
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import Store, Version
 
 #: Env steps after which every run of the machine ends at last.
@@ -638,6 +638,6 @@ def test_run_that_is_only_looked_at_writes_nothing(make_run: MakeRun, tmp_path: 
     run = make_run(max_env_steps=20)
     finish(run)
     with closing(Store(tmp_path, read_only=True)) as store:
-        looked_at = Standing(store, Budget(max_env_steps=1000))
+        looked_at = RunState(store, Budget(max_env_steps=1000))
         assert looked_at.progress == run.progress
         assert result(looked_at) == result(run)

@@ -89,7 +89,9 @@ class ActorService:
                 environment_digest=environment_digest(generator),
             )
             asker.ask(verbs.JOIN, join)
-            token = self._transport.appear(key_expressions.alive(run_id, "actor", self._name))
+            token = self._transport.declare_presence(
+                key_expressions.alive(run_id, "actor", self._name)
+            )
             courier = Courier(self._transport, self._hello, join, asker, self._stop)
 
             def deliver_one(outcome: Episode | Failure) -> None:

@@ -14,7 +14,7 @@ from udrl.errors import ConfigError, PeerError, Refused, Unreachable
 from udrl_inspect.address import Address, connected, served_at
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
-from udrl_inspect.obedience_report import ObedienceReport, kept
+from udrl_inspect.obedience_report import ObedienceReport, load_report
 from udrl_proto import verbs
 from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Weights, WeightsRequest
@@ -136,7 +136,7 @@ class Stored:
 
     def obedience(self) -> ObedienceReport | None:
         """Return the report in its directory, or None."""
-        return kept(self._run_dir)
+        return load_report(self._run_dir)
 
     def close(self) -> None:
         """Do nothing: no resources are held."""

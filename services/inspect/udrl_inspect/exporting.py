@@ -11,7 +11,7 @@ from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.inspection import budget_of
-from udrl_inspect.obedience_report import ObedienceReport, kept_of
+from udrl_inspect.obedience_report import ObedienceReport, report_of_agent
 from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
@@ -111,7 +111,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     policy = agent.policy
     if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
-    card = _card(agent, folder, found, kept_of(agent, run_dir), _again(agent, progress))
+    card = _card(agent, folder, found, report_of_agent(agent, run_dir), _again(agent, progress))
     folders.save(folder, policy, card)
     write_config(folder, agent.config, budget_of(run_dir))
 

@@ -17,7 +17,7 @@ from udrl_proto.messages import Hello
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.progress import RunProgress
 from udrl_replay.reporting import Throughput, Waits, status
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -91,9 +91,9 @@ def read_status(run_dir: Path) -> Status:
     return found
 
 
-def read_run(run_dir: Path, store: Store) -> Standing:
+def read_run(run_dir: Path, store: Store) -> RunState:
     """Return a read-only view of a run."""
-    return Standing(store, budget_of(run_dir))
+    return RunState(store, budget_of(run_dir))
 
 
 def last_iteration(run_dir: Path) -> int:

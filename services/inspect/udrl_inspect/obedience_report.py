@@ -275,7 +275,7 @@ def _agreement(commanded: Sequence[float], obtained: Sequence[float]) -> Agreeme
     )
 
 
-def keep(run_dir: Path, report: ObedienceReport) -> Path:
+def save_report(run_dir: Path, report: ObedienceReport) -> Path:
     """Write a report to a run's directory, and return the file's path.
 
     Raises:
@@ -289,20 +289,20 @@ def keep(run_dir: Path, report: ObedienceReport) -> Path:
     return path
 
 
-def kept_of(agent: Agent, run_dir: Path) -> ObedienceReport | None:
+def report_of_agent(agent: Agent, run_dir: Path) -> ObedienceReport | None:
     """Return the report in a run's directory if it is about this agent's weights, else None.
 
     Raises:
         InvalidData: the file is invalid.
     """
-    report = kept(run_dir)
+    report = load_report(run_dir)
     if report is None:
         return None
     mine = (report.run_id, report.weights_version) == (agent.run_id, agent.version)
     return report if mine else None
 
 
-def kept(run_dir: Path) -> ObedienceReport | None:
+def load_report(run_dir: Path) -> ObedienceReport | None:
     """Return the report in a run's directory; None if there is none.
 
     Raises:

@@ -99,7 +99,9 @@ class LearnerService:
         try:
             self._asker.ask(verbs.JOIN, self._join)
             declared += [
-                self._transport.appear(key_expressions.alive(run_id, "learner", self._name)),
+                self._transport.declare_presence(
+                    key_expressions.alive(run_id, "learner", self._name)
+                ),
                 self._transport.subscribe(
                     key_expressions.key(run_id, key_expressions.PROGRESS),
                     lambda _: self._progress.set(),

@@ -6,13 +6,13 @@ from udrl.evaluation import return_text
 from udrl.fitting import fits
 from udrl.setting_groups import NetworkSettings
 from udrl_proto.reports import IterationStatus
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 
 #: Share of the budget after which a run should obtain more than random actions do.
 _PATIENCE = 1 / 3
 
 
-def advice(run: Standing) -> str:
+def advice(run: RunState) -> str:
     """Return what most likely keeps a run from learning; empty: it learns, or it is too early.
 
     It does not learn if no evaluation obtains more than the warm-up did, after a third of the

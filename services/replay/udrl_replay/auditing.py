@@ -65,8 +65,8 @@ class Auditor:
     draw: Callable[[], float] = field(default=random.SystemRandom().random)
     open: dict[int, Audit] = field(default_factory=dict)
 
-    def consider(self, command: Command, actor: str, numerics_class: str, digest: bytes) -> None:
-        """Begin an audit of an episode that was accepted, or do not."""
+    def maybe_audit(self, command: Command, actor: str, numerics_class: str, digest: bytes) -> None:
+        """Audit an accepted episode, with the probability ``rate``."""
         if len(self.open) < MOST_OPEN and self.draw() < self.rate:
             self.open[command.id] = Audit(command, numerics_class, {actor: digest})
 

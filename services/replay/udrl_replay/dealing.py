@@ -129,7 +129,7 @@ class Dealer:
             self._put_back(item.command.id, name)
         return held
 
-    def silent(self, here: Container[str], now: float) -> list[str]:
+    def silent_actors(self, here: Container[str], now: float) -> list[str]:
         """Return actors that have said nothing for long, except those that are ``here``."""
         quiet = [n for n, a in self.actors.items() if now - a.last_seen > SILENCE_S]
         return [name for name in quiet if name not in here]
@@ -214,7 +214,7 @@ class Dealer:
         if name in self.actors:
             self.actors[name].last_seen = now
 
-    def fail(self, command_id: int, name: str) -> None:
+    def note_failure(self, command_id: int, name: str) -> None:
         """Note that an actor could not carry out a command."""
         item = self.outstanding[command_id]
         item.failures.append(name)

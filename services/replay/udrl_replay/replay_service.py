@@ -215,7 +215,7 @@ class ReplayService:
         run = self.run
         before = run.progress.iteration
         answers: list[tuple[Question, Message]] = []
-        silent = run.dealer.silent({name for _, name in self._here}, now)
+        silent = run.dealer.silent_actors({name for _, name in self._here}, now)
         if not group and not silent:
             return
         with self._store.transaction():
@@ -242,7 +242,7 @@ class ReplayService:
     def _reply(self, question: Question, now: float) -> Message:
         request: Any = question.request
         if isinstance(request, Malformed):
-            self.run.trust.offend(request.actor, str(request.error))
+            self.run.trust.count_offence(request.actor, str(request.error))
             request = request.error
         if isinstance(request, InvalidData):
             if question.verb.name == verbs.EPISODE.name:

@@ -28,7 +28,7 @@ from udrl_proto.reports import (
 )
 from udrl_replay.advice import advice
 from udrl_replay.remedies import unwritable
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import COLUMNS, EvaluationRow, Store
 
 log = logging.getLogger("udrl")
@@ -136,7 +136,7 @@ class Waits:
         )
 
 
-def status(run: Standing, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
+def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
     progress, dealer, config = run.progress, run.dealer, run.config
     returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
@@ -242,7 +242,7 @@ def history(store: Store, after: int) -> History:
     )
 
 
-def contents(run: Standing) -> Contents:
+def contents(run: RunState) -> Contents:
     """Return what the replay buffer holds, and what its next commands ask for."""
     config = run.config
     entries = list(run.buffer)

@@ -1,4 +1,4 @@
-"""The run itself: issue commands, accept episodes, complete iterations, close.
+"""The run itself: issue commands, accept episodes, complete iterations, evaluate.
 
 It is a state machine over a :class:`~udrl_replay.store.Store`, driven by one thread inside the
 store's transactions; it knows nothing of messaging. Everything that it must remember is in the
@@ -21,7 +21,7 @@ from udrl_proto.text import printable
 from udrl_replay.arrival import Arrival
 from udrl_replay.dealing import SUSPICIOUS
 from udrl_replay.progress import STOPPED
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import EvaluationRow, Store, Version
 from udrl_replay.trust import Trust
 from udrl_replay.versions import is_known
@@ -29,7 +29,7 @@ from udrl_replay.versions import is_known
 log = logging.getLogger("udrl")
 
 
-class StoredRun(Standing):
+class StoredRun(RunState):
     """A run that is worked on, new or resumed.
 
     Args:
@@ -71,7 +71,7 @@ class StoredRun(Standing):
         self.store.set_fact("progress", self.progress)
 
     def stop(self) -> None:
-        """Note that nobody will work on the run, for whoever looks at its file."""
+        """Mark the run as stopped, for processes that read its file."""
         if self.progress.state in ("running", "closing"):
             self.progress.ended_because = STOPPED
         self.save()
@@ -96,12 +96,14 @@ class StoredRun(Standing):
                 return self.trust.compare(arrival)
             return self._accept_again(arrival)
         if arrival.entry.length > item.command.max_steps:
-            self.trust.offend(arrival.actor, f"an episode longer than command {command_id} allows")
+            self.trust.count_offence(
+                arrival.actor, f"an episode longer than command {command_id} allows"
+            )
             raise self.reject(
                 f"episode {command_id} has {arrival.entry.length} steps, its command allows "
                 f"{item.command.max_steps}"
             )
-        self.trust.note(item.command, arrival)
+        self.trust.record_delivery(item.command, arrival)
         self.dealer.remove_command(command_id, now)
         self.store.add_episode(arrival.entry, arrival.digest, arrival.body)
         self.progress.accepted += 1
@@ -127,7 +129,7 @@ class StoredRun(Standing):
             return "duplicate"
         if index >= FINAL_EVALUATION or iteration > self.progress.iteration:
             raise self.reject(f"command {command_id} is cancelled or unknown; drop the episode")
-        self.trust.offend(
+        self.trust.count_offence(
             arrival.actor, f"an episode of command {command_id}, which was never issued"
         )
         raise self.reject(f"command {command_id} was never issued; drop the episode")
@@ -156,7 +158,7 @@ class StoredRun(Standing):
         self.progress.env_failures += 1
         error = printable(failure.error)
         log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, error)
-        self.dealer.fail(failure.command_id, failure.actor)
+        self.dealer.note_failure(failure.command_id, failure.actor)
         if self.dealer.is_hopeless(failure.command_id):
             self._give_up(
                 failure.command_id,

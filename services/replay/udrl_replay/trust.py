@@ -11,7 +11,7 @@ from udrl_proto.messages import CommandsRequest
 from udrl_replay.arrival import Arrival
 from udrl_replay.dealing import MAX_DEALT
 from udrl_replay.quarantine import OFFENCES
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 
 log = logging.getLogger("udrl")
 
@@ -24,7 +24,7 @@ class Trust:
         remove_actor: gives what an actor holds to others.
     """
 
-    def __init__(self, run: Standing, remove_actor: Callable[[str], None]) -> None:
+    def __init__(self, run: RunState, remove_actor: Callable[[str], None]) -> None:
         self._run = run
         self._remove_actor = remove_actor
         # The iteration in which an actor's first episode entered the run.
@@ -40,15 +40,15 @@ class Trust:
         actor.reruns += len(again)
         return again, msgspec.structs.replace(request, wanted=request.wanted - len(again))
 
-    def note(self, command: Command, arrival: Arrival) -> None:
-        """Remember who brings an episode, and perhaps have it made again."""
+    def record_delivery(self, command: Command, arrival: Arrival) -> None:
+        """Record which actor delivered an episode, and perhaps audit it."""
         run, name = self._run, arrival.actor
         if name not in self._entered:
             self._entered[name] = command.iteration
             run.store.set_fact("entered", self._entered)
         if name in run.dealer.actors:
             numerics_class = run.dealer.actors[name].join.numerics_class
-            run.auditor.consider(command, name, numerics_class, arrival.digest)
+            run.auditor.maybe_audit(command, name, numerics_class, arrival.digest)
 
     def compare(self, arrival: Arrival) -> Literal["duplicate"]:
         """Take in an episode that was asked for to check another actor's."""
@@ -68,10 +68,10 @@ class Trust:
                 f"nothing is audited any more"
             )
         else:
-            self._convict(verdict.liar, command_id)
+            self._quarantine_liar(verdict.liar, command_id)
         return "duplicate"
 
-    def _convict(self, liar: str, command_id: int) -> None:
+    def _quarantine_liar(self, liar: str, command_id: int) -> None:
         why = f"its episode of command {command_id} differs from that of two others"
         self.quarantine(liar, why)
         progress = self._run.progress
@@ -84,8 +84,8 @@ class Trust:
             )
             log.error("%s", progress.problem)
 
-    def offend(self, actor: str, what: str) -> None:
-        """Note that an actor delivered what it may not; too often is once too many."""
+    def count_offence(self, actor: str, what: str) -> None:
+        """Count an invalid delivery; quarantine the actor after too many."""
         if self._run.quarantined.count(actor):
             self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
 

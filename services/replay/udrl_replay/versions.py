@@ -3,11 +3,11 @@
 import math
 
 from udrl.errors import Refused
-from udrl_replay.standing import Standing
+from udrl_replay.run_state import RunState
 from udrl_replay.store import Version
 
 
-def is_known(run: Standing, version: Version) -> bool:
+def is_known(run: RunState, version: Version) -> bool:
     """Say whether a version that was delivered is here already.
 
     Raises:

@@ -7,7 +7,7 @@ import click
 from udrl.errors import ConfigError
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_buffer, export_folder, export_model
-from udrl_inspect.obedience_report import kept_of
+from udrl_inspect.obedience_report import report_of_agent
 from udrl_launch.subcommands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
 
 
@@ -44,7 +44,7 @@ def export(
     if folder is not None:
         export_folder(agent, run_dir, folder)
         click.echo(f'folder: {folder}; in Python: udrl.load("{folder}")')
-        if kept_of(agent, run_dir) is None:
+        if report_of_agent(agent, run_dir) is None:
             click.echo(
                 "The model card does not say which returns this agent can deliver. Measure them "
                 "and export again, with: "

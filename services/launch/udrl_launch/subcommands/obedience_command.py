@@ -96,7 +96,7 @@ def obedience(
 def _keep(run_dir: Path, report: reports.ObedienceReport, *, draws: bool) -> list[str]:
     """Write the files in the run's directory, and return what went wrong."""
     try:
-        reports.keep(run_dir, report)
+        reports.save_report(run_dir, report)
         csv_tables.write(
             run_dir / _NAME.with_suffix(".csv"), obedience_text.Row, obedience_text.rows(report)
         )

@@ -1,4 +1,4 @@
-"""A run as its store has it: to be looked at, or to go on from."""
+"""The state of a run as read from its store: to be inspected, or to be resumed."""
 
 import logging
 import time
@@ -16,8 +16,8 @@ from udrl_replay.store import Store
 log = logging.getLogger("udrl")
 
 
-class Standing:
-    """Where a run stands. Making one changes nothing.
+class RunState:
+    """The state of a run. Making one changes nothing.
 
     Args:
         store: the run's file.
