@@ -63,7 +63,9 @@ def test_services_equal_the_reference(run: Runner, tmp_path: Path) -> None:
     agent = load_agent(run_dir)
     commands = evaluation_commands(agent, episodes=2, desired_return=50.7)
     assert evaluate(agent, commands).desired_horizon == 50
-    with pytest.raises(ConfigError, match="desired horizon 30: in this run it always equals the desired return"):
+    with pytest.raises(
+        ConfigError, match="desired horizon 30: in this run it always equals the desired return"
+    ):
         evaluation_commands(agent, episodes=2, desired_horizon=30)
 
 
