@@ -275,3 +275,8 @@ def test_area_average_of_colours_and_of_large_images() -> None:
     found = AreaAverage(480, 640, 60, 80)(image)
     blocks = image.astype(np.int64).reshape(60, 8, 80, 8, 3).sum(axis=(1, 3))
     assert np.array_equal(found, (2 * blocks + 64) // 128)
+
+
+def test_area_average_of_more_pixels_than_32_bits_can_sum() -> None:
+    image = np.full((2100, 2100), 255, np.uint8)
+    assert AreaAverage(2100, 2100, 2, 3)(image).tolist() == [[255] * 3] * 2

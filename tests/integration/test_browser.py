@@ -483,8 +483,9 @@ def test_presets_are_commands_of_the_buffer(
 
 def test_actions_of_several_components_have_names(
     board: Callable[..., str], pages: Callable[..., Page], run: Callable[..., Status],
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     run(build(Config, SETTINGS | {"action_bins": 9}), 400, run_dir=tmp_path / "nested")
     page = pages(board(tmp_path / "nested"))
     expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)

@@ -139,7 +139,7 @@ cli.main()
 
 
 def test_numpy_computes_in_one_thread() -> None:
-    """Its threads spin while they wait: two actors on two cores made a fifth of the steps."""
+    """Its threads spin while they wait: two actors on two cores made a fifth of their env steps."""
     program = """
 import os, sys, click
 from udrl_launch import cli

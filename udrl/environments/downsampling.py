@@ -20,12 +20,11 @@ class AreaAverage:
     """
 
     def __init__(self, height: int, width: int, to_height: int, to_width: int) -> None:
-        # Small integers are exact as floats, in whatever order they are summed, and matrix products
-        # of floats are the fast ones.
         self._area = height * width
-        exact = np.float32 if 255 * self._area < 2**24 else np.float64
-        self._rows: npt.NDArray[Any] = _shares(height, to_height).astype(exact)
-        self._columns: npt.NDArray[Any] = _shares(width, to_width).T.astype(exact)
+        # Sums are at most 255 times the area, and twice that with what rounds them.
+        exact = np.int32 if 511 * self._area < 2**31 else np.int64
+        self._rows = _covered(height, to_height, exact)
+        self._columns = _covered(width, to_width, exact)
 
     def __call__(self, image: Image) -> Image:
         """Return the smaller image.
@@ -36,12 +35,28 @@ class AreaAverage:
         Returns:
             uint8 [to_height, to_width] or [to_height, to_width, channels].
         """
-        channels = image if image.ndim == 3 else image[..., None]
-        planes = np.moveaxis(channels, -1, 0).astype(self._rows.dtype)
-        sums = (self._rows @ planes @ self._columns).astype(np.int64)
-        smaller = ((2 * sums + self._area) // (2 * self._area)).astype(np.uint8)
-        out: Image = np.moveaxis(smaller, 0, -1).reshape(*smaller.shape[1:], *image.shape[2:])
+        # Not a matrix product: a BLAS computes it in threads that wait for each other by spinning,
+        # and that deadlock when an environment in another thread starts a process.
+        rows, shares = self._rows
+        sums = np.einsum("kj,kj...->j...", shares, image[rows])
+        columns, shares = self._columns
+        sums = np.einsum("kj,ikj...->ij...", shares, sums[:, columns])
+        out: Image = ((2 * sums + self._area) // (2 * self._area)).astype(np.uint8)
         return out
+
+
+def _covered(
+    size: int, to_size: int, exact: type[np.signedinteger[Any]]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
+    """Return which pixels each of ``to_size`` covers, and their parts, [most, to_size] each.
+
+    Where one covers fewer than the most, neighbours with no part are among them.
+    """
+    shares = _shares(size, to_size)
+    most = int((shares > 0).sum(axis=1).max())
+    first = np.minimum((shares > 0).argmax(axis=1), size - most)
+    pixels = first + np.arange(most)[:, None]
+    return pixels, shares[np.arange(to_size), pixels].astype(exact)
 
 
 def _shares(size: int, to_size: int) -> npt.NDArray[np.int64]:
