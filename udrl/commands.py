@@ -132,8 +132,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 def episodes_due(settings: CommandSettings, buffer: ReplayBuffer) -> int:
     """Return how many exploratory episodes an iteration has, given the buffer it is drawn from."""
     least, steps = settings.n_episodes_per_iter, settings.n_steps_per_iter
-    newest = buffer.newest()
-    if steps is None or not newest:
+    if steps is None or not (newest := buffer.newest()):
         return least
     wanted = math.ceil(steps * len(newest) / sum(e.length for e in newest))
     return max(least, min(wanted, MOST_EPISODES))

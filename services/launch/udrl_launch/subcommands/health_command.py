@@ -6,7 +6,7 @@ import click
 
 from udrl.errors import Unreachable
 from udrl_inspect.address import Address, connected, host_name, is_of_this_machine
-from udrl_launch.subcommands.options import KEYS, PATIENCE, RUN
+from udrl_launch.subcommands.options import CONNECT_REQUIRED, KEYS, PATIENCE, RUN
 from udrl_proto import key_expressions
 from udrl_proto.access import REPLAY
 from udrl_proto.session import check_endpoint
@@ -16,8 +16,7 @@ _ANSWER_S = 3.0
 
 @click.command()
 @click.argument("role", type=click.Choice([REPLAY, "learner", "actor"]))
-@click.option("--connect", metavar="ENDPOINT", required=True,
-              help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.")  # fmt: skip
+@CONNECT_REQUIRED
 @KEYS
 @PATIENCE
 @RUN

@@ -2,6 +2,7 @@
 
 import math
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -82,9 +83,12 @@ def place(
     raise ConfigError("give either RUN_DIR or --connect ENDPOINT")
 
 
-CONNECT = click.option(
-    "--connect", metavar="ENDPOINT", help="Endpoint of the run, e.g. tcp/127.0.0.1:7447."
-)
+_endpoint_option = partial(
+    click.option, "--connect", metavar="ENDPOINT",
+    help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.",
+)  # fmt: skip
+CONNECT = _endpoint_option()
+CONNECT_REQUIRED = _endpoint_option(required=True)
 WEIGHTS = click.option(
     "--weights", default="latest", show_default=True, metavar="latest|best|VERSION",
     shell_complete=completions.weights,

@@ -24,6 +24,7 @@ from udrl_launch.process import (
 from udrl_launch.subcommands.options import (
     ALLOW_INEXACT,
     AUDIT,
+    CONNECT_REQUIRED,
     INSECURE,
     KEYS,
     PARENT,
@@ -104,12 +105,7 @@ def replay(
 
 
 @click.command()
-@click.option(
-    "--connect",
-    metavar="ENDPOINT",
-    required=True,
-    help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.",
-)
+@CONNECT_REQUIRED
 @KEYS
 @PATIENCE
 @RUN
@@ -129,12 +125,7 @@ def learner(
 
 
 @click.command()
-@click.option(
-    "--connect",
-    metavar="ENDPOINT",
-    required=True,
-    help="Endpoint of the run, e.g. tcp/127.0.0.1:7447.",
-)
+@CONNECT_REQUIRED
 @click.option("--envs", type=click.IntRange(1, 4096), default=16, show_default=True, metavar="N",
               help="Environments to step at once.")  # fmt: skip
 @click.option("--nice", type=click.IntRange(0, 19), default=0, show_default=True, metavar="N",
