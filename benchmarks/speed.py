@@ -79,11 +79,12 @@ class Usage(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Seconds of each part alone."""
+    """Seconds of each part alone: in one thread, a chained update in as many as the run's."""
 
     step: float
     inference: float
     update: float
+    chained_update: float
     bare_update: float
 
 
@@ -106,7 +107,12 @@ def main() -> None:
         print(json.dumps(_parts(*_recorded(options.parts))))
         return
     print(f"machine: {_machine()}")
-    rows = [measure(options, Path(folder)) for folder in _folders(options.repeats)]
+    rows = []
+    for folder in _folders(options.repeats):
+        rows.append(measure(options, Path(folder)))
+        ratio, system = (rows[-1][n] for n in ("system / limit", "system, env steps/s"))
+        done = f"repetition {len(rows)} of {options.repeats}"
+        print(f"{done}: {system:,.0f} env steps/s, {ratio:.2f} of the limit", flush=True)
     for name in rows[0]:
         values = [row[name] for row in rows]
         low, middle, high = min(values), statistics.median(values), max(values)
@@ -137,8 +143,8 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
     per_step = config.training.n_updates_per_iter * window.iterations / window.steps
 
     def limit(parts: Parts, per_step: float = per_step, cores: int = cores) -> float:
-        training = parts.update * per_step
-        return min(cores / (parts.step + parts.inference + training), 1 / training)
+        work = parts.step + parts.inference + parts.update * per_step
+        return min(cores / work, 1 / (parts.chained_update * per_step))
 
     parts, busy = _time_parts(run_dir, 1), _time_parts(run_dir, cores)
     system = window.steps / window.seconds
@@ -150,6 +156,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
         "bare environment, random actions, env steps/s per core": _random_speed(config),
         "inference, us per row (full call)": parts.inference * 1e6,
         "update, ms": parts.update * 1e3,
+        "update in the run's threads, ms": parts.chained_update * 1e3,
         "bare update, on tensors in memory, ms": parts.bare_update * 1e3,
         "update / bare update": parts.update / parts.bare_update,
         "updates per 1,000 env steps": per_step * 1000,
@@ -256,8 +263,6 @@ def _time_parts(run_dir: Path, processes: int) -> Parts:
 
 
 def _parts(config: Config, episodes: list[Episode]) -> Parts:
-    # The limit counts the time of cores; more threads an update would take more of them.
-    config = change(config, training_threads=1)
     generator = EpisodeGenerator(config, 1)
     spec = generator.spec
     env = make_environment(config)
@@ -277,10 +282,16 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
     experience = Experience(config, spec)
     for episode in episodes:
         experience.add(episode)
-    state = untrained(config, spec)
     ranked = experience.by_rank([e.command_id for e in episodes])
-    update = _seconds(lambda: train(state, ranked, config), 5) / config.training.n_updates_per_iter
-    return Parts(step, inference, update, _bare_update(config, spec))
+
+    def seconds_per_update(settings: Config) -> float:
+        state, n = untrained(settings, spec), settings.training.n_updates_per_iter
+        return _seconds(lambda: train(state, ranked, settings), 5) / n
+
+    # The bound of the cores counts the time of one; that of the chain, the time that passes.
+    update = seconds_per_update(change(config, training_threads=1))
+    chained = seconds_per_update(config)
+    return Parts(step, inference, update, chained, _bare_update(config, spec))
 
 
 def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
@@ -348,6 +359,10 @@ def _reference_run(config: Config, steps: int) -> Window:
         ),
     )
     first, last = reports[len(reports) // 2], reports[-1]
+    if last.iterations == first.iterations:
+        raise SystemExit(
+            f"--reference-steps {steps}: the warm-up takes {first.steps:,} env steps; raise it"
+        )
     return Window(
         last.seconds - first.seconds, last.steps - first.steps, last.iterations - first.iterations
     )

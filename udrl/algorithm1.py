@@ -87,10 +87,9 @@ def algorithm1(
         raise ConfigError(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
-    config = settle(config)
+    config = settle(fit(config, left_open))
     generator = EpisodeGenerator(config, n_environments)
     config, offline = settle_dataset(config, generator.spec)
-    config = fit(config, left_open, generator, offline)
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
 

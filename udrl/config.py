@@ -136,6 +136,7 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
 
 #: Settings that accept ``auto``, with placeholders until they are chosen (:mod:`udrl.fitting`).
 OPEN: Mapping[str, Any] = {
+    "observe_time": False,
     "return_scale": 1.0,
     "horizon_scale": 1.0,
     "baseline": "value",

@@ -7,6 +7,7 @@ that are played for it. A :class:`udrl.config.Config` holds the choice.
 
 import math
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from hashlib import blake2b
 
 import msgspec
@@ -15,6 +16,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import CommandSampler
 from udrl.config import OPEN, Config, change
 from udrl.episode import Episode
+from udrl.offline import settle_dataset
 
 #: Random episodes that are looked at: so many, and more until there are enough env steps; fewer if
 #: they are long.
@@ -34,27 +36,46 @@ _WARM_UP, _WARM_UP_STEPS = 50, 4_000
 _LEAST_LAMBDA, _REACH = 0.95, 4.0
 
 
-def fit(
+def fit(config: Config, left_open: Collection[str]) -> Config:
+    """Return the settings of a new run, with those chosen that were left open.
+
+    The environment is made once, and only if anything is open.
+
+    Args:
+        config: the settings; the values of open ones have no meaning.
+        left_open: names of open ones, among :data:`udrl.config.OPEN`.
+
+    Raises:
+        ConfigError: the settings contradict what was chosen, or the dataset cannot be used.
+        UnsupportedEnvironment: the environment does not exist or is not supported.
+        EnvironmentFault: the environment failed three times under the same command.
+    """
+    if not left_open:
+        return config
+    with closing(EpisodeGenerator(config, 1)) as generator:
+        _, offline = settle_dataset(config, generator.spec)
+        return choose(config, left_open, generator, offline)
+
+
+def choose(
     config: Config,
     left_open: Collection[str],
     generator: EpisodeGenerator,
     episodes: Sequence[Episode] | None = None,
 ) -> Config:
-    """Return the settings of a new run, with those chosen that were left open.
+    """Return settings with the open ones chosen.
 
     Args:
-        config: the settings; the values of open ones count for nothing.
+        config: the settings; the values of open ones have no meaning.
         left_open: names of open ones, among :data:`udrl.config.OPEN`.
-        generator: plays the first commands of the warm-up, if anything is open.
+        generator: plays the first commands of the warm-up.
         episodes: to look at instead.
 
     Raises:
-        ConfigError: the settings do not go with what was chosen.
+        ConfigError: the settings contradict what was chosen.
         EnvironmentFault: the environment failed three times under the same command.
     """
     assert OPEN.keys() >= set(left_open)
-    if not left_open:
-        return config
     hold, n_warm_up = config.commands.warm_up_hold, config.commands.n_warm_up_episodes
     if episodes is not None:
         sample = Sample()
@@ -72,6 +93,9 @@ def fit(
     if config.training.segments == "all":
         baseline = "none"  # no other goes with them
     chosen = {
+        # An agent that does not see a step limit cannot plan for it. Where episodes end long before
+        # it, the time left says little, and agents that saw it learned more slowly.
+        "observe_time": 2 * length > _limit(config, generator),
         "return_scale": _rounded(1 / reach) if reach else 1.0,
         # How long an episode lasts is luck too, and one that is asked to be short would gamble.
         "horizon_scale": 0.0 if sample.by_chance else _rounded(1 / length),
@@ -157,6 +181,12 @@ def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
 def fits(scale: float, size: float) -> bool:
     """Say whether a scale makes a number that a network reads well of what is usual."""
     return 0.0 in (size, scale) or _LEAST <= scale * size <= _MOST
+
+
+def _limit(config: Config, generator: EpisodeGenerator) -> int:
+    """Return how many steps of a random episode are looked at, at most."""
+    training = config.max_train_steps or _LONGEST
+    return min(generator.spec.max_episode_steps, training, _LONGEST)
 
 
 def _rounded(scale: float) -> float:

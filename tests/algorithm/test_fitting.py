@@ -11,7 +11,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
 from udrl.config import OPEN, Budget, Config, build, change
 from udrl.episode import Episode
-from udrl.fitting import Sample, fit, fits
+from udrl.fitting import Sample, choose, fit, fits
 
 
 class Endless(gym.Env[Any, Any]):
@@ -67,21 +67,21 @@ def episodes(*returns_and_lengths: tuple[float, int]) -> list[Episode]:
 def test_scales_are_one_over_what_is_usual(
     found: list[tuple[float, int]], scales: tuple[float, float]
 ) -> None:
-    network = fit(config(), SCALES, EpisodeGenerator(config(), 1), episodes(*found)).network
+    network = choose(config(), SCALES, EpisodeGenerator(config(), 1), episodes(*found)).network
     assert (network.return_scale, network.horizon_scale) == scales
 
 
 def test_what_is_given_stays() -> None:
     generator = EpisodeGenerator(config(), 1)
     given = config(return_scale=0.5, horizon_scale=0.5)
-    assert fit(given, (), generator) == given
-    half = fit(given, ("horizon_scale",), generator).network
+    assert fit(given, ()) == given
+    half = choose(given, ("horizon_scale",), generator).network
     assert half.return_scale == 0.5
     assert half.horizon_scale != 0.5
 
 
 def test_the_choice_does_not_depend_on_how_many_environments_there_are() -> None:
-    fitted = [fit(config(), OPEN, EpisodeGenerator(config(), n)) for n in (1, 7)]
+    fitted = [choose(config(), OPEN, EpisodeGenerator(config(), n)) for n in (1, 7)]
     assert fitted[0] == fitted[1]
     assert 0.01 < fitted[0].network.return_scale < 0.1
 
@@ -89,7 +89,7 @@ def test_the_choice_does_not_depend_on_how_many_environments_there_are() -> None
 def test_algorithm_1_chooses_them() -> None:
     small = {"n_warm_up_episodes": 4, "n_episodes_per_iter": 2, "n_updates_per_iter": 2,
              "batch_size": 16, "replay_size": 10, "last_few": 2}  # fmt: skip
-    fitted = fit(config(**small), SCALES, EpisodeGenerator(config(**small), 1))
+    fitted = fit(config(**small), SCALES)
     budget = Budget(max_env_steps=300)
     ways = [
         algorithm1(config(**small), budget, left_open=SCALES),
@@ -137,7 +137,7 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
         Config,
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
     )
-    fitted = fit(
+    fitted = choose(
         settings,
         ("baseline", "horizon_scale", "held_actions", "held_rate"),
         EpisodeGenerator(settings, 1),
@@ -147,9 +147,7 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
     assert fitted.commands.held_actions == (0.5 if slippery else 0.25)
     assert fitted.commands.held_rate == (0.15 if slippery else 0.05)
     everything = change(settings, segments="all")
-    assert (
-        fit(everything, ("baseline",), EpisodeGenerator(everything, 1)).network.baseline == "none"
-    )
+    assert fit(everything, ["baseline"]).network.baseline == "none"
 
 
 @pytest.mark.parametrize(
@@ -163,7 +161,7 @@ def test_a_scale_fits_what_is_usual_or_not(scale: float, size: float, good: bool
 @pytest.mark.parametrize(("environment", "expected"), [("MountainCar-v0", 32), ("CartPole-v1", 1)])
 def test_actions_are_held_where_one_step_moves_little(environment: str, expected: int) -> None:
     settings = config(environment=environment)
-    fitted = fit(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
+    fitted = choose(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
     assert fitted.warm_up_hold == expected
     assert fitted.hold_steps == settings.commands.hold_steps
 
@@ -172,14 +170,14 @@ def test_actions_are_held_where_one_step_moves_little(environment: str, expected
 def test_lambda_follows_the_length_of_episodes(length: int, expected: float) -> None:
     settings = config()
     generator = EpisodeGenerator(settings, 1)
-    fitted = fit(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
+    fitted = choose(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
     assert fitted.training.return_lambda == expected
 
 
 def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
     endless = config(environment=Endless.id)
     with closing(EpisodeGenerator(endless, 1)) as generator:
-        fitted = fit(endless, OPEN, generator)
+        fitted = choose(endless, OPEN, generator)
     assert Endless.steps <= 60_000
     assert fitted.network.horizon_scale == 0.0005
     assert fitted.commands.n_warm_up_episodes == 50
@@ -187,12 +185,38 @@ def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
 
 def test_short_episodes_are_many_in_the_warm_up() -> None:
     settings = config(environment="FrozenLake-v1")
-    fitted = fit(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
+    fitted = choose(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
     assert 300 < fitted.n_warm_up_episodes < 1_000  # of about 8 steps
 
 
 def test_a_dataset_decides_how_many_episodes_the_warm_up_has() -> None:
     settings = config(n_warm_up_episodes=3)
-    fitted = fit(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
+    fitted = choose(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
     assert fitted.commands.n_warm_up_episodes == 3
     assert fitted.commands.warm_up_hold == 1
+
+
+@pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])
+def test_the_time_is_shown_where_random_episodes_last_for_half_the_step_limit(
+    environment: str, shown: bool
+) -> None:
+    assert fit(config(environment=environment), ("observe_time",)).observe_time is shown
+
+
+@pytest.mark.parametrize(
+    ("lengths", "limits", "shown"),
+    [
+        ((49, 51), {}, False),
+        ((50, 51), {}, True),
+        ((30, 30), {"max_train_steps": 50}, True),  # none can be longer
+        ((999, 999), {"max_episode_steps": 100_000}, False),
+        ((1_100, 1_100), {"max_episode_steps": 100_000}, True),  # of the 2,000 that are looked at
+    ],
+)
+def test_lengths_are_compared_with_the_limit_of_random_episodes(
+    lengths: tuple[int, ...], limits: dict[str, int], shown: bool
+) -> None:
+    settings = config(**{"max_episode_steps": 100} | limits)
+    found = episodes(*[(1.0, length) for length in lengths])
+    with closing(EpisodeGenerator(settings, 1)) as generator:
+        assert choose(settings, ["observe_time"], generator, found).observe_time is shown

@@ -12,12 +12,13 @@ from tests.foreign.conventions import Plain, register
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config, build
-from udrl.errors import OtherConfiguration
+from udrl.errors import Deceived, OtherConfiguration
 from udrl.repeating import difference
 from udrl.streams import Purpose, stream_key
 from udrl_inspect.inspection import read_status
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Status
+from udrl_replay.progress import RunProgress
 from udrl_replay.resuming import resume
 from udrl_replay.store import Store
 
@@ -85,6 +86,19 @@ def test_changed_environment_is_found_when_a_run_goes_on(
     assert status.state == "ended"
     assert not status.exact
     assert "has changed" in status.inexact_reason
+
+
+def test_a_liar_is_named_although_its_episodes_are_not_the_environments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(Changing, tmp_path / "run")
+    with closing(Store(tmp_path / "run")) as store, store.transaction():
+        progress = store.fact("progress", RunProgress)
+        progress.deceived, progress.problem = True, "actor a1 lied"
+        store.set_fact("progress", progress)
+    monkeypatch.setattr(Changing, "today", 10.0)
+    with pytest.raises(Deceived, match="actor a1 lied"):
+        train(Changing, tmp_path / "run", resume=True, max_env_steps=800)
 
 
 def test_difference_is_the_first_step_that_is_another() -> None:

@@ -18,7 +18,7 @@ BLOCKS = Page("docs/tutorial.md").blocks
 #: What differs between machines in the output, and what stands for it.
 _MASKS = [
     (r"(Command returns|Higher commands|This agent does not) .*", "VERDICT"),
-    (r"  obeyed$|, cut by its time limit$", ""),
+    (r"  obeyed$|, cut by its time limit$| \(time limit reached\)$", ""),
     (r"-[0-9a-f]{8}\b", "-ID"),
     (r"-?\d[\d.,]*(?:[:e]-?\d+)*", "N"),
 ]

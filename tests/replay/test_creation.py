@@ -53,6 +53,20 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
     assert created.fact("progress", RunProgress) == RunProgress()
 
 
+@pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])
+def test_spaces_are_those_after_settings_are_chosen(
+    environment: str, shown: bool, tmp_path: Path
+) -> None:
+    config = Config(environment=environment)
+    with closing(creation.create(tmp_path, config, left_open=["observe_time"])) as store:
+        hello = store.fact("hello", Hello)
+    assert hello.config.observe_time is shown
+    with closing(EpisodeGenerator(hello.config, 1)) as generator:
+        assert hello.environment == generator.spec
+        assert hello.environment_digest == environment_digest(generator)
+    assert ("time_left" in str(hello.environment.observation_space)) is shown
+
+
 def test_environment_that_does_not_replay_marks_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -20,7 +20,7 @@ from udrl.config import Config, change, flat
 from udrl.cost import slow
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
-from udrl.fitting import fit, fits
+from udrl.fitting import choose, fits
 from udrl.repeating import environment_digest, repeated_digest
 
 #: Random episodes, and seconds after which no further one is started.
@@ -95,12 +95,13 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
     advice = _of_gymnasium(env.unwrapped)
     env.close()
     with closing(EpisodeGenerator(config, 1)) as generator:
-        spec = generator.spec
         memory = (_memory() - before) / 2  # two were created
+        fitted = choose(config, left_open, generator) if left_open else config
+    with closing(EpisodeGenerator(fitted, 1)) as generator:
+        spec = generator.spec
         digest = repeated_digest(generator)
-        fitted = fit(config, left_open, generator)
         episodes, reset_s, step_s = _play(generator, fitted)
-    with closing(EpisodeGenerator(config, 1)) as another:
+    with closing(EpisodeGenerator(fitted, 1)) as another:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
     advice += _unusual(fitted, episodes, repeats=repeats)

@@ -98,15 +98,14 @@ def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
 def _create(
     run_dir: Path, config: Config, left_open: Collection[str], *, allow_inexact: bool
 ) -> Store:
-    config = settle(config)
     make_strategy(config)
+    if left_open:
+        log.info("choosing settings by random episodes of %s", config.environment)
+    config = settle(fit(config, left_open))
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First, as an actor does it: in an instance that has seen nothing else.
         digest = repeated_digest(generator)
         config, offline = settle_dataset(config, generator.spec)
-        if left_open:
-            log.info("choosing settings by random episodes of %s", config.environment)
-        config = fit(config, left_open, generator, offline)
     exact = digest != ""
     progress = RunProgress(exact=exact)
     if not exact:

@@ -56,7 +56,9 @@ def resume(
             hello = msgspec.structs.replace(hello, allow_inexact=True)
             with store.transaction():
                 store.set_fact("hello", hello)
-        if check_environment and store.fact("progress", RunProgress).exact:
+        progress = store.fact("progress", RunProgress)
+        # The episodes of a run with a liar are not the environment's.
+        if check_environment and progress.exact and not progress.deceived:
             _check_environment(store, hello, allow_inexact=allow_inexact)
     return store
 
