@@ -1,8 +1,8 @@
-"""What actions are: how they are chosen from the behavior function's outputs, and checked.
+"""Action spaces: how actions are chosen from the behavior function's outputs, and checked.
 
-A ``Discrete`` action is one index. All others are several at once, each chosen by itself given the
-observation and the command: the components of a ``MultiDiscrete``, the bits of a ``MultiBinary``,
-and the dimensions of a ``Box``, whose values fall into bins
+A ``Discrete`` action is one index. All other actions have several components, which are independent
+given the observation and the command: the components of a ``MultiDiscrete``, the bits of a
+``MultiBinary``, and the dimensions of a ``Box``, whose values are binned
 (:mod:`udrl.environments.action_conversions`).
 """
 
@@ -21,32 +21,32 @@ Numbers = npt.NDArray[np.float64]
 
 
 class Categorical(Indices, frozen=True, tag="categorical"):
-    """One of ``n`` actions, an index from 0 on; the behavior function gives a logit for each.
+    """One of ``n`` actions, an index from 0; the behavior function outputs a logit for each.
 
-    An action takes one uniform number.
+    Sampling an action takes one uniform number.
     """
 
     @property
     def n_parameters(self) -> int:
-        """Outputs of the behavior function."""
+        """Number of outputs of the behavior function."""
         return self.n
 
     @property
     def components(self) -> tuple[int, ...]:
-        """How many values there are of each component, which is the action itself."""
+        """Number of values of each component; the action is the only one."""
         return (self.n,)
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The smaller of uint8 and int32 that holds them."""
+        """uint8 for at most 256 actions, otherwise int32."""
         return np.dtype(np.uint8 if self.n <= 256 else np.int32)
 
     def sample(self, logits: Numbers, temperature: Numbers, uniforms: Numbers) -> Actions:
-        """Return an action of each row, by inverse CDF in float64.
+        """Sample an action for each row, by inverse CDF in float64.
 
         Args:
-            logits: of P(a | s, c), float64 [rows, n].
-            temperature: logits are divided by it, float64 [rows, 1], more than 0.
+            logits: logits of P(a | s, c), float64 [rows, n].
+            temperature: divisor of the logits, float64 [rows, 1], above 0.
             uniforms: float64 [rows] in [0, 1).
 
         Returns:
@@ -61,12 +61,12 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         return actions
 
     def mode(self, logits: Numbers) -> Actions:
-        """Return the likeliest action of each row, int64 [rows], for float64 [rows, n]."""
+        """Return the most likely action of each row, int64 [rows], for float64 [rows, n]."""
         actions: Actions = logits.argmax(axis=1)
         return actions
 
     def uniform(self, uniforms: Numbers) -> Actions:
-        """Return actions that are all as likely, int64 [rows], for float64 [rows] in [0, 1)."""
+        """Return uniformly random actions, int64 [rows], for float64 [rows] in [0, 1)."""
         return (uniforms * self.n).astype(np.int64)
 
     def allowed(self, mask: npt.NDArray[Any], actions: Actions) -> npt.NDArray[np.bool_]:
@@ -75,11 +75,11 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         return ones
 
     def probabilities(self, logits: Numbers, temperature: float) -> Numbers:
-        """Return the distribution over actions, float64 [n], for logits of the same shape.
+        """Return the distribution over actions, float64 [n].
 
         Args:
-            logits: of P(a | s, c).
-            temperature: logits are divided by it; 0: all on the mode.
+            logits: logits of P(a | s, c), float64 [n].
+            temperature: divisor of the logits; 0 = probability 1 for the most likely action.
         """
         if temperature == 0:
             weights: Numbers = np.zeros(self.n)
@@ -90,12 +90,12 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         return shares
 
     def choose(self, logits: Numbers, temperature: float, uniform: float) -> int:
-        """Return the action that Algorithm 2 takes in one row.
+        """Choose one action, as in Algorithm 2.
 
         Args:
-            logits: of P(a | s, c), float64 [n].
-            temperature: logits are divided by it; 0: take the mode.
-            uniform: the number in [0, 1) that decides.
+            logits: logits of P(a | s, c), float64 [n].
+            temperature: divisor of the logits; 0 = the most likely action.
+            uniform: random number in [0, 1).
         """
         if temperature == 0:
             return int(self.mode(logits[None])[0])
@@ -104,33 +104,33 @@ class Categorical(Indices, frozen=True, tag="categorical"):
 
 
 class Product(IndexVectors, frozen=True, tag="product"):
-    """Several indices at once, component i one of ``ns[i]``; each has a distribution of its own.
+    """Several indices, component i one of ``ns[i]``, each with its own categorical distribution.
 
-    The behavior function's outputs are the logits of all components, one after another. An action
-    takes one uniform number for each component.
+    The behavior function's outputs are the concatenated logits of all components. Sampling an
+    action takes one uniform number per component.
     """
 
     @property
     def n_parameters(self) -> int:
-        """Outputs of the behavior function."""
+        """Number of outputs of the behavior function."""
         return sum(self.ns)
 
     @property
     def components(self) -> tuple[int, ...]:
-        """How many values there are of each component."""
+        """Number of values of each component."""
         return self.ns
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The smaller of uint8 and int32 that holds them."""
+        """uint8 if all components have at most 256 values, otherwise int32."""
         return np.dtype(np.uint8 if max(self.ns) <= 256 else np.int32)
 
     def sample(self, logits: Numbers, temperature: Numbers, uniforms: Numbers) -> Actions:
-        """Return an action of each row, by inverse CDF in float64.
+        """Sample an action for each row, by inverse CDF in float64.
 
         Args:
-            logits: of P(a | s, c), float64 [rows, n_parameters].
-            temperature: logits are divided by it, float64 [rows, 1], more than 0.
+            logits: logits of P(a | s, c), float64 [rows, n_parameters].
+            temperature: divisor of the logits, float64 [rows, 1], above 0.
             uniforms: float64 [rows, components] in [0, 1).
 
         Returns:
@@ -144,7 +144,7 @@ class Product(IndexVectors, frozen=True, tag="product"):
         return actions
 
     def mode(self, logits: Numbers) -> Actions:
-        """Return the likeliest action of each row, int64 [rows, components].
+        """Return the most likely action of each row, int64 [rows, components].
 
         Args:
             logits: float64 [rows, n_parameters].
@@ -153,7 +153,7 @@ class Product(IndexVectors, frozen=True, tag="product"):
         return actions
 
     def uniform(self, uniforms: Numbers) -> Actions:
-        """Return actions that are all as likely, int64, for float64 [rows, components]."""
+        """Return uniformly random actions, int64, for float64 [rows, components] in [0, 1)."""
         actions: Actions = (uniforms * np.array(self.ns)).astype(np.int64)
         return actions
 
@@ -164,11 +164,11 @@ class Product(IndexVectors, frozen=True, tag="product"):
         return ones
 
     def probabilities(self, logits: Numbers, temperature: float) -> Numbers:
-        """Return the distributions of all components, one after another, float64 [n_parameters].
+        """Return the concatenated distributions of all components, float64 [n_parameters].
 
         Args:
-            logits: of P(a | s, c), float64 [n_parameters].
-            temperature: logits are divided by it; 0: all on the modes.
+            logits: logits of P(a | s, c), float64 [n_parameters].
+            temperature: divisor of the logits; 0 = probability 1 for the most likely action.
         """
         parts = np.split(logits, self.ends[:-1])
         shares = [
@@ -178,12 +178,12 @@ class Product(IndexVectors, frozen=True, tag="product"):
         return np.concatenate(shares)
 
     def choose(self, logits: Numbers, temperature: float, uniform: Numbers) -> Actions:
-        """Return the action that Algorithm 2 takes in one row, int64 [components].
+        """Choose one action, int64 [components], as in Algorithm 2.
 
         Args:
-            logits: of P(a | s, c), float64 [n_parameters].
-            temperature: logits are divided by it; 0: take the mode.
-            uniform: the numbers in [0, 1) that decide, float64 [components].
+            logits: logits of P(a | s, c), float64 [n_parameters].
+            temperature: divisor of the logits; 0 = the most likely action.
+            uniform: random numbers in [0, 1), float64 [components].
         """
         row, divisor = logits[None], np.array([[temperature]])
         chosen = self.sample(row, divisor, uniform[None]) if temperature else self.mode(row)
@@ -192,43 +192,42 @@ class Product(IndexVectors, frozen=True, tag="product"):
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Where the logits of each component end."""
+        """End of each component's logits, exclusive."""
         return tuple(accumulate(self.ns))
 
     def _weights(self, logits: Numbers, temperature: Numbers) -> Numbers:
-        """Return numbers in proportion to the probabilities, [rows, components, most]."""
+        """Return unnormalised probabilities, [rows, components, max(ns)]."""
         padded = self._padded(logits)
         padded -= np.maximum.reduce(padded, axis=2, keepdims=True)
         weights: Numbers = np.exp(padded / temperature)
         return weights
 
     def _padded(self, logits: Numbers) -> Numbers:
-        """Return logits by component, [rows, components, most]; impossible ones are -inf."""
-        places, impossible = _places(self.ns)
+        """Return logits by component, [rows, components, max(ns)], padded with -inf."""
+        places, padding = _places(self.ns)
         padded: Numbers = logits[:, places]
-        padded[:, impossible] = -np.inf
+        padded[:, padding] = -np.inf
         return padded
 
 
 @lru_cache
 def _places(ns: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Return where a component's logits stand, [components, most], and which do not exist."""
+    """Return the indices of each component's logits, [components, max(ns)], and the padding."""
     number = np.arange(max(ns))[None, :]
     sizes = np.array(ns)[:, None]
     first = np.cumsum(sizes)[:, None] - sizes
     return first + np.minimum(number, sizes - 1), number >= sizes
 
 
-#: The kinds there are.
 ActionSpace = Categorical | Product
 
 
 def random_actions(space: ActionSpace, mask: npt.NDArray[Any] | None, uniforms: Numbers) -> Actions:
-    """Return actions that are all as likely, of those that are allowed, int64 [rows, *shape].
+    """Return uniformly random allowed actions, int64 [rows, *shape].
 
     Args:
-        space: of the actions.
-        mask: 1 for what is allowed, 0 for all else, [rows, n_parameters]; None: everything is.
+        space: the action space.
+        mask: 1 for allowed actions, otherwise 0, [rows, n_parameters]; None: all are allowed.
         uniforms: float64 [rows, *shape] in [0, 1).
     """
     if mask is None:

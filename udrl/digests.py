@@ -1,8 +1,8 @@
-"""SHA-256 digests of content: two runs are equal when these are.
+"""SHA-256 digests of content: two runs are equal if their digests are.
 
-They cover decoded values, not encodings: weights by name, dtype, shape and bytes; episodes by their
-arrays; a buffer by its episodes in the order of (return, id). Who made an episode and when is left
-out. Numbers are little-endian.
+Digests cover decoded values, not encodings: weights by name, dtype, shape and bytes; episodes by
+their arrays; a buffer by its episodes in the order of (return, id). The actor of an episode and the
+time are not included. Numbers are little-endian.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ Digest = bytes
 
 
 def arrays_digest(arrays: Mapping[str, npt.NDArray[np.generic]]) -> Digest:
-    """Return the digest of named arrays, whatever order they come in."""
+    """Return the digest of named arrays, independent of their order."""
     sha = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -46,7 +46,7 @@ def episode_digest(episode: Episode) -> Digest:
 
 
 def replay_digest(episode_digests: Iterable[Digest]) -> Digest:
-    """Return the digest of a buffer from those of its episodes, in the buffer's order."""
+    """Return the digest of a buffer from its episodes' digests, in the buffer's order."""
     sha = hashlib.sha256()
     for digest in episode_digests:
         sha.update(digest)

@@ -1,81 +1,81 @@
-"""Every error that this project raises on purpose.
+"""The exceptions of this project.
 
 ::
 
     UdrlError
-    ├── ConfigError              a setting, preset or file that cannot be used
-    │   └── UnsupportedEnvironment   an environment we cannot act in
-    ├── EnvironmentFault         an environment raised, or returned what it may not
-    ├── InvalidData              bytes from outside that are not what they should be
-    │   ├── InvalidMessage           a message
-    │   └── InvalidWeights           a set of tensors
-    ├── PeerError                another process
-    │   ├── Unreachable              does not answer
-    │   └── Refused                  answered no
-    ├── StoreError               the run directory
-    │   ├── RunInUse                 another replay service holds it
-    │   ├── OtherConfiguration       it belongs to another configuration
+    ├── ConfigError              invalid setting, preset or file
+    │   └── UnsupportedEnvironment   the environment does not exist or is not supported
+    ├── EnvironmentFault         an environment raised an exception or returned an invalid value
+    ├── InvalidData              invalid external data
+    │   ├── InvalidMessage           a message does not follow the protocol
+    │   └── InvalidWeights           tensors with wrong names, shapes, dtypes or values
+    ├── PeerError                failed communication with another process
+    │   ├── Unreachable              no reply within the deadline
+    │   └── Refused                  the request was refused
+    ├── StoreError               unusable run directory
+    │   ├── RunInUse                 another replay service has locked it
+    │   ├── OtherConfiguration       it belongs to a run with other settings
     │   └── DamagedStore             its content is not what was written
-    ├── RunFailed                the run cannot go on
-    │   └── Deceived                 an actor lied, and the run has learned from it
-    └── Interrupted              a wait that ended because the process was told to stop
+    ├── RunFailed                the run cannot continue
+    │   └── Deceived                 the run was trained on false episodes of an actor
+    └── Interrupted              a wait ended because the process was asked to stop
 
-A message names the value, what was expected, and the remedy. ``exit_code`` is what a command ends
-with (``docs/operations-reference.md``).
+A message names the value, what was expected, and the remedy. ``exit_code`` is the exit code of a
+command (``docs/operations-reference.md``).
 """
 
 
 class UdrlError(Exception):
-    """Base of all; catch it to catch everything that we raise on purpose."""
+    """Base class of all exceptions of this project."""
 
     exit_code = 1
 
 
 class ConfigError(UdrlError):
-    """A setting, preset or configuration file that cannot be used."""
+    """A setting, preset or configuration file is invalid."""
 
     exit_code = 2
 
 
 class UnsupportedEnvironment(ConfigError):
-    """An environment that does not exist or whose spaces are not supported."""
+    """An environment does not exist, or is not supported."""
 
 
 class EnvironmentFault(UdrlError):
-    """An environment raised an exception or returned a value it may not return."""
+    """An environment raised an exception or returned an invalid value."""
 
     exit_code = 3
 
 
 class InvalidData(UdrlError):
-    """Bytes from outside that are not what they should be."""
+    """External data is invalid."""
 
     exit_code = 5
 
 
 class InvalidMessage(InvalidData):
-    """A message that does not follow the protocol."""
+    """A message does not follow the protocol."""
 
 
 class InvalidWeights(InvalidData):
-    """Tensors with wrong names, shapes, dtypes or values."""
+    """Tensors have wrong names, shapes, dtypes or values."""
 
 
 class PeerError(UdrlError):
-    """Another process of the run."""
+    """Communication with another process failed."""
 
     exit_code = 6
 
 
 class Unreachable(PeerError):
-    """Nobody answered within the deadline."""
+    """There was no reply within the deadline."""
 
 
 class Refused(PeerError):
-    """The peer answered, and the answer is no.
+    """The peer refused the request.
 
     Attributes:
-        code: the protocol's name for the reason (``docs/protocol.md``).
+        code: code of the reason in the protocol (``docs/protocol.md``).
     """
 
     exit_code = 7
@@ -86,17 +86,17 @@ class Refused(PeerError):
 
 
 class StoreError(UdrlError):
-    """The run directory."""
+    """The run directory cannot be used."""
 
     exit_code = 8
 
 
 class RunInUse(StoreError):
-    """Another replay service holds the run directory."""
+    """Another replay service has locked the run directory."""
 
 
 class OtherConfiguration(StoreError):
-    """The run directory belongs to another configuration."""
+    """The run directory belongs to a run with other settings."""
 
 
 class DamagedStore(StoreError):
@@ -104,18 +104,18 @@ class DamagedStore(StoreError):
 
 
 class RunFailed(UdrlError):
-    """The run cannot go on, whoever works on it."""
+    """The run cannot continue."""
 
     exit_code = 9
 
 
 class Deceived(RunFailed):
-    """An actor lied, and the run has learned from its episodes."""
+    """The run was trained on false episodes, which an actor delivered."""
 
     exit_code = 10
 
 
 class Interrupted(UdrlError):
-    """A wait ended because the process was told to stop."""
+    """A wait ended because the process was asked to stop."""
 
     exit_code = 130

@@ -1,4 +1,4 @@
-"""Section 2.3.6: what an evaluation says."""
+"""Section 2.3.6: the statistics of an evaluation."""
 
 import math
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ class Evaluation(NamedTuple):
     """Mean and spread of the returns of an evaluation's episodes.
 
     Attributes:
-        mean: of the returns.
+        mean: mean return.
         std: standard deviation of the sample (divided by n - 1); 0 for one episode.
         ci95_low: lower end of the 95 % confidence interval of the mean, mean - 1.96 std / sqrt(n).
-        ci95_high: its upper end.
-        episodes: n.
+        ci95_high: upper end of that interval.
+        episodes: number of episodes, n.
     """
 
     mean: float
@@ -25,9 +25,9 @@ class Evaluation(NamedTuple):
 
 
 def return_text(value: float) -> str:
-    """Return a return as people read it: one decimal, or three digits where it is below ten.
+    """Format a return: one decimal, or three significant digits below 10.
 
-    Environments differ by orders of magnitude: returns of 0 to 1 need more decimals than others.
+    Environments differ by orders of magnitude: returns of 0 to 1 need more decimals.
     """
     size = abs(value)
     if not 1e-4 <= size < 10:
@@ -37,7 +37,7 @@ def return_text(value: float) -> str:
 
 
 def summarise(returns: Sequence[float]) -> Evaluation:
-    """Return the evaluation of some episode returns, at least one."""
+    """Return the statistics of episode returns, at least one."""
     mean = fmean(returns)
     std = stdev(returns) if len(returns) > 1 else 0.0
     half = 1.96 * std / math.sqrt(len(returns))

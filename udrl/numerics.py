@@ -1,7 +1,7 @@
-"""Whether two machines round alike, and what a run leaves to the machine that creates it.
+"""Numerics classes of machines, and settings that depend on the machine that creates a run.
 
-A run is exact when its environment repeats itself (:mod:`udrl.repeating`) and when all machines
-round alike: they do when their *numerics class*, the digest of a fixed probe, is the same
+A run is exact if its environment is deterministic (:mod:`udrl.repeating`) and all machines compute
+the same bits. The latter is checked by their *numerics class*, the digest of a fixed probe
 (:func:`acting_class`, :func:`udrl.training_class.training_class`).
 """
 
@@ -17,13 +17,13 @@ from udrl.digests import arrays_digest
 from udrl.inference import ActingFunction, probe_rows, probe_weights
 from udrl.streams import Purpose, Stream, stream_key
 
-#: Rows of the probe's logits, and choices among actions.
+#: Number of rows of logits in the probe, and of actions sampled from them.
 PROBE_ROWS = 16
 PROBE_CHOICES = 64
 
 
 def settle(config: Config) -> Config:
-    """Return the settings of a new run: what says ``auto`` is chosen for this machine."""
+    """Return settings with ``device`` and ``precision`` chosen for this machine if ``auto``."""
     device, precision = config.arithmetic.device, config.arithmetic.precision
     if device == "auto":
         device = "cuda" if has_cuda() else "cpu"
@@ -33,18 +33,22 @@ def settle(config: Config) -> Config:
 
 
 def settle_as(held: Config, config: Config) -> Config:
-    """Return settings with what they leave open as it was chosen for another run."""
-    asked, known = flat(config), flat(held)
-    open_ = ("device", "precision")
-    chosen = {name: known[name] for name in open_ if asked[name] == "auto"}
-    if asked["dataset"] is not None and asked["dataset"] == known["dataset"]:
+    """Return settings with the choices of an existing run for what ``config`` does not specify.
+
+    Args:
+        held: settings of the existing run.
+        config: settings with ``auto``, or with a dataset without digest.
+    """
+    given, known = flat(config), flat(held)
+    chosen = {name: known[name] for name in ("device", "precision") if given[name] == "auto"}
+    if given["dataset"] is not None and given["dataset"] == known["dataset"]:
         chosen["n_warm_up_episodes"] = known["n_warm_up_episodes"]
-        chosen["dataset_sha256"] = asked["dataset_sha256"] or known["dataset_sha256"]
+        chosen["dataset_sha256"] = given["dataset_sha256"] or known["dataset_sha256"]
     return change(config, **chosen)
 
 
 def _is_fast_in_bfloat16() -> bool:
-    """Say whether this processor has instructions for it; where nobody tells, it has not."""
+    """Return whether this processor has bfloat16 instructions; False if that is unknown."""
     try:
         flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
     except OSError:
@@ -53,7 +57,7 @@ def _is_fast_in_bfloat16() -> bool:
 
 
 def has_cuda() -> bool:
-    """Ask the driver for GPUs; whoever creates a run may have no torch."""
+    """Return whether the CUDA driver finds a GPU; torch may not be installed here."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -67,11 +71,11 @@ def has_cuda() -> bool:
 
 
 def acting_class(graph: bytes, space: ActionSpace) -> str:
-    """Return the numerics class of acting: digest of the probe's logits and choices.
+    """Return the numerics class of acting: the digest of a probe's logits and actions.
 
     Args:
         graph: the acting graph.
-        space: of the actions.
+        space: the action space.
     """
     function = ActingFunction(graph, probe_weights(graph))
     logits, state = function.advance(*probe_rows(function, PROBE_ROWS))

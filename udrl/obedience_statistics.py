@@ -1,8 +1,8 @@
-"""Section 3.5: how obtained returns follow commanded ones, and where they do.
+"""Section 3.5: how closely, and in which range, obtained returns follow desired returns.
 
-What can be commanded is what the episodes of the replay buffer did (:func:`spread`,
-:func:`mean_of_nearest`); where an agent obeys is judged by the mean return that it
-obtains for each command (:func:`obeyed`).
+Commands are taken from what the episodes of the replay buffer achieved (:func:`spread`,
+:func:`mean_of_nearest`). The range in which an agent obeys follows from the mean return obtained
+for each command (:func:`obeyed`).
 """
 
 import math
@@ -11,25 +11,25 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-#: Share of the episodes, those with the least returns, that does not count as reachable: among them
-#: are rare accidents of exploration, far below all others.
+#: Share of episodes, those with the lowest returns, that does not count as reachable: some are rare
+#: accidents of exploration, far below the rest.
 OUTLIERS = 0.05
-#: Share of the episodes that count as nearest to a return, and how many do at least.
-NEAREST, LEAST_NEAREST = 0.05, 5
-#: Least slope of obtained on commanded returns over a range that counts as obeyed.
-LEAST_SLOPE = 0.5
+#: Share of episodes that count as nearest to a return, and their minimum number.
+NEAREST, MIN_NEAREST = 0.05, 5
+#: Minimum slope of obtained over desired returns in a range that counts as obeyed.
+MIN_SLOPE = 0.5
 
 Floats = npt.NDArray[np.float64]
 
 
 class Means(NamedTuple):
-    """What was obtained for each command, in increasing order of the commanded value.
+    """Mean obtained value for each command, in increasing order of the commanded value.
 
     Attributes:
-        commanded: float64 [n], without repetitions.
-        mean: mean of what was obtained, float64 [n].
-        ci95_low: lower end of its 95 % confidence interval, float64 [n].
-        ci95_high: upper end, float64 [n].
+        commanded: commanded values, float64 [n], without duplicates.
+        mean: mean obtained values, float64 [n].
+        ci95_low: lower ends of their 95 % confidence intervals, float64 [n].
+        ci95_high: upper ends, float64 [n].
     """
 
     commanded: Floats
@@ -39,7 +39,7 @@ class Means(NamedTuple):
 
 
 def reachable(values: npt.ArrayLike) -> tuple[float, float]:
-    """Return the least and the greatest value, the lowest :data:`OUTLIERS` left out.
+    """Return the lowest and the highest value, without the lowest :data:`OUTLIERS`.
 
     Args:
         values: returns or lengths of episodes, float [n], at least one.
@@ -49,15 +49,15 @@ def reachable(values: npt.ArrayLike) -> tuple[float, float]:
 
 
 def evenly(low: float, high: float, n: int) -> list[float]:
-    """Return at most ``n`` values spread evenly from ``low`` to ``high``, without repetitions.
+    """Return at most ``n`` evenly spaced values from ``low`` to ``high``, without duplicates.
 
-    They are rounded to a tenth of the decimal place of their spacing, so that they can be written
-    down as they are: -119.3 to 287.6 in 11 values is -119, -79, ..., 288.
+    They are rounded to a tenth of the decimal place of their spacing, so that they are short to
+    write: -119.3 to 287.6 in 11 values is -119, -79, ..., 288.
 
     Args:
-        low: least value.
-        high: greatest value, not less.
-        n: how many, at least 2.
+        low: lowest value.
+        high: highest value, at least ``low``.
+        n: number of values, at least 2.
     """
     if not high > low:
         return [low]
@@ -67,75 +67,75 @@ def evenly(low: float, high: float, n: int) -> list[float]:
 
 
 def spread(values: npt.ArrayLike, n: int) -> list[float]:
-    """Return what to command, of what episodes did: at most ``n`` values in increasing order.
+    """Return values to command, given those of episodes: at most ``n``, in increasing order.
 
-    Where episodes differ in a few values only, these: nothing between them can be obtained. Else
-    what is :func:`reachable`, spread :func:`evenly`.
+    If there are at most ``n`` distinct values, these: values in between may be impossible to
+    obtain. Otherwise evenly spaced values (:func:`evenly`) over the :func:`reachable` range.
 
     Args:
         values: returns or lengths of episodes, float [m], at least one.
-        n: at least 2.
+        n: maximum number of values, at least 2.
     """
     distinct = np.unique(np.asarray(values, np.float64))
     return distinct.tolist() if len(distinct) <= n else evenly(*reachable(values), n)
 
 
 def mean_of_nearest(at: float, where: npt.ArrayLike, values: npt.ArrayLike) -> float:
-    """Return the mean value of the episodes that are nearest to a return.
+    """Return the mean value of the episodes whose returns are nearest to a return.
 
-    These are :data:`NEAREST` of all, at least :data:`LEAST_NEAREST`, and all that are as near as
-    the last of these.
+    These are the share :data:`NEAREST` of all episodes, at least :data:`MIN_NEAREST`, and all at
+    the same distance as the last of these.
 
     Args:
         at: the return.
         where: returns of the episodes, float [n], at least one.
-        values: their lengths, say; float [n].
+        values: values to average, e.g. the episodes' lengths, float [n].
     """
     distance = np.abs(np.asarray(where, np.float64) - at)
-    count = min(len(distance), max(LEAST_NEAREST, math.ceil(NEAREST * len(distance))))
+    count = min(len(distance), max(MIN_NEAREST, math.ceil(NEAREST * len(distance))))
     furthest = np.partition(distance, count - 1)[count - 1]
     return float(np.asarray(values, np.float64)[distance <= furthest].mean())
 
 
 def correlation(commanded: npt.ArrayLike, obtained: npt.ArrayLike) -> float:
-    """Return Pearson's correlation; 0 where one of the two does not vary.
+    """Return Pearson's correlation; 0 if one of the two does not vary.
 
     Args:
-        commanded: float [n], at least one.
-        obtained: float [n].
+        commanded: commanded values, float [n], at least one.
+        obtained: obtained values, float [n].
     """
     x, y = (np.asarray(values, np.float64) for values in (commanded, obtained))
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return 0.0
     x, y = x - x.mean(), y - y.mean()
-    # Dividing first, lest a square is not a number.
+    # Normalised first, so that squares do not overflow.
     x, y = x / np.abs(x).max(), y / np.abs(y).max()
     return float(np.clip(x @ y / math.sqrt((x @ x) * (y @ y)), -1.0, 1.0))
 
 
 def mean_absolute_error(commanded: npt.ArrayLike, obtained: npt.ArrayLike) -> float:
-    """Return the mean distance between what was commanded and obtained.
+    """Return the mean absolute difference between commanded and obtained values.
 
     Args:
-        commanded: float [n], at least one.
-        obtained: float [n].
+        commanded: commanded values, float [n], at least one.
+        obtained: obtained values, float [n].
     """
     return float(np.abs(np.asarray(obtained) - np.asarray(commanded)).mean())
 
 
 def obeyed(means: Means, tolerance: float) -> slice | None:
-    """Return the commands of the range in which an agent obeys; None: there is none.
+    """Return the commands of the range in which an agent obeys; None: there is no such range.
 
-    It is the widest one of which all of this is true, and of equally wide ones the highest:
+    It is the widest range that meets all of these conditions, and the highest of equally wide ones:
 
-    - Every mean lies within ``tolerance`` of its command.
-    - The mean increases with the command: the slope of the straight line that fits best is at least
-      :data:`LEAST_SLOPE`.
-    - It is no accident: the confidence intervals at the two ends do not overlap, and the upper
-      one's is the higher.
+    - Every mean is within ``tolerance`` of its command.
+    - The mean increases with the command: the slope of the least-squares line is at least
+      :data:`MIN_SLOPE`.
+    - The increase is significant: the confidence interval at the upper end lies above that at the
+      lower end.
 
     Args:
-        means: what was obtained for each command.
+        means: mean obtained return for each command.
         tolerance: at least 0, in units of the return.
     """
     x, n = means.commanded, len(means.commanded)
@@ -144,7 +144,7 @@ def obeyed(means: Means, tolerance: float) -> slice | None:
     first, last = np.triu_indices(n, k=1)
     allowed = outside[last + 1] == outside[first]
     allowed &= means.ci95_low[last] > means.ci95_high[first]
-    # n Sxy and n Sxx of every range, by sums from the first command on.
+    # n Sxy and n Sxx of every range, from cumulative sums.
     x, y = x - x[:1], means.mean - x[:1]
     count = (last + 1 - first).astype(np.float64)
 
@@ -155,7 +155,7 @@ def obeyed(means: Means, tolerance: float) -> slice | None:
 
     sum_x = sums(x)
     together = count * sums(x * y) - sum_x * sums(y)
-    allowed &= together >= LEAST_SLOPE * (count * sums(x * x) - sum_x**2)
+    allowed &= together >= MIN_SLOPE * (count * sums(x * x) - sum_x**2)
     if not allowed.any():
         return None
     width = np.where(allowed, x[last] - x[first], -1.0)

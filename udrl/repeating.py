@@ -1,7 +1,7 @@
-"""Whether an environment does again what it did: here, elsewhere, and at another time.
+"""Checks that an environment is deterministic: on this machine, on other machines, and later.
 
-A run is exact only if it does. That is another question than whether machines round alike
-(:mod:`udrl.numerics`), with another remedy.
+A run is exact only if its environment is. Whether machines compute the same numbers is a separate
+question, with a separate remedy (:mod:`udrl.numerics`).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from udrl.environments.making import limit_steps, make_environment
 from udrl.episode import Episode
 from udrl.streams import Purpose, stream_key
 
-#: Steps of an episode of the probe.
+#: Maximum length of a probe's episode, in steps.
 PROBE_STEPS = 64
 
 
@@ -22,16 +22,16 @@ def environment_digest(generator: EpisodeGenerator) -> str:
     """Return the digest of a short episode of random actions, 16 hexadecimal digits.
 
     Raises:
-        EnvironmentFault: the environment raised, or returned what it may not.
+        EnvironmentFault: the environment raised an exception, or returned an invalid value.
     """
     return _short_episode(generator, index=0).hex()[:16]
 
 
 def repeated_digest(generator: EpisodeGenerator) -> str:
-    """Return :func:`environment_digest`, or "" if it is another after an episode in between.
+    """Return :func:`environment_digest`, or "" if it differs after another episode.
 
     Raises:
-        EnvironmentFault: the environment raised, or returned what it may not.
+        EnvironmentFault: the environment raised an exception, or returned an invalid value.
     """
     first = environment_digest(generator)
     _short_episode(generator, index=1)
@@ -55,20 +55,20 @@ def _short_episode(generator: EpisodeGenerator, index: int) -> bytes:
 
 
 def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> str | None:
-    """Say where an environment does not repeat an episode when its actions are taken again.
+    """Replay an episode's actions and describe the first step that differs.
 
     Args:
-        config: the settings that the episode was made with.
-        episode: as it was.
-        seed: what its environment was reset with.
-        max_steps: after which it was truncated.
+        config: settings of the episode's run.
+        episode: the recorded episode.
+        seed: its environment seed.
+        max_steps: its time limit.
 
     Returns:
-        The first step that differs, in words; None: there is none.
+        A description of the first difference; None: there is none.
 
     Raises:
         UnsupportedEnvironment: the environment can no longer be made.
-        EnvironmentFault: it returned what it may not.
+        EnvironmentFault: it returned an invalid value.
     """
     env = make_environment(config)
     try:
@@ -76,14 +76,14 @@ def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> s
         observation, _ = env.reset(seed=seed)
         for t in range(episode.length):
             if not np.array_equal(observation, episode.observations[t]):
-                return f"step {t} shows another observation"
+                return f"the observation of step {t} differs"
             observation, reward, terminated, truncated, _ = env.step(episode.actions[t])
             if np.float32(reward) != episode.rewards[t]:
-                return f"step {t} gives the reward {reward:g}, it gave {episode.rewards[t]:g}"
+                return f"the reward of step {t} is {reward:g}, it was {episode.rewards[t]:g}"
             ends = t == episode.length - 1
             expected = (episode.terminated and ends, episode.truncated and ends)
             if (terminated, truncated) != expected:
-                return f"step {t} ends the episode otherwise"
+                return f"step {t} differs in terminated or truncated"
         return None
     finally:
         env.close()

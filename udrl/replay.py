@@ -1,9 +1,9 @@
 """Section 2.3.1: the replay buffer keeps the episodes with the highest returns.
 
-Two settings that are not in the paper change what "all episodes" are. With an age limit the best of
-the last iterations are kept: elites of all times are lucky ones in the end, imitated long after the
-agent could have replaced them, and learned by heart. And the newest can be kept whatever they
-returned, which holds the agent near what it does.
+Two settings are not in the paper. ``max_age`` keeps the best episodes of the last iterations only:
+the best of all time are mostly lucky ones, and the agent would memorise them long after it could
+have replaced them. ``recent_size`` keeps the newest episodes whatever their return, so that the
+agent also trains on its present behavior.
 """
 
 import bisect
@@ -16,7 +16,7 @@ from udrl.setting_groups import BufferSettings
 
 
 class Entry(NamedTuple):
-    """One episode of the buffer. Entries compare by return; of equal ones the newer is greater."""
+    """One episode of the buffer. Entries compare by return; among equal ones, newer is greater."""
 
     episode_return: float
     id: int
@@ -24,19 +24,19 @@ class Entry(NamedTuple):
 
     @property
     def iteration(self) -> int:
-        """The iteration that the episode was made in."""
+        """The iteration of the episode."""
         return self.id // COMMANDS_PER_ITERATION
 
 
 class ReplayBuffer:
-    """The greatest of all entries that were admitted, and the newest, in increasing order.
+    """The best and the newest of all admitted entries, in increasing order.
 
-    It ranks episodes; who needs their steps keeps them (:class:`udrl.segments.Experience`).
+    It ranks episodes; it does not hold their steps (see :class:`udrl.segments.Experience`).
 
     Args:
-        settings: ``replay_size``, how many of the greatest it keeps; ``recent_size``, how many of
-            the newest, those among the greatest counted; ``max_age``, for how many iterations.
-        entries: what it holds at first.
+        settings: ``replay_size``, number of best entries; ``recent_size``, number of newest
+            entries, which may be among the best; ``max_age``, maximum age in iterations.
+        entries: initial content.
     """
 
     def __init__(self, settings: BufferSettings, entries: Iterable[Entry] = ()) -> None:
@@ -52,7 +52,7 @@ class ReplayBuffer:
         return iter(self._entries)
 
     def admit(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Add entries and return those that had to leave, least first; some may be new ones."""
+        """Add entries and return the evicted ones, lowest first; new entries may be among them."""
         for entry in entries:
             bisect.insort(self._entries, entry)
         before, self._entries = self._entries, self._kept(self._entries)
@@ -68,10 +68,10 @@ class ReplayBuffer:
         return [entry for entry in entries[:surplus] if entry.id in newest] + entries[surplus:]
 
     def newest(self) -> Sequence[Entry]:
-        """Return the entries of the newest iteration of which it holds any."""
+        """Return the entries of the newest iteration in the buffer."""
         newest = max((entry.iteration for entry in self._entries), default=0)
         return [entry for entry in self._entries if entry.iteration == newest]
 
     def best(self, n: int) -> Sequence[Entry]:
-        """Return the last ``n`` entries, or all when there are fewer."""
+        """Return the best ``n`` entries, or all if there are fewer, lowest first."""
         return self._entries[-n:]

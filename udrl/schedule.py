@@ -1,15 +1,15 @@
-"""Which weights an iteration acts with, and which buffer its commands come from.
+"""The weights version of each iteration, and the buffer that its commands are drawn from.
 
-Iteration 0 is the warm-up. Weights version v is trained from version v-1 on the buffer as it is
-after iteration v-1. With ``lead = L``, iteration i acts with version max(1, i - L); its commands
-are drawn from the buffer that version was trained on. ``lead = 0`` is Algorithm 1: train, act,
-train, act. With L > 0 actors work while the learner trains, and the result is still a function of
+Iteration 0 is the warm-up. Weights version v is trained from version v-1 on the buffer after
+iteration v-1. With ``lead = L``, iteration i acts with version max(1, i - L), and its commands are
+drawn from the buffer that this version was trained on. ``lead = 0`` is Algorithm 1: train, act,
+train, act. With L > 0 actors work while the learner trains, and the result still depends only on
 the configuration.
 """
 
 
 def weights_version(iteration: int, lead: int) -> int:
-    """Return the weights version that an iteration's commands name; 0 means: act at random."""
+    """Return the weights version of an iteration's commands; 0 = random actions."""
     return 0 if iteration == 0 else max(1, iteration - lead)
 
 
@@ -21,14 +21,14 @@ def opened_by(completed: int, lead: int) -> range:
 
 
 def evaluation_due(completed: int, steps_before: int, steps_after: int, every: int) -> bool:
-    """Say whether the first iteration opened by ``completed`` carries an evaluation.
+    """Return whether the first iteration opened by ``completed`` includes an evaluation.
 
-    It does when that iteration's completion took ``env_steps`` past a multiple of ``every``.
+    It does if completing ``completed`` took ``env_steps`` to or past a multiple of ``every``.
 
     Args:
-        completed: the iteration whose buffer commands are drawn from.
-        steps_before: env steps of the buffer before it was completed.
-        steps_after: env steps of the buffer after it.
+        completed: the iteration whose buffer the commands are drawn from.
+        steps_before: ``env_steps`` before this iteration.
+        steps_after: ``env_steps`` after it.
         every: env steps between evaluations.
     """
     return steps_after // every > (0 if completed == 0 else steps_before) // every

@@ -1,10 +1,10 @@
-"""Counter-based random streams: every random number of a run has an address, none has a history.
+"""Counter-based random streams: every random number of a run has an address instead of a history.
 
-A stream is named by (seed, purpose, iteration, index). Its key is the first 16 bytes of
-``sha256("udrl/stream/1|seed|purpose|iteration|index")``, read as a little-endian integer, and its
-numbers are those of Philox4x64-10 under that key, counter from 1, each turned into a float64 in
-[0, 1) by ``(x >> 11) * 2**-53``. Nothing else in the project draws random numbers that a result
-depends on, and no generator state is ever stored.
+A stream is identified by (seed, purpose, iteration, index). Its key is the first 16 bytes of
+``sha256("udrl/stream/1|seed|purpose|iteration|index")``, read as a little-endian integer. Its
+numbers are those of Philox4x64-10 under that key, counter from 1, each converted to a float64 in
+[0, 1) by ``(x >> 11) * 2**-53``. All random numbers that results depend on come from streams, and
+no generator state is ever stored.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 
 class Purpose(StrEnum):
-    """What a stream's numbers are for."""
+    """Purpose of a stream's numbers."""
 
     INITIALISE = "initialise"
     COMMANDS = "commands"
@@ -46,7 +46,7 @@ class Stream:
         return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def number(self, index: int) -> float:
-        """Return the number of an index, counted from the next one; those up to it are used up."""
+        """Return the number at ``index``, counted from the next one, and advance past it."""
         return float(self.uniforms(index + 1)[index])
 
     def integers(self, n: int, low: int, high: int) -> npt.NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What a command asks for, how it counts down, and how the networks read it."""
+"""Targets: what a command requires, how it counts down, and how the networks read it."""
 
 import math
 
@@ -7,24 +7,24 @@ import numpy.typing as npt
 
 from udrl.setting_groups import NetworkSettings
 
-#: Rows of what is desired: float64 [rows, ReturnInTime.size].
+#: Targets, one per row: float64 [rows, ReturnInTime.size].
 Desired = npt.NDArray[np.float64]
 
 
 class ReturnInTime:
-    """The paper's: a desired return within a desired horizon (section 2.2).
+    """The paper's target: a desired return within a desired horizon (section 2.2).
 
     Args:
         network: ``return_scale``, ``horizon_scale``, ``desired_horizon``.
 
     Attributes:
-        horizon_follows: the horizon is the desired return, as an integer, always (section 3.1,
-            TakeCover).
-        least: what return and horizon are raised to before they are read; in acting the horizon
-            counts down beyond what was seen in training.
+        horizon_follows: whether the horizon always equals the desired return, as an integer
+            (section 3.1, TakeCover).
+        least: lower bounds of return and horizon at the networks' input. In acting, the horizon
+            counts down below the values seen in training.
     """
 
-    #: Numbers of a target.
+    #: Numbers per target.
     size = 2
 
     def __init__(self, network: NetworkSettings) -> None:
@@ -34,7 +34,7 @@ class ReturnInTime:
 
     @property
     def has_horizon(self) -> bool:
-        """Whether it makes a difference which horizon is desired."""
+        """Whether the desired horizon has an effect of its own."""
         return not self.horizon_follows and self._network.horizon_scale > 0
 
     @property
@@ -43,7 +43,7 @@ class ReturnInTime:
         return self._network.return_scale, self._network.horizon_scale
 
     def settle(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
-        """Return c_0 as it is said: with a horizon of 1 at least, and one that follows."""
+        """Return c_0: the horizon at least 1, and derived from the return if it follows it."""
         if self.horizon_follows:
             desired_horizon = max(1, min(math.floor(desired_return), 2**31))
             desired_return = float(desired_horizon)
@@ -53,12 +53,12 @@ class ReturnInTime:
         """Count down in place, after a step: lines 8, 9 and 11 of Algorithm 2.
 
         Args:
-            desired: of each row.
+            desired: the targets.
             reward: r_t, float32 [rows].
         """
         desired[:, 0] -= reward
         desired[:, 1] -= 1.0
 
     def bound(self, desired: Desired, cap: npt.NDArray[np.float64]) -> None:
-        """Lower desired returns to a cap, float64 [rows], in place (section 2.3.6)."""
+        """Cap desired returns in place, at ``cap``, float64 [rows] (section 2.3.6)."""
         np.minimum(desired[:, 0], cap, out=desired[:, 0])

@@ -1,4 +1,4 @@
-"""The numerics class of training: machines of one class make the same weights, bit for bit."""
+"""The numerics class of training: machines of one class compute bit-identical weights."""
 
 import math
 
@@ -15,12 +15,12 @@ from udrl.spaces import noise, parts_of
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 
-#: Index of the probe's stream that the episode is made of.
+#: Index of the probe's stream for the episode.
 _EPISODE = 1000
 
 
 def training_class(config: Config, spec: EnvironmentSpec) -> str:
-    """Return the digest of the weights after two updates on an episode of noise."""
+    """Return the digest of the weights after two updates on a random episode."""
     small = change(config, n_updates_per_iter=2, replay_size=1, recent_size=0, last_few=1)
     stream = Stream(stream_key(0, Purpose.PROBE, 0, _EPISODE))
     length = min(PROBE_STEPS, spec.max_episode_steps)

@@ -67,7 +67,7 @@ def test_run_of_an_unseeded_environment_goes_on_with_other_actors(tmp_path: Path
     ("kind", "says"),
     [
         (Changing, "its first steps are others"),
-        (ChangingLate, r"in episode \d+ step 7\d gives the reward 10, it gave 1"),
+        (ChangingLate, r"in episode \d+ the reward of step 7\d is 10, it was 1"),
     ],
 )
 def test_changed_environment_is_found_when_a_run_goes_on(
@@ -120,12 +120,12 @@ def test_difference_is_the_first_step_that_is_another() -> None:
 
     assert found() is None
     paid = episode.rewards[41]
-    says = f"step 41 gives the reward {paid:g}, it gave {paid + 1:g}"
+    says = f"the reward of step 41 is {paid:g}, it was {paid + 1:g}"
     assert found(rewards=changed(episode.rewards, 41)) == says
     assert (
-        found(observations=changed(episode.observations, 3)) == "step 3 shows another observation"
+        found(observations=changed(episode.observations, 3)) == "the observation of step 3 differs"
     )
-    assert found(terminated=False, truncated=True) == "step 79 ends the episode otherwise"
+    assert found(terminated=False, truncated=True) == "step 79 differs in terminated or truncated"
     short = {name: getattr(episode, name)[:50] for name in ("observations", "actions", "rewards")}
-    assert found(**short) == "step 49 ends the episode otherwise"
-    assert difference(config, episode, 8, 90) == "step 0 shows another observation"
+    assert found(**short) == "step 49 differs in terminated or truncated"
+    assert difference(config, episode, 8, 90) == "the observation of step 0 differs"
