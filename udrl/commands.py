@@ -1,7 +1,7 @@
-"""Commands: what an episode is to achieve, and everything else that it depends on.
+"""Commands: desired return and horizon of an episode, and everything else that it depends on.
 
-An episode is a pure function of its command. Sections 2.3.4 (exploratory commands) and 2.3.6
-(evaluation commands) are here, and so are the warm-up's, which say "act at random".
+An episode is a pure function of its command. This module draws the exploratory commands (2.3.4),
+the evaluation commands (2.3.6), and those of the warm-up, which prescribe random actions.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.replay import ReplayBuffer
 from udrl.schedule import weights_version
 from udrl.setting_groups import CommandSettings, Temperature
-from udrl.strategies import Best, CommandStrategy, ask, make_strategy
+from udrl.strategies import Best, CommandStrategy, choose_command, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 
@@ -30,19 +30,19 @@ TRAINING_SEEDS = (1_000_000, 10_000_000)
 SEARCH_SEEDS = (500_000, 1_000_000)
 EVALUATION_SEEDS = (1, 500_000)
 
-#: Exploratory episodes of an iteration that is to have ``n_steps_per_iter``, at most.
-MOST_EPISODES = 1_000
-#: Within an iteration, the final evaluation of a run that ends there has indices from here on.
+#: With ``n_steps_per_iter``, maximum number of exploratory episodes per iteration.
+MAX_EPISODES = 1_000
+#: Index of the first command of a run's final evaluation, within the run's last iteration.
 FINAL_EVALUATION = 500_000
 
 
 class Decisions(NamedTuple):
-    """What decides the actions of an episode's first steps.
+    """Random numbers that choose the actions of an episode's first steps.
 
     Attributes:
         numbers: uniform in [0, 1), float64 [n, *action_shape].
-        random: whether the action is uniformly random, whatever the behavior function says,
-            bool [n].
+        random: whether the action is uniformly random instead of sampled from the behavior
+            function's distribution, bool [n].
     """
 
     numbers: npt.NDArray[np.float64]
@@ -53,22 +53,21 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """A command to an actor.
 
     Attributes:
-        id: ``iteration * COMMANDS_PER_ITERATION + index``; the episode's id is the same.
-        kind: what the episode is for.
-        desired_return: initial desired return; 0 in the warm-up, where nothing reads it.
-        desired_horizon: initial desired horizon in steps; likewise.
-        cap: the greatest desired return at any step; None: there is none.
-        environment_seed: what the environment is reset with.
-        stream_key: 16 bytes, the key of the stream whose number t decides action t.
-        weights_version: the behavior function to act with; 0 in the warm-up: act at random.
-        max_steps: the episode is truncated after so many steps.
-        temperature: logits are divided by it before an action is sampled; 0: take the mode.
-        random_from: the first of the steps whose actions are uniformly random, whatever the
-            behavior function says.
-        random_steps: how many there are of them, one after another.
-        random_hold: for how many of them each of their actions is held.
-        random_rate: where it is not 0, there are other random actions instead: at each step that
-            holds none, one begins with this probability. It is held for ``random_hold`` times k
+        id: ``iteration * COMMANDS_PER_ITERATION + index``; also the id of the episode.
+        kind: purpose of the episode.
+        desired_return: initial desired return; 0 and unused in the warm-up.
+        desired_horizon: initial desired horizon in steps; 0 and unused in the warm-up.
+        cap: upper bound of the desired return at every step; None: no bound.
+        environment_seed: reset seed of the environment.
+        stream_key: key of the random stream whose number t chooses action t, 16 bytes.
+        weights_version: version of the behavior function; 0 in the warm-up: random actions.
+        max_steps: time limit of the episode in steps.
+        temperature: divisor of the logits before sampling; 0 = the most likely action.
+        random_from: first step of a period of uniformly random actions.
+        random_steps: length of this period in steps.
+        random_hold: steps for which each of these actions is held.
+        random_rate: if not 0, there is no such period. Instead, at each step without a held action,
+            a random action begins with this probability. It is held for ``random_hold`` times k
             steps, where k is at least n with probability 1 / n.
     """
 
@@ -89,7 +88,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     @property
     def iteration(self) -> int:
-        """The iteration that the command belongs to."""
+        """The command's iteration."""
         return self.id // COMMANDS_PER_ITERATION
 
     @property
@@ -99,11 +98,11 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     @property
     def is_ever_random(self) -> bool:
-        """Whether there may be random actions."""
+        """Whether the episode may have random actions."""
         return self.random_steps > 0 or self.random_rate > 0
 
     def decisions(self, n: int, shape: tuple[int, ...]) -> Decisions:
-        """Return what decides the first ``n`` actions of a shape."""
+        """Return the random numbers of the first ``n`` actions, which have the given shape."""
         numbers = Stream(self.stream_key).uniforms(n * math.prod(shape)).reshape(n, *shape)
         steps = np.arange(n)
         if self.random_rate:
@@ -116,7 +115,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return Decisions(numbers[np.where(random, begun, steps)], random)
 
     def _begun(self, n: int) -> npt.NDArray[np.int64]:
-        """Return where the random action of each step began, int64 [n]; -1: it has none."""
+        """Return the first step of each step's held action, int64 [n]; -1: none is held."""
         begun = np.full(n, -1)
         key = hashlib.sha256(self.stream_key).digest()[:16]
         numbers = Stream(key).uniforms(n)
@@ -130,12 +129,12 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def episodes_due(settings: CommandSettings, buffer: ReplayBuffer) -> int:
-    """Return how many exploratory episodes an iteration has, given the buffer it is drawn from."""
+    """Return the number of an iteration's exploratory episodes, given the buffer to draw from."""
     least, steps = settings.n_episodes_per_iter, settings.n_steps_per_iter
     if steps is None or not (newest := buffer.newest()):
         return least
     wanted = math.ceil(steps * len(newest) / sum(e.length for e in newest))
-    return max(least, min(wanted, MOST_EPISODES))
+    return max(least, min(wanted, MAX_EPISODES))
 
 
 class CommandSampler:
@@ -143,7 +142,7 @@ class CommandSampler:
 
     Args:
         config: the run's settings.
-        spec: of the environment: its time limit and greatest return.
+        spec: the environment's time limit and highest return.
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
@@ -156,7 +155,7 @@ class CommandSampler:
 
     @cached_property
     def _strategy(self) -> CommandStrategy:
-        return make_strategy(self._config)  # evaluating does without, wherever its module is
+        return make_strategy(self._config)  # on first use: evaluations do not need to import it
 
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
@@ -169,27 +168,29 @@ class CommandSampler:
     def explore(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
         """Return an iteration's exploratory commands (section 2.3.4).
 
-        What they ask for is the strategy's choice (:mod:`udrl.strategies`): in the paper the mean
-        length of the ``last_few`` best episodes, and a return that is uniform in [M, M + S]. Not in
-        the paper: in a share of the episodes, ``held_actions``, random actions are held, one for
-        ``hold_steps`` steps from a step within the desired horizon on, or with a ``held_rate``
-        again and again.
+        A strategy (:mod:`udrl.strategies`) chooses desired return and horizon: in the paper, a
+        return uniform in [M, M + S], and the mean length of the ``last_few`` best episodes. Not in
+        the paper: a share of the episodes, ``held_actions``, have held random actions. One is held
+        for ``hold_steps`` steps, beginning within the desired horizon, or with a ``held_rate``
+        many, repeatedly.
 
         Raises:
-            ConfigError: the strategy cannot be imported, or asks for what cannot be.
+            ConfigError: the strategy cannot be imported, or returned an invalid command.
         """
         best = buffer.best(self._settings.last_few)
         n = episodes_due(self._settings, buffer)
         u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
-        desired = [self._target.settle(*ask(self._strategy, best, number)) for number in u]
+        desired = [
+            self._target.settle(*choose_command(self._strategy, best, number)) for number in u
+        ]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
-            self._explored(c, x[k]) if w[k] < self._settings.held_actions else c
+            self._with_held_actions(c, x[k]) if w[k] < self._settings.held_actions else c
             for k, c in enumerate(commands)
         ]
 
-    def _explored(self, command: Command, x: float) -> Command:
-        """Return a command with random actions that are held."""
+    def _with_held_actions(self, command: Command, x: float) -> Command:
+        """Add held random actions to a command; ``x`` in [0, 1) chooses the first step."""
         rate, hold = self._settings.held_rate, self._settings.hold_steps
         if rate:
             return msgspec.structs.replace(command, random_rate=rate, random_hold=hold)
@@ -201,7 +202,7 @@ class CommandSampler:
         )
 
     def training_command(self, episode_id: int) -> Command:
-        """Return a warm-up or exploratory command again, apart from what it asked for."""
+        """Return a warm-up or exploratory command again, without desired return and horizon."""
         iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
         kind: Kind = "explore" if iteration else "warm_up"
         return self._commands(kind, iteration, 0, [(0.0, 0)] * (index + 1), TRAINING_SEEDS)[index]
@@ -212,7 +213,7 @@ class CommandSampler:
         return self._evaluation(iteration, first, buffer)
 
     def evaluate_final(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
-        """Return a run's final evaluation after an iteration: fresh seeds, final weights."""
+        """Return commands of a final evaluation after an iteration: final weights, fresh seeds."""
         commands = self._evaluation(iteration, FINAL_EVALUATION, buffer)
         return [msgspec.structs.replace(c, weights_version=iteration) for c in commands]
 

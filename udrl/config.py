@@ -1,11 +1,11 @@
 """Settings of a run (:class:`Config`) and its stopping criteria (:class:`Budget`).
 
-A run is a function of its :class:`Config`: the paper's hyperparameters (Table 2) under the paper's
-names, the network, and the choices that the paper leaves open. The :class:`Budget` may change when
-a run is resumed.
+A run's result depends only on its :class:`Config`: the paper's hyperparameters (Table 2) under the
+paper's names, the network, and choices that the paper does not specify. The :class:`Budget` may
+change when a run is resumed.
 
-A ``Config`` has its settings in groups (:mod:`udrl.setting_groups`). Everywhere else, in files, on
-the command line, in messages and in stores, settings are flat: a unique name each, and no groups
+A ``Config`` holds its settings in groups (:mod:`udrl.setting_groups`). In files, on the command
+line, in messages and in stores, settings are flat: each has a unique name, and there are no groups
 (:func:`flat`, :func:`build`, :func:`change`).
 """
 
@@ -35,12 +35,12 @@ from udrl.setting_groups import (
 )
 
 KeywordValue = bool | int | float | str
-# Lists and tables of these, to a limited depth: a peer could send thousands of levels.
+# Lists and tables of these, with limited depth: a peer could send thousands of levels.
 _Inner = KeywordValue | list[KeywordValue] | dict[str, KeywordValue]
 _Outer = KeywordValue | list[_Inner] | dict[str, _Inner]
 #: Keyword arguments for an environment.
 Keywords = dict[str, KeywordValue | list[_Outer] | dict[str, _Outer]]
-#: Settings as they are sent and stored: by name, without groups.
+#: Settings by name, without groups, as in messages and stores.
 FlatSettings = dict[str, KeywordValue | list[int | str] | Keywords | None]
 #: The import path of a wrapper, with arguments if it needs any.
 Wrapper = Annotated[str, Meta(min_length=1, max_length=200)]
@@ -64,8 +64,8 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
         max_episode_steps: time limit of an episode in steps. None: the environment's own.
         max_train_steps: shorter time limit of warm-up and exploratory episodes. None: none.
         max_return: the highest possible return, which caps the desired return in evaluation
-            (2.3.2). None: as the environment declares, if it does.
-        seed: key of every random stream.
+            (2.3.2). None: the environment's own, if it declares one.
+        seed: seed of all random streams.
         lead: iterations that acting may run ahead of training; 0 is Algorithm 1.
         actions: settings of action spaces.
         network: settings of the acting graph, and its initialisation.
@@ -106,7 +106,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
         if self.network.memory != "none" and segments != "trailing":
             raise ConfigError(
                 f"segments = {segments!r} with memory = {self.network.memory!r}: windows of steps "
-                f"are trained on with what followed until the end; set segments = 'trailing'"
+                f"are trained with the return until the episode's end; set segments = 'trailing'"
             )
         if self.network.behavior is not None and self.network.memory != "none":
             raise ConfigError(
@@ -134,7 +134,7 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
     stop_return: float | None = None
 
 
-#: Settings that accept ``auto``, with placeholders until they are chosen (:mod:`udrl.fitting`).
+#: Settings that accept ``auto``, with placeholders until :mod:`udrl.fitting` chooses values.
 OPEN: Mapping[str, Any] = {
     "observe_time": False,
     "return_scale": 1.0,
@@ -161,19 +161,19 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
 }
 
 
-def refuse_idle(config: Config, names: Iterable[str]) -> None:
-    """Raise :class:`ConfigError` for a setting that has no effect with the others.
+def refuse_ineffective(config: Config, names: Iterable[str]) -> None:
+    """Raise :class:`ConfigError` for a setting without effect in this configuration.
 
     Args:
         config: all settings.
-        names: the settings that were given explicitly.
+        names: settings that were set explicitly.
     """
     for name in names:
         has_effect, need = _NEEDS.get(name, (lambda config: True, ""))
         if not has_effect(config):
             raise ConfigError(
                 f"{name} = {flat(config)[name]!r} has no effect: it needs {need}; leave it out, "
-                f"or set that as well"
+                f"or set that too"
             )
 
 
@@ -189,7 +189,7 @@ def preset(name: str) -> dict[str, Any]:
     """Return the settings of a preset.
 
     Raises:
-        ConfigError: there is no such preset.
+        ConfigError: there is no preset of that name.
     """
     if name not in preset_names():
         raise ConfigError(f"unknown preset {name!r}: expected one of {', '.join(preset_names())}")
@@ -261,7 +261,7 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
 
     Args:
         kind: :class:`Config`, :class:`Budget` or a group.
-        values: settings by name, without groups. Missing ones have their defaults.
+        values: settings by name, without groups. Missing settings have their defaults.
 
     Raises:
         ConfigError: a name is unknown or a value is invalid; the message names it.

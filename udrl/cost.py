@@ -1,4 +1,4 @@
-"""About how long an iteration trains, so that one that takes minutes is no surprise."""
+"""A rough estimate of an iteration's training time, to warn of iterations that take minutes."""
 
 import math
 from itertools import pairwise
@@ -10,18 +10,18 @@ from udrl.memory import FrameStack
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Image, LeafSpace, Record, leaves_of
 
-#: Floating-point operations of a core per second in convolutions, as measured; machines differ by
-#: a factor of two or three, and this is about minutes.
-_PER_SECOND = 5e10
-#: Operations of an update for each multiplication of acting: one forward, twice as many
-#: backward, each with an addition.
-_OF_AN_UPDATE = 6
-#: Seconds of training in an iteration that are worth a word.
+#: Floating-point operations per second and core, measured in convolutions. Machines differ by a
+#: factor of two or three, which is good enough to estimate minutes.
+_OPERATIONS_PER_S = 5e10
+#: Operations of an update per multiplication of a forward pass: the backward pass has twice as
+#: many, and each comes with an addition.
+_UPDATE_OPERATIONS = 6
+#: Training time per iteration above which there is a warning, in seconds.
 _LONG_S = 60.0
 
 
 def training_s(config: Config, spec: EnvironmentSpec) -> float:
-    """Return about how many seconds the updates of an iteration take on a CPU."""
+    """Estimate the time of an iteration's updates on a CPU, in seconds."""
     network, training = config.network, config.training
     space, first = spec.observation_space, network.hidden[0]
     widths = layer_widths(space, network)
@@ -33,12 +33,12 @@ def training_s(config: Config, spec: EnvironmentSpec) -> float:
     expecting = _features(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
     networks = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
     examples = training.n_updates_per_iter * training.batch_size
-    operations = _OF_AN_UPDATE * examples * (acting + networks * expecting)
-    return operations / _PER_SECOND / config.arithmetic.training_threads
+    operations = _UPDATE_OPERATIONS * examples * (acting + networks * expecting)
+    return operations / _OPERATIONS_PER_S / config.arithmetic.training_threads
 
 
-def slow(config: Config, spec: EnvironmentSpec) -> str:
-    """Return a sentence about what makes training slow; empty where nothing does."""
+def slow_training_warning(config: Config, spec: EnvironmentSpec) -> str:
+    """Return a warning if training is slow, with its cause and remedy; otherwise ""."""
     seconds, seen = training_s(config, spec), spec.observation_space
     if seconds < _LONG_S or config.arithmetic.device == "cuda":
         return ""
@@ -47,7 +47,7 @@ def slow(config: Config, spec: EnvironmentSpec) -> str:
     remedies = "n_updates_per_iter, batch_size or hidden"
     if any(isinstance(leaf.space, Image) for leaf in leaves_of(seen)):
         remedies = (
-            "n_updates_per_iter, batch_size or convolutions, or make the pictures smaller "
+            "n_updates_per_iter, batch_size or convolutions, or make the images smaller "
             "(gymnasium.wrappers.ResizeObservation)"
         )
     return (
@@ -57,7 +57,7 @@ def slow(config: Config, spec: EnvironmentSpec) -> str:
 
 
 def _features(config: Config, spec: EnvironmentSpec, width: int, remembered: int) -> float:
-    """Return multiplications of an encoder and of the memory behind it, for one observation."""
+    """Return the multiplications of an encoder and the memory after it, per observation."""
     network = config.network
     encoding = _encoder(config, spec, width)
     if network.memory == "none":
@@ -67,7 +67,7 @@ def _features(config: Config, spec: EnvironmentSpec, width: int, remembered: int
 
 
 def _encoder(config: Config, spec: EnvironmentSpec, width: int) -> float:
-    """Return multiplications of an encoder for one observation."""
+    """Return the multiplications of an encoder, per observation."""
     space, network = spec.observation_space, config.network
     shapes = FrameStack(space, network.frame_stack).shapes
     leaves = [leaf.space for leaf in leaves_of(space)]

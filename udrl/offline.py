@@ -1,8 +1,8 @@
-"""Episodes of others: Minari datasets, to learn from and to hand on.
+"""Minari datasets: episodes for the warm-up, and export of a run's episodes.
 
-A run that names a ``dataset`` begins with its episodes where others begin with random ones: they
-are its warm-up (section 2.3.1). A dataset has one observation more than steps, on the last of which
-nobody acted. Episodes here have none, so in what is written the last one is there twice.
+In a run with a ``dataset``, its episodes replace the warm-up (section 2.3.1). An episode of a
+dataset ends with an observation after the last step. Episodes of this project do not have it, so
+exports contain the last observation twice.
 """
 
 import logging
@@ -40,13 +40,13 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
     """Return a dataset's episodes, numbered as those of a warm-up.
 
     Args:
-        name: of a dataset that Minari finds on this machine.
-        config: ``max_train_steps``.
-        spec: what the run's environment looks like.
+        name: name of a dataset that Minari finds on this machine.
+        config: the run's settings.
+        spec: specification of the run's environment.
 
     Raises:
-        ConfigError: there is no such dataset, it is empty, or its episodes are none of this
-            environment.
+        ConfigError: there is no such dataset, it is empty, or its episodes do not fit the
+            environment or its time limit.
     """
     minari = _minari()
     try:
@@ -58,7 +58,7 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
             f"dataset {name!r}: {error}; name one that `minari list local` shows"
         ) from error
     if not episodes:
-        raise ConfigError(f"dataset {name!r} has no episodes; there is nothing to begin with")
+        raise ConfigError(f"dataset {name!r} has no episodes, expected at least 1; name another")
     longest = max(e.length for e in episodes)
     limit = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
     if longest > limit:
@@ -70,10 +70,10 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
 
 
 def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[Episode] | None]:
-    """Return the settings of a new run with what its dataset decides, and the dataset's episodes.
+    """Return the settings of a new run, completed from its dataset, and the dataset's episodes.
 
     Raises:
-        ConfigError: the dataset cannot be used, or is another one than the settings say.
+        ConfigError: the dataset cannot be used, or its digest differs from ``dataset_sha256``.
     """
     name, known = config.commands.dataset, config.commands.dataset_sha256
     if name is None:
@@ -82,16 +82,16 @@ def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[
     digest = dataset_digest(episodes)
     if known not in ("", digest):
         raise ConfigError(
-            f"dataset {name!r} has the digest {digest}, the settings name {known}; it is another "
-            f"one than the run began with"
+            f"dataset {name!r} has the digest {digest}, expected {known}; restore the dataset that "
+            f"the run started with"
         )
     return change(config, dataset_sha256=digest, n_warm_up_episodes=len(episodes)), episodes
 
 
 class _Reader:
-    """Makes episodes of a dataset's, whose spaces become plain as an environment's do.
+    """Converts a dataset's episodes, like those of an environment.
 
-    What the run's environment shows besides is added, if it follows from what the dataset has.
+    If the dataset lacks what ``observe_time`` and ``observe_previous`` add, it is added here.
     """
 
     def __init__(self, name: str, dataset: Any, config: Config, spec: EnvironmentSpec) -> None:
@@ -125,10 +125,10 @@ class _Reader:
         """Return the observations of a dataset's episode as those of the run's environment."""
         shown, n = data.observations, len(data.rewards) + 1
         if self._adds_time:
-            shown = time_left.shown_in_all_steps(shown, n, self._spec.max_episode_steps)
+            shown = time_left.add_time_left(shown, n, self._spec.max_episode_steps)
         if self._adds_previous:
             done = self._actions.declared
-            shown = previous.shown_in_all_steps(done, shown, data.actions, data.rewards)
+            shown = previous.add_previous(done, shown, data.actions, data.rewards)
         return shown
 
     def episode(self, number: int, data: Any) -> Episode:
@@ -137,7 +137,7 @@ class _Reader:
         try:
             episode = Episode(
                 command_id=number,
-                # One more than steps: nothing was done after the last.
+                # Without the observation after the last step.
                 observations=self._observations.convert(self._shown(data), (n + 1,))[:-1],
                 actions=self._actions.convert(data.actions, (n,)),
                 rewards=rewards,
@@ -156,26 +156,26 @@ class _Reader:
 
 
 def dataset_digest(episodes: Sequence[Episode]) -> str:
-    """Return the SHA-256 of a dataset's episodes, in hexadecimal."""
+    """Return the SHA-256 digest of a dataset's episodes, in hexadecimal."""
     return replay_digest(map(episode_digest, episodes)).hex()
 
 
 def write_dataset(
     name: str, episodes: Iterable[Episode], config: Config, spec: EnvironmentSpec
 ) -> None:
-    """Write episodes as a Minari dataset, every bit of them, as their environment shows them.
+    """Write episodes to a Minari dataset without loss, in the environment's own spaces.
 
-    Where the environment cannot be made, they are written as the algorithm sees them, and the
-    dataset does not name it.
+    If the environment cannot be made, they are written in the algorithm's spaces, and the dataset
+    does not name its environment.
 
     Args:
-        name: of the dataset, as Minari has them, e.g. ``LunarLander/udrl-v0``.
-        episodes: of the environment.
-        config: the settings that they were made with.
-        spec: what the environment looks like.
+        name: name of the dataset, in Minari's form, e.g. ``LunarLander/udrl-v0``.
+        episodes: the episodes.
+        config: settings of their run.
+        spec: specification of the environment.
 
     Raises:
-        ConfigError: the name is taken or impossible, or it cannot be written.
+        ConfigError: the name exists or is invalid, or the dataset cannot be written.
     """
     if not re.fullmatch(r"(?:\w[\w-]*/)*\w[\w-]*-v\d+", name, re.ASCII):
         raise ConfigError(
@@ -201,7 +201,7 @@ def write_dataset(
     ]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of what only its author can tell
+            warnings.simplefilter("ignore", UserWarning)  # about missing metadata, e.g. the author
             minari.create_dataset_from_buffers(
                 name,
                 buffers,
@@ -210,24 +210,24 @@ def write_dataset(
                 action_space=form.actions.declared,
                 algorithm_name="Upside-Down Reinforcement Learning",
                 description=f"Episodes of a udrl run on {config.environment}, seed {config.seed}; "
-                f"the last observation of each is there twice.",
+                f"the last observation of each is repeated.",
                 jpeg_encoding=False,  # which would change the images
             )
     except (OSError, ValueError, AssertionError) as error:
         raise ConfigError(
-            f"dataset {name!r}: {error}; choose another name, or a version that is not there yet"
+            f"dataset {name!r}: {error}; choose another name, or a new version"
         ) from error
 
 
 def _lists(arrays: Any) -> Any:
-    """Return arrays, in whatever dictionaries and tuples, as lists of their rows."""
+    """Return arrays, possibly in dictionaries and tuples, as lists of their rows."""
     if isinstance(arrays, dict):
         return {key: _lists(inner) for key, inner in arrays.items()}
     return tuple(map(_lists, arrays)) if isinstance(arrays, tuple) else list(arrays)
 
 
 class _Form(NamedTuple):
-    """How episodes are written: as what, and of which environment, if one can be named."""
+    """Conversions of exported episodes, and their environment, if it can be named."""
 
     observations: Conversion
     actions: Conversion
@@ -243,7 +243,7 @@ def _form(config: Config, spec: EnvironmentSpec) -> _Form:
         named, observations, actions = env.env.spec, env.observations, env.actions
         env.close()
         if (observations.plain, actions.plain) == (spec.observation_space, spec.action_space):
-            return _Form(observations, actions, named if _can_be_written(named) else None)
+            return _Form(observations, actions, named if _is_serialisable(named) else None)
     return _Form(
         observation_conversion(spec.observation_space.gymnasium),
         action_conversion(spec.action_space.gymnasium, config.actions),
@@ -251,8 +251,8 @@ def _form(config: Config, spec: EnvironmentSpec) -> _Form:
     )
 
 
-def _can_be_written(spec: EnvSpec | None) -> bool:
-    """Say whether Gymnasium can write down how an environment is made: not with a callable."""
+def _is_serialisable(spec: EnvSpec | None) -> bool:
+    """Return whether Gymnasium can serialise a specification: not if it contains a callable."""
     try:
         return spec is not None and bool(spec.to_json())
     except (ValueError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""Groups of settings, so that each part of the algorithm takes only its own.
+"""Groups of settings, one for each part of the algorithm.
 
 A :class:`udrl.config.Config` has one group of each kind. The hyperparameters of Table 2 have the
 paper's names.
@@ -47,19 +47,20 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
         behavior: a torch module in place of the paper's network, as ``package.module:Class``
             (:mod:`udrl.custom`). None: the paper's network.
         frame_stack: number of most recent observations in the input, concatenated along the first
-            dimension. At the start of an episode its first observation is repeated.
+            dimension. At the start of an episode, the first observation is repeated.
         memory: ``none``, or ``gru``: a gated recurrent unit between encoder and command, which
             remembers the episode so far (section 6).
         memory_size: units of the memory.
-        normalise_observations: whether vectors are normalised by their mean and deviation in the
-            warm-up.
+        normalise_observations: whether vectors are normalised by their mean and standard deviation
+            in the warm-up.
         convolutions: channels of each convolutional layer, for images (3.2, B.2).
         hidden: units of each fully connected layer. For vectors, the output of the first is
             multiplied with the embedded command (3.2).
         activation: activation of the hidden layers.
         initialisation: ``orthogonal``, or ``uniform`` (PyTorch's default for linear layers).
         return_scale: factor on the desired return at the network's input.
-        horizon_scale: factor on the desired horizon at the network's input. 0: it is ignored.
+        horizon_scale: factor on the desired horizon at the network's input. 0: the network ignores
+            the horizon.
         desired_horizon: horizon of exploratory and evaluation commands. ``mean``: the mean length
             of the best episodes. ``return``: equal to the desired return, as an integer, for
             environments with a reward of 1 per step (TakeCover, 3.1).
@@ -130,15 +131,15 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
             episodes as this takes at the mean length of the newest ones, ``n_episodes_per_iter`` at
             least. None, as in the paper: a fixed number.
         held_actions: share of exploratory episodes with held random actions; 0 in the paper.
-        held_rate: probability per step of such an episode that a held action begins. 0: there is
-            one per episode.
+        held_rate: probability per step of such an episode that a held action begins. 0: one held
+            action per episode.
         hold_steps: steps for which such an action is held. With a ``held_rate``, at least n times
             as many with probability 1 / n.
         n_warm_up_episodes: episodes with random actions before the first iteration. With a
             ``dataset``, the number of its episodes.
         warm_up_hold: steps for which each random action of the warm-up is held; 1 in the paper.
-        dataset: a Minari dataset to use in place of the warm-up. None: none.
-        dataset_sha256: digest of its episodes. Empty: set when the run is created.
+        dataset: Minari dataset to use in place of the warm-up. None: none.
+        dataset_sha256: digest of the dataset's episodes. Empty: set when the run is created.
     """
 
     command_strategy: Annotated[str, Meta(min_length=1, max_length=200)] = "uniform"
@@ -165,9 +166,9 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
         memory_window: with a ``memory``, number of consecutive steps trained together (truncated
             backpropagation through time).
         drop_previous: with ``observe_previous``, share of examples that hide the previous action
-            and reward, so that the agent does not only learn to repeat itself.
-        return_lambda: with a ``baseline``, lambda of the lambda-returns that examples are labelled
-            with. 1: the observed return. 0: one reward and the value after it.
+            and reward, so that the agent does not only learn to repeat its actions.
+        return_lambda: with a ``baseline``, lambda of the lambda-returns that label examples. 1: the
+            observed return. 0: one reward and the value after it.
     """
 
     segments: Literal["trailing", "all"] = "trailing"

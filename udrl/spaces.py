@@ -1,8 +1,9 @@
-"""What observations are to the algorithm: plain arrays of a few kinds, and records of them.
+"""Observation spaces of the algorithm: plain arrays of a few kinds, and records of them.
 
-What is stored and sent is compact: an index stays an index, a bit a byte, a frame a frame. An
-encoder (:mod:`udrl.encoders`, :mod:`udrl.graph`) makes features of each kind. The elements of a
-record are one structured array, so that whoever only keeps or passes on observations need not know.
+Observations are stored and sent in compact form: an index as one integer, a bit as a byte, a frame
+as a single frame. An encoder (:mod:`udrl.encoders`, :mod:`udrl.graph`) computes features of each
+kind. A record is one structured array, so code that only stores or forwards observations handles
+all kinds alike.
 """
 
 import functools
@@ -17,16 +18,16 @@ from msgspec import Meta
 
 from udrl.streams import Stream
 
-#: float32 of vectors, uint8 of images and bits, int32 of categories; structured of records.
+#: float32 for vectors, uint8 for images and bits, int32 for categories, structured for records.
 Observations = npt.NDArray[Any]
 
-#: Each has a vector of its own in the network.
-MOST_CATEGORIES = 2**20
-#: Leaves of a record, at most.
-MOST_LEAVES = 256
+#: Maximum number of categories. The network learns an embedding vector for each.
+MAX_CATEGORIES = 2**20
+#: Maximum number of leaves of a record.
+MAX_LEAVES = 256
 
-#: Of a dictionary, or a place in a tuple.
-Key = Annotated[str, Meta(max_length=200)] | Annotated[int, Meta(ge=0, le=MOST_LEAVES)]
+#: Key of a dictionary, or index in a tuple.
+Key = Annotated[str, Meta(max_length=200)] | Annotated[int, Meta(ge=0, le=MAX_LEAVES)]
 
 Size = Annotated[int, Meta(ge=1, le=2**20)]
 
@@ -36,37 +37,38 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one of them."""
+        """Shape of an element."""
         raise NotImplementedError
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """How they are stored and sent."""
+        """Dtype of the elements, in memory, messages and stores."""
         raise NotImplementedError
 
     @property
     def n_bytes(self) -> int:
-        """Of one of them."""
+        """Size of an element in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def gymnasium(self) -> spaces.Space[Any]:
-        """A Gymnasium space of the same elements."""
+        """The Gymnasium space with the same elements."""
         raise NotImplementedError
 
     def fault(self, values: npt.NDArray[Any], n: int) -> str | None:
-        """Say in what way an array is not ``n`` elements of the space, or None."""
+        """Return why an array is not ``n`` elements of the space; None: it is."""
         expected = (n, *self.shape)
         if values.dtype != self.dtype or values.shape != expected:
             return f"{values.dtype} {values.shape}, expected {self.dtype} {expected}"
-        return self._impossible(values)
+        return self._invalid(values)
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
+        """Return why values, of the right dtype and shape, are invalid; None: they are valid."""
         return None
 
 
 class Indices(Space, frozen=True):
-    """The integers from 0 on, below ``n``."""
+    """The integers from 0 to ``n`` - 1."""
 
     n: Annotated[int, Meta(ge=1, le=2**31 - 1)]
 
@@ -80,7 +82,7 @@ class Indices(Space, frozen=True):
         """``Discrete``."""
         return spaces.Discrete(self.n)
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
         if values.size == 0:
             return None
         least, greatest = int(values.min()), int(values.max())
@@ -90,7 +92,7 @@ class Indices(Space, frozen=True):
 
 
 class IndexVectors(Space, frozen=True):
-    """Vectors of integers from 0 on, component i below ``ns[i]``."""
+    """Vectors of integers, component i from 0 to ``ns[i]`` - 1."""
 
     ns: Annotated[tuple[Annotated[int, Meta(ge=1, le=2**20)], ...], Meta(min_length=1)]
 
@@ -104,15 +106,15 @@ class IndexVectors(Space, frozen=True):
         """``MultiDiscrete``."""
         return spaces.MultiDiscrete(np.array(self.ns))
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
         for k, n in enumerate(self.ns):
-            if found := Indices(n)._impossible(values[:, k]):
+            if found := Indices(n)._invalid(values[:, k]):
                 return f"{found} in component {k}"
         return None
 
 
 class Sized(Space, frozen=True):
-    """One dimension of ``size`` numbers."""
+    """Arrays of one dimension, with ``size`` numbers."""
 
     size: Size
 
@@ -123,7 +125,7 @@ class Sized(Space, frozen=True):
 
 
 class Vector(Sized, frozen=True, tag="vector"):
-    """Numbers, float32 [size]."""
+    """Vectors of finite numbers, float32 [size]."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -135,12 +137,12 @@ class Vector(Sized, frozen=True, tag="vector"):
         """A ``Box`` without bounds."""
         return spaces.Box(-np.inf, np.inf, self.shape, np.float32)
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
         return None if np.isfinite(values).all() else "not all finite numbers"
 
 
 class Bits(Sized, frozen=True, tag="bits"):
-    """Zeros and ones, uint8 [size]."""
+    """Vectors of zeros and ones, uint8 [size]."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -152,12 +154,12 @@ class Bits(Sized, frozen=True, tag="bits"):
         """``MultiBinary``."""
         return spaces.MultiBinary(self.size)
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
         return None if (values <= 1).all() else "not all 0 or 1"
 
 
 class Image(Space, frozen=True, tag="image"):
-    """Bytes, uint8 [channels, height, width]."""
+    """Images, uint8 [channels, height, width]."""
 
     channels: Size
     height: Size
@@ -180,9 +182,9 @@ class Image(Space, frozen=True, tag="image"):
 
 
 class Category(Indices, frozen=True, tag="category"):
-    """One of ``n``, an index from 0 on, int32 []."""
+    """One of ``n`` categories, an index from 0, int32 []."""
 
-    n: Annotated[int, Meta(ge=1, le=MOST_CATEGORIES)]
+    n: Annotated[int, Meta(ge=1, le=MAX_CATEGORIES)]
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -191,7 +193,7 @@ class Category(Indices, frozen=True, tag="category"):
 
 
 class Categories(IndexVectors, frozen=True, tag="categories"):
-    """Several of these at once, int32 [components]."""
+    """Several categories, int32 [components]."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -199,7 +201,7 @@ class Categories(IndexVectors, frozen=True, tag="categories"):
         return np.dtype(np.int32)
 
 
-#: What is encoded by itself.
+#: Spaces with an encoder of their own.
 LeafSpace = Vector | Bits | Image | Category | Categories
 
 
@@ -207,8 +209,8 @@ class Leaf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A part of a record.
 
     Attributes:
-        path: keys of dictionaries and indices of tuples on the way to it, from the outside.
-        space: what it is.
+        path: keys of dictionaries and indices of tuples that lead to it, outermost first.
+        space: space of its elements.
     """
 
     path: Annotated[tuple[Key, ...], Meta(max_length=16)]
@@ -216,30 +218,30 @@ class Leaf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def name(self) -> str:
-        """How Python finds it in what the environment shows, e.g. ``['inventory'][2]``."""
+        """The path as a Python subscript of the observation, e.g. ``['inventory'][2]``."""
         return "".join(f"[{key!r}]" for key in self.path)
 
     def find(self, observation: Any) -> Any:
-        """Return it in what the environment shows.
+        """Return the leaf's value in an observation of the environment.
 
         Raises:
-            LookupError: it is not there.
+            LookupError: the observation does not contain it.
         """
         for key in self.path:
             try:
                 observation = observation[key]
-            except (TypeError, ValueError) as error:  # of what has no such keys
+            except (TypeError, ValueError) as error:  # the type has no such keys
                 raise LookupError(key) from error
         return observation
 
 
 class Record(Space, frozen=True, tag="record"):
-    """Several observations at once: what Gymnasium calls ``Dict`` and ``Tuple``, however deep.
+    """Several observations at once: Gymnasium's ``Dict`` and ``Tuple``, possibly nested.
 
-    An element is a structure of its leaves, one after another without padding.
+    An element is a structure of its leaves, in order and without padding.
     """
 
-    leaves: Annotated[tuple[Leaf, ...], Meta(min_length=1, max_length=MOST_LEAVES)]
+    leaves: Annotated[tuple[Leaf, ...], Meta(min_length=1, max_length=MAX_LEAVES)]
 
     def __str__(self) -> str:
         return ", ".join(f"{leaf.name}: {leaf.space}" for leaf in self.leaves)
@@ -255,17 +257,17 @@ class Record(Space, frozen=True, tag="record"):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """A field for each leaf, of its name, dtype and shape."""
+        """A structure with one field per leaf, with its name, dtype and shape."""
         return _structure(self.leaves)
 
     @property
     def gymnasium(self) -> spaces.Space[Any]:
-        """Dictionaries and tuples with the leaves where they were."""
+        """Dictionaries and tuples with the leaves at their paths."""
         return _nested([(leaf.path, leaf.space.gymnasium) for leaf in self.leaves])
 
-    def _impossible(self, values: npt.NDArray[Any]) -> str | None:
+    def _invalid(self, values: npt.NDArray[Any]) -> str | None:
         for leaf in self.leaves:
-            if found := leaf.space._impossible(values[leaf.name]):
+            if found := leaf.space._invalid(values[leaf.name]):
                 return f"{found} in {leaf.name}"
         return None
 
@@ -276,7 +278,7 @@ def _structure(leaves: tuple[Leaf, ...]) -> np.dtype[Any]:
 
 
 def _nested(leaves: list[tuple[tuple[Key, ...], spaces.Space[Any]]]) -> spaces.Space[Any]:
-    """Return the space in which some spaces have these paths."""
+    """Return a space that contains the given spaces at the given paths."""
     if len(leaves) == 1 and not leaves[0][0]:
         return leaves[0][1]
     inner: dict[Key, list[tuple[tuple[Key, ...], spaces.Space[Any]]]] = {}
@@ -292,21 +294,21 @@ ObservationSpace = LeafSpace | Record
 
 
 def leaves_of(space: ObservationSpace) -> tuple[Leaf, ...]:
-    """Return the leaves of a record; of any other space itself, with an empty name."""
+    """Return the leaves of a record; for any other space, one leaf with an empty name."""
     return space.leaves if isinstance(space, Record) else (Leaf((), space),)
 
 
 def parts_of(values: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], ...]:
-    """Return views of elements' leaves, [..., *leaf_shape] each."""
+    """Return views of the leaves of elements, [..., *leaf_shape] each."""
     if values.dtype.names is None:
         return (values,)
     return tuple(values[name] for name in values.dtype.names)
 
 
 def noise(stream: Stream, dtype: np.dtype[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """Return observations of a leaf made of the next numbers of a stream.
+    """Return random observations of a leaf, from the next numbers of a stream.
 
-    float32 in [-2, 2), bytes, or index 0, which every category has.
+    Uniform float32 in [-2, 2), uniform bytes, or category 0, depending on the dtype.
     """
     numbers = stream.uniforms(math.prod(shape)).reshape(shape)
     if dtype == np.uint8:

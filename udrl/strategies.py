@@ -1,6 +1,6 @@
 """Section 2.3.4: strategies that choose exploratory commands, given the best episodes.
 
-The paper's desired returns are slightly above the mean of the best ones. Section 6 suggests
+The paper's desired returns are slightly above the mean of the best episodes. Section 6 suggests
 studying other strategies. A strategy is a class with one method. The setting ``command_strategy``
 names it: one of :data:`STRATEGIES`, or your own, importable as ``package.module:Class``::
 
@@ -32,7 +32,7 @@ class CommandStrategy(Protocol):
     def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
         """Return the desired return and horizon of one exploratory command.
 
-        The result must depend on the arguments alone, or the run is not reproducible.
+        The result must depend only on the arguments; otherwise the run is not reproducible.
 
         Args:
             best: the ``last_few`` best episodes, lowest return first; at least one.
@@ -60,7 +60,7 @@ class Best(NamedTuple):
 
     @classmethod
     def of(cls, episodes: Sequence[Entry]) -> "Best":
-        """Return the statistics of some episodes, at least one."""
+        """Return the statistics of the given episodes, at least one."""
         n = len(episodes)
         # fsum rounds once, so that the result does not depend on the order of summation.
         mean = math.fsum(e.episode_return for e in episodes) / n
@@ -89,8 +89,8 @@ class Uniform:
 class Ranked:
     """Command the return and length of one of the best episodes; better ones are more likely.
 
-    Diverse commands, each of which an episode has fulfilled, keep agents from doing everything in
-    one way, and rare successes are repeated before there are many.
+    Such commands are diverse, and each has been fulfilled by an episode. This keeps the agent from
+    converging to one behavior, and lets it repeat successes while they are still rare.
     """
 
     def __init__(self, config: Config) -> None:
@@ -99,7 +99,7 @@ class Ranked:
     def __call__(self, best: Sequence[Entry], u: float) -> tuple[float, int]:
         """Return the return and length of one of the best episodes.
 
-        It is among the k best of n with probability sqrt(k / n).
+        With probability sqrt(k / n), it is one of the k best of n.
         """
         chosen = best[-1 - int(u * u * len(best))]
         return chosen.episode_return, chosen.length
@@ -108,7 +108,7 @@ class Ranked:
 class Maximum:
     """Always command the highest possible return (``max_return``).
 
-    For tasks in which an agent delivers what is commanded and no more, such as balancing for a
+    For tasks in which an agent obtains what is commanded and no more, such as balancing for a
     number of steps. There, commands slightly above the best episodes make progress slow.
 
     Raises:
@@ -136,7 +136,7 @@ STRATEGIES: dict[str, type[CommandStrategy]] = {
 
 
 def make_strategy(config: Config) -> CommandStrategy:
-    """Return the strategy that ``command_strategy`` names.
+    """Return the strategy named by ``command_strategy``.
 
     Raises:
         ConfigError: there is no strategy of that name, or it cannot be imported or created.
@@ -161,11 +161,11 @@ def make_strategy(config: Config) -> CommandStrategy:
     return strategy
 
 
-def ask(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[float, int]:
-    """Return the desired return and horizon of a strategy, checked.
+def choose_command(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[float, int]:
+    """Return the desired return and horizon that a strategy chooses, after checking them.
 
     Raises:
-        ConfigError: it raised, or returned an invalid command.
+        ConfigError: the strategy raised an exception, or returned an invalid command.
     """
     name = type(strategy).__name__
     try:

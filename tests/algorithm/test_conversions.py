@@ -210,7 +210,7 @@ def test_components_outside_are_faults() -> None:
 @pytest.mark.parametrize(
     ("space", "says"),
     [
-        (spaces.Text(4), "its observation is Text.*Box, Discrete.*differ.*TransformObservation"),
+        (spaces.Text(4), "its observation is Text.*Box, Discrete.*vary.*TransformObservation"),
         (
             spaces.Dict(
                 a=spaces.Discrete(2),

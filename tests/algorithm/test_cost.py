@@ -6,7 +6,7 @@ import pytest
 
 from udrl.actions import Categorical
 from udrl.config import Config, build
-from udrl.cost import slow, training_s
+from udrl.cost import slow_training_warning, training_s
 from udrl.environments import EnvironmentSpec
 from udrl.spaces import Image, ObservationSpace, Vector
 
@@ -53,10 +53,10 @@ def test_a_memory_adds_its_cost() -> None:
 
 def test_large_pictures_are_announced_with_what_to_do() -> None:
     screen = spec(Image(channels=3, height=210, width=160))
-    said = slow(settings(), screen)
+    said = slow_training_warning(settings(), screen)
     assert "every iteration will train for about 12 minutes" in said
     assert "100 updates of 768 examples of" in said
     assert "ResizeObservation" in said
-    assert slow(settings(n_updates_per_iter=5), screen) == ""
-    assert slow(settings(device="cuda"), screen) == ""
-    assert slow(settings(), spec(Vector(size=8))) == ""
+    assert slow_training_warning(settings(n_updates_per_iter=5), screen) == ""
+    assert slow_training_warning(settings(device="cuda"), screen) == ""
+    assert slow_training_warning(settings(), spec(Vector(size=8))) == ""

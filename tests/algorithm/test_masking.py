@@ -147,7 +147,7 @@ def test_masks_that_are_none_are_the_environments_fault(given: dict[str, Any], s
         (
             "walls",
             {"shows": True},
-            "shows no such entry; expected 'info', or one of 'doors', 'time'",
+            "has no such entry; expected 'info', or one of 'doors', 'time'",
         ),
         ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
     ],

@@ -12,11 +12,11 @@ from gymnasium import spaces
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
 from udrl.commands import CommandSampler
-from udrl.config import Budget, Config, build, refuse_idle
+from udrl.config import Budget, Config, build, refuse_ineffective
 from udrl.digests import arrays_digest
 from udrl.environments import make_environment
 from udrl.environments.making import specify
-from udrl.environments.previous import PREVIOUS, ObservePrevious, nothing
+from udrl.environments.previous import PREVIOUS, ObservePrevious, null_action
 from udrl.episode import Episode
 from udrl.errors import ConfigError, UnsupportedEnvironment
 from udrl.offline import read_dataset
@@ -72,8 +72,8 @@ def test_it_is_what_was_done_and_earned(environment: str) -> None:
     ],
     ids=str,
 )
-def test_at_first_there_is_nothing(space: Any, expected: Any) -> None:
-    found = nothing(space)
+def test_first_previous_action_is_null(space: Any, expected: Any) -> None:
+    found = null_action(space)
     if isinstance(expected, tuple):
         assert all(map(np.array_equal, found, expected))
     else:
@@ -200,9 +200,9 @@ def test_wrappers_take_literals_as_arguments() -> None:
     ("wrapper", "says"),
     [
         ("FlattenObservation", "there is no colon"),
-        ("gymnasium.wrappers:FrameStackObservation(3)", "arguments need their names"),
+        ("gymnasium.wrappers:FrameStackObservation(3)", "arguments need names"),
         ("gymnasium.wrappers:FrameStackObservation(stack_size=open('x'))", "ValueError"),
-        ("gymnasium.wrappers:a.b(c=1)", "no name of a class"),
+        ("gymnasium.wrappers:a.b(c=1)", "no class name"),
         ("gymnasium.wrappers:", "SyntaxError"),
         ("gymnasium.wrappers:NoSuchWrapper", "AttributeError"),
         ("no_such_package:Wrapper", "ModuleNotFoundError"),
@@ -218,4 +218,4 @@ def test_wrappers_that_cannot_be_applied_are_refused(wrapper: str, says: str) ->
 
 def test_to_drop_what_is_not_observed_has_no_effect() -> None:
     with pytest.raises(ConfigError, match=r"drop_previous = 0.25 .* needs observe_p"):
-        refuse_idle(config(observe_previous=False), ["drop_previous"])
+        refuse_ineffective(config(observe_previous=False), ["drop_previous"])

@@ -12,7 +12,7 @@ from udrl.algorithm1 import algorithm1
 from udrl.batches import Batches, Windows, draw_examples
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.commands import CommandSampler
-from udrl.config import Budget, Config, build, refuse_idle
+from udrl.config import Budget, Config, build, refuse_ineffective
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.graph import acting_graph
@@ -205,4 +205,4 @@ def test_all_segments_have_no_windows() -> None:
         settings(segments="all")
     for name in ("memory_size", "memory_window"):
         with pytest.raises(ConfigError, match=f"{name} = .* has no effect"):
-            refuse_idle(settings(memory="none"), [name])
+            refuse_ineffective(settings(memory="none"), [name])

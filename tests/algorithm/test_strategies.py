@@ -15,7 +15,7 @@ from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError
 from udrl.replay import Entry, ReplayBuffer
 from udrl.spaces import Vector
-from udrl.strategies import STRATEGIES, ask, make_strategy
+from udrl.strategies import STRATEGIES, choose_command, make_strategy
 
 BEST = st.lists(st.tuples(st.floats(-500, 500), st.integers(1, 1000)), min_size=1, max_size=8).map(
     lambda rows: sorted(Entry(r, i, n) for i, (r, n) in enumerate(rows))
@@ -137,7 +137,7 @@ def test_what_cannot_be_made_is_refused(own: str) -> None:
 
 def test_a_strategy_that_fails_is_named(own: str) -> None:
     with pytest.raises(ConfigError, match="Broken failed: ZeroDivisionError"):
-        ask(strategy(f"{own}:Broken"), [Entry(1.0, 1, 1)], 0.5)
+        choose_command(strategy(f"{own}:Broken"), [Entry(1.0, 1, 1)], 0.5)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_what_no_command_can_be_is_refused(asked: Any) -> None:
             return asked
 
     with pytest.raises(ConfigError, match="Odd"):
-        ask(Odd(config()), [Entry(1.0, 1, 1)], 0.5)
+        choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5)
 
 
 @pytest.mark.parametrize(("horizon", "said"), [(0, 1), (-5, 1), (2.9, 2)])
@@ -165,4 +165,4 @@ def test_a_horizon_is_a_whole_number_of_at_least_one(horizon: float, said: int) 
         def __call__(self, best: Sequence[Entry], u: float) -> Any:
             return 1.0, horizon
 
-    assert ask(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, said)
+    assert choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, said)

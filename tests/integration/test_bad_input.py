@@ -33,7 +33,7 @@ def refusal(process: Cli) -> tuple[int, str]:
         (["train", "CartPole-v1", "--config", "missing.toml"], "missing.toml"),
         (["train", "CartPole-v1", "--resume"], "--resume needs --run-dir"),
         (["train", "CartPole-v1", "--listen", "localhost"], "tcp/HOST:PORT"),
-        (["train", "CartPole-v1", "--set", "action_mask=walls"], "shows no such entry"),
+        (["train", "CartPole-v1", "--set", "action_mask=walls"], "has no such entry"),
         (["train", "--seed", "x", "CartPole-v1"], "--seed"),
         (["replay", "CartPole-v1"], "--listen ENDPOINT or --connect ENDPOINT"),
         (["replay", "CartPole-v1", "--listen", "tcp/0.0.0.0:7447"], "--insecure"),

@@ -81,7 +81,7 @@ def test_what_is_written_is_what_is_read_to_the_bit(spec: EnvironmentSpec) -> No
 
 def test_a_name_that_is_taken_or_unknown() -> None:
     write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
-    with pytest.raises(ConfigError, match=r"already exists.*another name, or a version"):
+    with pytest.raises(ConfigError, match=r"already exists.*another name, or a new version"):
         write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"not found locally.*minari list local"):
         read_dataset("some/thing-v0", small(), VECTOR)
@@ -164,7 +164,7 @@ def test_it_goes_on_without_the_dataset(
 
 def test_another_dataset_of_the_same_name_is_noticed(dataset: str, tmp_path: Path) -> None:
     settings = Settings(offline(dataset, dataset_sha256="0" * 64), Budget(), Fleet())
-    with pytest.raises(ConfigError, match="it is another one than the run began with"):
+    with pytest.raises(ConfigError, match=r"expected [0-9a-f]+; restore the dataset"):
         train(settings, tmp_path / "run", threading.Event(), in_process=True)
 
 

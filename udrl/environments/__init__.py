@@ -1,8 +1,8 @@
-"""Environments: the paper's that Gymnasium lacks, and the one door to all others.
+"""Environments: those of the paper that Gymnasium lacks, and the adapter for all others.
 
-Importing this package registers with Gymnasium ``TakeCover-v0`` (section 3.1), ``Doom-v0`` (any of
-ViZDoom's scenarios), ``LunarLanderSparse-v3`` (section 3.4), ``Figure2-v0`` (the paper's toy) and
-``Obedience-v0`` (obeying the command is trivial).
+Importing this package registers these environments with Gymnasium: ``TakeCover-v0`` (section 3.1),
+``Doom-v0`` (any ViZDoom scenario), ``LunarLanderSparse-v3`` (section 3.4), ``Figure2-v0`` (the
+paper's toy example) and ``Obedience-v0`` (following the command is trivial).
 """
 
 import gymnasium as gym

@@ -1,8 +1,8 @@
-"""Between an environment's own actions and the algorithm's indices (:mod:`udrl.actions`).
+"""Conversion between an environment's actions and the algorithm's indices (:mod:`udrl.actions`).
 
-A ``Box`` is cut into bins: dimension by dimension so many values, evenly from the lowest to the
-highest. What an environment is given is always one of these values; an action of a dataset becomes
-the nearest.
+A ``Box`` is divided into bins: each dimension has a number of evenly spaced values, from the lowest
+to the highest. The environment only receives these values; actions of a dataset are rounded to the
+nearest.
 """
 
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ from udrl.environments.conversions import (
 from udrl.errors import UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
 
-#: Outputs of the network for one action, at most.
-_MOST_PARAMETERS = 2**16
+#: Maximum number of the network's outputs.
+_MAX_PARAMETERS = 2**16
 
 
 class _Bits(MultiIndexed):
-    """Zeros and ones of a ``MultiBinary``."""
+    """Converts a ``MultiBinary``."""
 
     def __init__(self, name: str, declared: spaces.MultiBinary, plain: Product) -> None:
         super().__init__(name, spaces.MultiDiscrete(np.full(declared.shape, 2)), plain)
@@ -37,18 +37,18 @@ class _Bits(MultiIndexed):
 
 
 class _Bins(Conversion):
-    """Values of a ``Box``.
+    """Converts a ``Box`` to bins.
 
     Args:
-        name: what messages call them.
-        declared: the space.
-        values: those of each dimension, in increasing order.
+        name: name of the actions in messages.
+        declared: the environment's space.
+        values: values of each dimension, in increasing order.
     """
 
     def __init__(self, name: str, declared: spaces.Box, values: Sequence[Array]) -> None:
         super().__init__(name, declared, Product(ns=tuple(len(v) for v in values)))
         self._values = values
-        # One row a dimension; what is missing is never looked at.
+        # One row per dimension; the padding is never read.
         self._table = np.zeros((len(values), max(self.plain.ns)), declared.dtype)
         for row, known in zip(self._table, values, strict=True):
             row[: len(known)] = known
@@ -74,7 +74,7 @@ class _Bins(Conversion):
 
 
 class _Joined(Conversion):
-    """The components of all leaves of a ``Dict`` or ``Tuple``, one after another."""
+    """Converts a ``Dict`` or ``Tuple`` to the concatenated components of its leaves."""
 
     def __init__(
         self, name: str, declared: spaces.Space[Any], parts: Sequence[tuple[Any, Conversion]]
@@ -109,7 +109,7 @@ class _Joined(Conversion):
         return converted
 
     def _split(self, values: Array) -> list[tuple[Conversion, Array]]:
-        """Return the part of each leaf, as its own conversion knows it."""
+        """Return each leaf's conversion and its part of the values."""
         return [
             (c, values[..., where] if isinstance(c.plain, Product) else values[..., where.start])
             for (_, c), where in zip(self._parts, self._where, strict=True)
@@ -117,14 +117,14 @@ class _Joined(Conversion):
 
 
 def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Conversion:
-    """Return how actions of a space become plain, and back.
+    """Return the conversion for actions of a space.
 
     Args:
-        space: of the environment's own.
+        space: the environment's action space.
         settings: ``action_bins``, ``action_low``, ``action_high``.
 
     Raises:
-        UnsupportedEnvironment: they are not supported; the message names what is not, and why.
+        UnsupportedEnvironment: the space is not supported; the message lists all problems.
     """
     leaves = list(leaves_within(space))
     dimensions = sum(int(np.prod(s.shape)) for _, s in leaves if isinstance(s, spaces.Box))
@@ -141,10 +141,10 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
         problems.append(f"its actions are {space}, of which there is only one")
     elif (
         not problems
-        and (n := sum(n for _, c in parts for n in c.plain.components)) > _MOST_PARAMETERS
+        and (n := sum(n for _, c in parts for n in c.plain.components)) > _MAX_PARAMETERS
     ):
         problems.append(f"its actions are {space}, for which the network would have {n:,} outputs; "
-                        f"at most {_MOST_PARAMETERS:,} are supported")  # fmt: skip
+                        f"at most {_MAX_PARAMETERS:,} are supported")  # fmt: skip
     if problems:
         raise UnsupportedEnvironment("; besides, ".join(problems))
     if [path for path, _ in leaves] == [()]:
@@ -153,9 +153,9 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
 
 
 def default_bins(dimensions: int) -> int:
-    """Return how many values a dimension has, if nothing else is said: fewer if there are many.
+    """Return the default number of values per dimension: fewer if there are many dimensions.
 
-    An odd number, so that the middle is one of them.
+    The number is odd, so that the middle is one of the values.
     """
     return 11 if dimensions <= 2 else 7
 
@@ -187,8 +187,8 @@ def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -
     if missing.any():
         place = np.argwhere(missing)[0].tolist()
         raise UnsupportedEnvironment(
-            f"its {name}{place} has no bounds ({space}), and values are chosen between two; say "
-            f"between which, e.g. --set action_low=-1 --set action_high=1"
+            f"its {name}{place} has no bounds ({space}), which are needed to divide it into bins; "
+            f"set them, e.g. --set action_low=-1 --set action_high=1"
         )
     if (low >= high).any():
         place = np.argwhere(low >= high)[0].tolist()

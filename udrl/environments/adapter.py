@@ -1,4 +1,4 @@
-"""A foreign environment as the algorithm sees it; everything that it returns is checked."""
+"""The wrapper that adapts an environment to the algorithm's spaces, and checks what it returns."""
 
 import logging
 from collections.abc import Mapping
@@ -16,17 +16,17 @@ _RESET = "(observation, info)"
 _STEP = "(observation, reward, terminated, truncated, info)"
 #: The largest reward.
 _LARGEST = float(np.finfo(np.float32).max)
-#: What Python says where an environment returns what Gym before version 0.26 wanted.
+#: Python's message if an environment's step() has the interface of Gym before version 0.26.
 _OLD_STEP = "not enough values to unpack (expected 5, got 4)"
 
 
 class Adapter(gym.Wrapper[Any, Any, Any, Any]):
-    """Shows plain observations and takes plain actions (:mod:`udrl.environments.conversions`).
+    """Returns plain observations and takes plain actions (:mod:`udrl.environments.conversions`).
 
     Args:
         env: the environment.
-        observations: how what it shows becomes plain.
-        actions: how plain actions become its own.
+        observations: conversion of its observations.
+        actions: conversion of its actions.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         """Begin an episode.
 
         Raises:
-            EnvironmentFault: the environment returned what it may not.
+            EnvironmentFault: the environment returned an invalid value.
         """
         returned: Any = self.env.reset(seed=seed, options=options)
         if not isinstance(returned, tuple) or len(returned) != 2:
@@ -58,15 +58,15 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         """Take a step.
 
         Args:
-            action: plain.
+            action: a plain action.
 
         Raises:
-            EnvironmentFault: the environment returned what it may not.
+            EnvironmentFault: the environment returned an invalid value.
         """
         try:
             returned: Any = self.env.step(self.actions.back_one(action))
         except ValueError as error:
-            if str(error).endswith(_OLD_STEP):  # Gymnasium's wrappers unpack it first
+            if str(error).endswith(_OLD_STEP):  # raised by Gymnasium's wrappers
                 raise _wrong("step", "a tuple of 4", f"{_STEP}, as since Gym 0.26") from error
             raise
         if type(returned) is not tuple or len(returned) != 5:
@@ -83,7 +83,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         return self._seen("step", observation), reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Close the environment; what it raises then is logged and does no harm."""
+        """Close the environment; its exceptions are logged and ignored."""
         close(self.env)
 
     def _seen(self, where: str, observation: Any) -> Array:
@@ -94,10 +94,10 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def close(env: gym.Env[Any, Any]) -> None:
-    """Close a foreign environment; what it raises then is logged and does no harm."""
+    """Close an environment; its exceptions are logged and ignored."""
     try:
         env.close()
-    except Exception as error:  # noqa: BLE001 - whatever foreign code raises
+    except Exception as error:  # noqa: BLE001 - the environment is foreign code
         log.warning("environment %s failed in close(): %s: %s", env, type(error).__name__, error)
 
 
@@ -115,7 +115,7 @@ def _number(reward: Any) -> float:
 
 
 def _flag(name: str, value: Any) -> bool:
-    """Return a truth value, or the one element of an array."""
+    """Return a truth value, or the one element of an array, as a bool."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
     if isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1)):

@@ -1,9 +1,9 @@
-"""Between what an environment has and the plain arrays of the algorithm.
+"""Conversion between an environment's values and the algorithm's plain arrays.
 
 An image's channels are moved to the front, a ``Discrete`` space with an offset is shifted to 0,
-``Dict`` and ``Tuple`` spaces become records, and everything has the dtype of :mod:`udrl.spaces`.
-What an environment or a dataset holds goes through here, and is checked on the way: numpy would
-broadcast, round and wrap without a word. :mod:`udrl.environments.action_conversions` has actions.
+``Dict`` and ``Tuple`` spaces become records, and arrays get the dtypes of :mod:`udrl.spaces`. All
+values of environments and datasets are converted here and checked, because numpy would silently
+broadcast, round and wrap. :mod:`udrl.environments.action_conversions` converts actions.
 """
 
 from abc import ABC, abstractmethod
@@ -16,8 +16,8 @@ from gymnasium import spaces
 
 from udrl.errors import InvalidData, UnsupportedEnvironment
 from udrl.spaces import (
-    MOST_CATEGORIES,
-    MOST_LEAVES,
+    MAX_CATEGORIES,
+    MAX_LEAVES,
     Bits,
     Categories,
     Category,
@@ -30,22 +30,22 @@ from udrl.spaces import (
 )
 
 Array = npt.NDArray[Any]
-#: Keys of dictionaries and indices of tuples on the way to a leaf.
+#: Keys of dictionaries and indices of tuples that lead to a leaf.
 Path = tuple[Key, ...]
 
-#: Of so many elements a table is kept.
+#: Maximum number of elements in a lookup table, and in a message.
 _FEW = 1000
-#: Levels of spaces within spaces.
-_DEEPEST = 16
+#: Maximum levels of nested spaces.
+_MAX_DEPTH = 16
 
 
 class Conversion(ABC):
-    """Of the elements of a Gymnasium space.
+    """Converts elements of a Gymnasium space to plain arrays, and back.
 
     Args:
-        name: what messages call them.
-        declared: what the environment says they are.
-        plain: what they are here.
+        name: name of the elements in messages.
+        declared: the environment's space.
+        plain: the algorithm's space.
     """
 
     def __init__(self, name: str, declared: spaces.Space[Any], plain: Space) -> None:
@@ -54,27 +54,27 @@ class Conversion(ABC):
         self.plain: Any = plain
 
     def one(self, value: Any) -> Array:
-        """Return an element of the environment's, plain.
+        """Convert one element to a plain array.
 
         Raises:
-            InvalidData: it is none; the message has what was declared and what came.
+            InvalidData: it is not in the declared space.
         """
         return self.convert(value, ())
 
     @abstractmethod
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Return elements of the environment's, plain, [*leading, *shape].
+        """Convert elements to a plain array, [*leading, *shape].
 
         Raises:
-            InvalidData: not all of them are.
+            InvalidData: they are not in the declared space.
         """
 
     @abstractmethod
     def back(self, values: Array) -> Any:
-        """Return plain elements, [T, ...], as the environment has them, in arrays of T."""
+        """Convert plain elements, [T, ...], back to arrays of T elements of the declared space."""
 
     def back_one(self, value: Any) -> Any:
-        """Return a plain element as the environment has it, of its own space's type."""
+        """Convert a plain element back to an element of the declared space."""
         return self.back(np.asarray(value)[None])[0]
 
     def _fault(self, value: Any) -> InvalidData:
@@ -82,7 +82,7 @@ class Conversion(ABC):
 
 
 class Boxed(Conversion):
-    """Numbers in the same order: of a ``Box`` of any shape, or a ``MultiBinary``."""
+    """Converts a ``Box`` or ``MultiBinary`` of any shape; the order of elements is unchanged."""
 
     def __init__(self, name: str, declared: spaces.Space[Any], plain: Space) -> None:
         super().__init__(name, declared, plain)
@@ -110,8 +110,8 @@ class Boxed(Conversion):
         return array.reshape(*leading, *self.plain.shape) if self._is_reshaped else array
 
 
-class _Pictures(Boxed):
-    """Images; which dimension has the channels, nobody declares: it is the smallest."""
+class _Images(Boxed):
+    """Converts images. Spaces do not declare the channel dimension: it is the smallest."""
 
     def __init__(self, name: str, declared: spaces.Box) -> None:
         shape = declared.shape
@@ -138,7 +138,7 @@ class _Pictures(Boxed):
 
 
 class Indexed(Conversion):
-    """Numbers of a ``Discrete``, from 0 on."""
+    """Converts a ``Discrete`` to indices from 0."""
 
     def __init__(self, name: str, declared: "spaces.Discrete[Any]", plain: Space) -> None:
         super().__init__(name, declared, plain)
@@ -146,8 +146,8 @@ class Indexed(Conversion):
         self._back = list(self.back(np.arange(self._n))) if self._n <= _FEW else None
 
     def one(self, value: Any) -> Any:
-        """Plain, without delay where it is an integer."""
-        if type(value) is int or isinstance(value, np.integer):  # as nearly all of them are
+        """Plain, with a fast path for integers."""
+        if type(value) is int or isinstance(value, np.integer):
             index = int(value) - self._start
             if 0 <= index < self._n:
                 return self.plain.dtype.type(index)
@@ -167,14 +167,14 @@ class Indexed(Conversion):
         if array.dtype.kind not in "iu" or array.size != np.prod(leading, dtype=int):
             raise self._fault(value)
         shifted = array.reshape(leading).astype(np.int64) - self._start
-        impossible = (shifted < 0) | (shifted >= self._n)
-        if impossible.any():
-            raise self._fault(shifted[impossible].flat[0] + self._start)
+        invalid = (shifted < 0) | (shifted >= self._n)
+        if invalid.any():
+            raise self._fault(shifted[invalid].flat[0] + self._start)
         return shifted.astype(self.plain.dtype)
 
 
 class MultiIndexed(Conversion):
-    """Numbers of a ``MultiDiscrete`` of any shape, from 0 on, in one dimension."""
+    """Converts a ``MultiDiscrete`` of any shape to vectors of indices from 0."""
 
     def __init__(self, name: str, declared: spaces.MultiDiscrete, plain: Space) -> None:
         super().__init__(name, declared, plain)
@@ -196,13 +196,13 @@ class MultiIndexed(Conversion):
             raise InvalidData(
                 f"{self.name} {array.tolist()}, declared is {self.declared}"
                 if array.size <= _FEW
-                else f"{self.name} with an impossible index, declared is {self.declared}"
+                else f"{self.name} with an invalid index, declared is {self.declared}"
             )
         return shifted.astype(self.plain.dtype)
 
 
 class _Records(Conversion):
-    """Structures of a ``Dict`` or ``Tuple``, however deep."""
+    """Converts a ``Dict`` or ``Tuple``, possibly nested, to records."""
 
     def __init__(
         self,
@@ -242,7 +242,7 @@ class _Records(Conversion):
 
 
 def nested(space: spaces.Space[Any], leaves: Iterator[Any]) -> Any:
-    """Return leaves, in the order of a space's, in its dictionaries and tuples."""
+    """Arrange leaves, in the order of the space's leaves, in its dictionaries and tuples."""
     if isinstance(space, spaces.Dict):
         return {key: nested(inner, leaves) for key, inner in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
@@ -253,7 +253,7 @@ def nested(space: spaces.Space[Any], leaves: Iterator[Any]) -> Any:
 def leaves_within(
     space: spaces.Space[Any], path: Path = ()
 ) -> Iterator[tuple[Path, spaces.Space[Any]]]:
-    """Yield the spaces in dictionaries and tuples of spaces, with the way to each."""
+    """Yield the leaves of nested ``Dict`` and ``Tuple`` spaces, with their paths."""
     inner: Mapping[Any, spaces.Space[Any]]
     if isinstance(space, spaces.Dict):
         inner = space.spaces
@@ -262,15 +262,15 @@ def leaves_within(
     else:
         yield path, space
         return
-    for key, one in inner.items():
-        yield from leaves_within(one, (*path, key))
+    for key, child in inner.items():
+        yield from leaves_within(child, (*path, key))
 
 
 def as_array(name: str, value: Any) -> Array:
     """Return a value as an array.
 
     Raises:
-        InvalidData: it is none.
+        InvalidData: it cannot be converted to an array.
     """
     try:
         return np.asarray(value)
@@ -279,7 +279,7 @@ def as_array(name: str, value: Any) -> Array:
 
 
 def describe(value: Any) -> str:
-    """Say what a value is, in a line."""
+    """Describe a value in one line."""
     if isinstance(value, np.ndarray | np.generic) and value.ndim:
         return f"an array of {value.dtype}, shape {value.shape}"
     if isinstance(value, tuple | list):
@@ -291,18 +291,18 @@ def describe(value: Any) -> str:
 
 
 def observation_conversion(space: spaces.Space[Any]) -> Conversion:
-    """Return how observations of a space become plain.
+    """Return the conversion for observations of a space.
 
     Raises:
-        UnsupportedEnvironment: they are not supported; the message names what is not, and why.
+        UnsupportedEnvironment: the space is not supported; the message lists all problems.
     """
     leaves = list(leaves_within(space))
     if [path for path, _ in leaves] == [()]:
         return _of_leaf("observation", space)
-    if not 1 <= len(leaves) <= MOST_LEAVES or max(len(path) for path, _ in leaves) > _DEEPEST:
+    if not 1 <= len(leaves) <= MAX_LEAVES or max(len(path) for path, _ in leaves) > _MAX_DEPTH:
         raise UnsupportedEnvironment(
-            f"its observations have {len(leaves)} parts; supported are 1 to {MOST_LEAVES}, at most "
-            f"{_DEEPEST} levels deep"
+            f"its observations have {len(leaves)} parts; supported are 1 to {MAX_LEAVES}, at most "
+            f"{_MAX_DEPTH} levels deep"
         )
     parts, problems = [], []
     for path, inner in leaves:
@@ -318,35 +318,35 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
 
 def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
     match space:
-        case spaces.Discrete(n=n) if n <= MOST_CATEGORIES:
+        case spaces.Discrete(n=n) if n <= MAX_CATEGORIES:
             return Indexed(name, space, Category(n=int(n)))
         case spaces.Discrete(n=n):
             raise UnsupportedEnvironment(
                 f"its {name} is one of {n:,} states, and the network would learn a vector for "
-                f"each; at most {MOST_CATEGORIES:,} are supported; wrap it, so that it shows "
+                f"each; at most {MAX_CATEGORIES:,} are supported; use a wrapper that returns "
                 f"numbers that describe a state"
             )
-        case spaces.MultiDiscrete() if space.nvec.size and space.nvec.sum() <= MOST_CATEGORIES:
+        case spaces.MultiDiscrete() if space.nvec.size and space.nvec.sum() <= MAX_CATEGORIES:
             return MultiIndexed(name, space, Categories(ns=tuple(space.nvec.reshape(-1).tolist())))
         case spaces.MultiBinary() if np.prod(space.shape) > 0:
             return Boxed(name, space, Bits(size=int(np.prod(space.shape))))
         case spaces.Box() if len(space.shape) in (2, 3) and space.dtype == np.uint8:
             if min(space.shape) > 0:
-                return _Pictures(name, space)
+                return _Images(name, space)
         case spaces.Box() if np.prod(space.shape) > 0:
             return Boxed(name, space, Vector(size=int(np.prod(space.shape))))
     raise UnsupportedEnvironment(
         f"its {name} is {space}; supported are Box, Discrete, MultiDiscrete, MultiBinary, and Dict "
-        f"and Tuple of these; {_help(name, space)}"
+        f"and Tuple of these; {_remedy(name, space)}"
     )
 
 
-def _help(name: str, space: spaces.Space[Any]) -> str:
-    """Return what helps with an unsupported space."""
+def _remedy(name: str, space: spaces.Space[Any]) -> str:
+    """Return the remedy for an unsupported space."""
     drop = ""
     if name.endswith("']"):
         drop = ", or leave it out with gymnasium.wrappers.FilterObservation"
-    differ = ""
+    cause = ""
     if isinstance(space, spaces.Text | spaces.Sequence | spaces.Graph | spaces.OneOf):
-        differ = "its elements differ in size; "
-    return f"{differ}make arrays of it with gymnasium.wrappers.TransformObservation{drop}"
+        cause = "its elements vary in size; "
+    return f"{cause}convert it to arrays with gymnasium.wrappers.TransformObservation{drop}"

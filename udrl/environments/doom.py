@@ -1,4 +1,4 @@
-"""ViZDoom's scenarios, seen through their screen; TakeCover (section 3.1) is one of them."""
+"""ViZDoom's scenarios, with the screen as observation; TakeCover (section 3.1) is one of them."""
 
 import contextlib
 import os
@@ -23,21 +23,22 @@ _keeper: int | None = None
 
 
 class Doom(gym.Env[Image, np.int64]):
-    """A ViZDoom scenario: action i presses its button i, the screen is observed.
+    """A ViZDoom scenario: action i presses its button i; the observation is the screen.
 
-    An episode is a function of its seed and actions. The engine is a process of its own; when it
-    dies, the next step raises.
+    An episode depends only on its seed and actions. The engine is a separate process; when it dies,
+    the next step raises.
 
     Args:
-        scenario: one that ships with ViZDoom, e.g. ``take_cover``, or the path of a .cfg file.
-        height, width: of the observation in pixels, at most 120 x 160, which the engine renders.
+        scenario: a scenario of ViZDoom, e.g. ``take_cover``, or the path of a .cfg file.
+        height, width: size of observations in pixels, at most 120 x 160, the engine's resolution.
         colour: observe red, green and blue instead of grey.
-        frame_skip: tics, of which there are 35 in a second, for each step.
-        max_return: the greatest return possible, if known (2.3.2).
+        frame_skip: tics per step; a second has 35 tics.
+        max_return: the highest possible return, if known (2.3.2).
         render_mode: ``rgb_array``, or None.
 
     Raises:
-        gymnasium.error.DependencyNotInstalled: ViZDoom is not installed, or broken.
+        gymnasium.error.DependencyNotInstalled: ViZDoom is not installed, or does not work.
+        ValueError: there is no such scenario, or the size is too large.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 35}
@@ -56,7 +57,7 @@ class Doom(gym.Env[Image, np.int64]):
         if not (0 < height <= _SCREEN[0] and 0 < width <= _SCREEN[1]):
             raise ValueError(
                 f"height = {height}, width = {width}: the screen is {_SCREEN[0]} x {_SCREEN[1]}, "
-                f"and images are made smaller only"
+                f"and cannot be enlarged"
             )
         self.render_mode = render_mode
         self.max_return = max_return
@@ -80,7 +81,7 @@ class Doom(gym.Env[Image, np.int64]):
         return self._observe(), {}
 
     def step(self, action: np.int64) -> tuple[Image, float, bool, bool, dict[str, Any]]:
-        """Press a button for ``frame_skip`` tics; after the last step the last screen is seen."""
+        """Press a button for ``frame_skip`` tics. The last step returns the last known screen."""
         reward = self._game.make_action(self._buttons[action], self._frame_skip)
         terminated = self._game.is_episode_finished()
         return self._observe(), float(reward), terminated, False, {}
@@ -93,7 +94,7 @@ class Doom(gym.Env[Image, np.int64]):
         return np.repeat(screen, 3 // screen.shape[-1], axis=-1)
 
     def close(self) -> None:
-        """End the engine."""
+        """Stop the engine."""
         self._game.close()
         self._folder.cleanup()
 
@@ -105,7 +106,7 @@ class Doom(gym.Env[Image, np.int64]):
 
 
 def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirectory[str]]:
-    """Start an engine; return it with the folder that it writes to."""
+    """Start an engine; return it and its working directory."""
     try:
         import vizdoom
     except ImportError as error:
@@ -121,7 +122,7 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
     game = vizdoom.DoomGame()
     try:
         game.load_config(str(path.resolve()))
-        game.set_doom_config_path(os.devnull)  # written at its end, when its folder may be gone
+        game.set_doom_config_path(os.devnull)  # written on exit, when the directory may be gone
         game.set_screen_resolution(vizdoom.ScreenResolution.RES_160X120)
         formats = vizdoom.ScreenFormat
         game.set_screen_format(formats.RGB24 if colour else formats.GRAY8)
@@ -140,17 +141,17 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
 
 
 def _start(game: Any, folder: str) -> None:
-    """Start a game's engine, and see to it that it ends with this process, however that ends.
+    """Start a game's engine, which ends with this process, even if that is killed.
 
-    Engines write to where they are started, and two at once trip over each other there. So for the
-    tenth of a second that it takes, this process works in a folder that the engine has alone.
+    Engines write to their working directory, and conflict if two share one. So this process changes
+    to the engine's own directory for the tenth of a second that the start takes.
     """
-    global _keeper  # what it reads; never closed, but by the end of this process
+    global _keeper  # write end of the keeper's standard input; only closed when this process ends
     with _starting:
         if _keeper is None and Path("/proc/self/environ").exists():
             reads, _keeper = os.pipe()
             command = [sys.executable, "-I", "-S", engine_keeper.__file__, _mark]
-            # Not our output: whoever reads that to its end would wait for the keeper's.
+            # Without our stdout and stderr: their reader would wait for the keeper's end.
             silent = [(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_WRONLY, 0) for fd in (1, 2)]
             os.posix_spawn(
                 sys.executable, command, os.environ,

@@ -1,4 +1,4 @@
-"""Making images smaller by area averaging, to the last bit the same everywhere."""
+"""Downsampling of images by area averaging, with the same bits on every machine."""
 
 from typing import Any
 
@@ -11,17 +11,17 @@ Image = npt.NDArray[np.uint8]
 class AreaAverage:
     """Averages the pixels that each pixel of a smaller image covers.
 
-    A pixel that is covered in part counts by its part. The sums are exact, so the result does not
-    depend on the processor; it is rounded to the nearest integer, halves up.
+    A partly covered pixel is weighted by its covered part. The sums are exact, so the result does
+    not depend on the processor; it is rounded to the nearest integer, halves up.
 
     Args:
-        height, width: of what comes in.
-        to_height, to_width: of what goes out, at most as large.
+        height, width: size of the input.
+        to_height, to_width: size of the output, at most that of the input.
     """
 
     def __init__(self, height: int, width: int, to_height: int, to_width: int) -> None:
         self._area = height * width
-        # Sums are at most 255 times the area, and twice that with what rounds them.
+        # Sums are at most 255 times the area; rounding doubles them and adds the area.
         exact = np.int32 if 511 * self._area < 2**31 else np.int64
         self._rows = _covered(height, to_height, exact)
         self._columns = _covered(width, to_width, exact)
@@ -35,8 +35,8 @@ class AreaAverage:
         Returns:
             uint8 [to_height, to_width] or [to_height, to_width, channels].
         """
-        # Not a matrix product: a BLAS computes it in threads that wait for each other by spinning,
-        # and that deadlock when an environment in another thread starts a process.
+        # Not a matrix product: BLAS threads spin while they wait for each other, and deadlock when
+        # an environment in another thread starts a process.
         rows, shares = self._rows
         sums = np.einsum("kj,kj...->j...", shares, image[rows])
         columns, shares = self._columns
@@ -48,9 +48,9 @@ class AreaAverage:
 def _covered(
     size: int, to_size: int, exact: type[np.signedinteger[Any]]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
-    """Return which pixels each of ``to_size`` covers, and their parts, [most, to_size] each.
+    """Return the pixels that each output pixel covers, and their weights, [most, to_size] each.
 
-    Where one covers fewer than the most, neighbours with no part are among them.
+    Output pixels that cover fewer than ``most`` pixels also have neighbours of weight 0.
     """
     shares = _shares(size, to_size)
     most = int((shares > 0).sum(axis=1).max())
@@ -60,9 +60,9 @@ def _covered(
 
 
 def _shares(size: int, to_size: int) -> npt.NDArray[np.int64]:
-    """Return what each of ``size`` pixels gives to each of ``to_size``, in parts of a pixel.
+    """Return the overlaps of ``to_size`` output pixels and ``size`` pixels, [to_size, size].
 
-    A pixel is ``to_size`` parts long and a larger one ``size``; [to_size, size].
+    The unit makes all overlaps integers: a pixel is ``to_size`` long, an output pixel ``size``.
     """
     pixel = np.arange(size) * to_size
     larger = np.arange(to_size)[:, None] * size

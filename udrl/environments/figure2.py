@@ -1,4 +1,4 @@
-"""Figure 2: a toy environment with four discrete states, for which Table 1 gives the answer.
+"""Figure 2: a toy environment with four discrete states; Table 1 has its behavior function.
 
 ::
 
@@ -18,7 +18,7 @@ A1, A2, A3 = 0, 1, 2
 
 
 class Figure2(gym.Env[np.int64, np.int64]):
-    """The toy environment; observations are the state's number, actions those of the figure."""
+    """The toy environment; observations are the numbers of states, actions those of the figure."""
 
     metadata = {"render_modes": [], "max_return": 2.0}
 
@@ -37,7 +37,7 @@ class Figure2(gym.Env[np.int64, np.int64]):
         return np.int64(self._state), {}
 
     def step(self, action: np.int64) -> tuple[np.int64, float, bool, bool, dict[str, Any]]:
-        """Follow an arrow of the figure."""
+        """Take a transition of the figure."""
         if self._state == 0:
             self._state, reward = (1, 2.0) if action == A1 else (2, 1.0)
         else:

@@ -1,8 +1,7 @@
-"""Making an environment from a run's settings, and saying what it looks like to the algorithm.
+"""Makes environments from a run's settings, and specifies them for the algorithm.
 
-However an environment presents itself, the algorithm sees observations of the kinds in
-:mod:`udrl.spaces` and actions of those in :mod:`udrl.actions`. Everything else is refused, with
-what is supported.
+All environments are adapted to the observation spaces of :mod:`udrl.spaces` and the action spaces
+of :mod:`udrl.actions`. Errors for unsupported spaces list the supported ones.
 """
 
 import ast
@@ -28,47 +27,47 @@ from udrl.environments.previous import ObservePrevious
 from udrl.environments.time_left import ObserveTime
 from udrl.errors import UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
-from udrl.spaces import MOST_LEAVES, Bits, ObservationSpace, Vector, leaves_of
+from udrl.spaces import MAX_LEAVES, Bits, ObservationSpace, Vector, leaves_of
 
 Environment = gym.Env[Any, Any]
 
 _EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot", "vizdoom": "doom"}
 
 
-#: The environment variable that holds an environment's index while it is made: no other that a run
-#: has on the same machine has the same.
+#: Environment variable with an environment's index while it is made, which is unique among the
+#: environments of a run on one machine.
 INDEX = "UDRL_ENVIRONMENT_INDEX"
 
 _making = threading.RLock()
 
 
 class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the algorithm knows of an environment.
+    """Specification of an environment.
 
     Attributes:
-        observation_space: what it shows.
-        action_space: what can be done.
-        max_episode_steps: steps after which an episode is truncated.
-        max_return: the greatest return possible, if declared (caps evaluation commands, 2.3.2).
-        action_mask: which leaf of an observation says what actions are allowed, by its number; 1
-            or 0 for each of the ``n_parameters``; None: all are, always.
+        observation_space: space of single observations.
+        action_space: space of actions.
+        max_episode_steps: time limit of episodes in steps.
+        max_return: the highest possible return, if declared; caps evaluation commands (2.3.2).
+        action_mask: number of the observation's leaf with the action mask: 1 for allowed actions,
+            otherwise 0, for each of the ``n_parameters``. None: all actions are allowed.
     """
 
     observation_space: ObservationSpace
     action_space: ActionSpace
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**31)]
     max_return: float | None = None
-    action_mask: Annotated[int, Meta(ge=0, le=MOST_LEAVES - 1)] | None = None
+    action_mask: Annotated[int, Meta(ge=0, le=MAX_LEAVES - 1)] | None = None
 
     @property
     def step_bytes(self) -> int:
-        """Bytes of one observation, action and reward, as they are sent and stored."""
+        """Bytes of one observation, action and reward, as sent and stored."""
         return self.observation_space.n_bytes + self.action_space.n_bytes + 4
 
 
 @contextmanager
 def indexed(number: int) -> Iterator[None]:
-    """Let the environment that is made within learn its index, e.g. for a port of its own."""
+    """Set :data:`INDEX` while an environment is made, which may need it, e.g. to choose a port."""
     with _making:
         before = os.environ.get(INDEX)
         os.environ[INDEX] = str(number)
@@ -82,14 +81,14 @@ def indexed(number: int) -> Iterator[None]:
 
 
 def make_environment(config: Config) -> Adapter:
-    """Return the environment of a run, with observations and actions as the algorithm sees them.
+    """Return the environment of a run, adapted to the algorithm's spaces.
 
     Raises:
-        UnsupportedEnvironment: it does not exist, cannot be made, has no time limit, or has spaces
-            that are not supported; all that is wrong is said at once.
+        UnsupportedEnvironment: it does not exist, cannot be made, has no time limit, or has
+            unsupported spaces. The message lists all problems with limit and spaces.
     """
     name = config.environment
-    # The limit is handed over only when it is set: None would mean "no limit" to Gymnasium.
+    # Passed only if it is set: None would mean "no limit" to Gymnasium.
     limit: dict[str, Any] = {}
     if config.max_episode_steps is not None:
         limit["max_episode_steps"] = config.max_episode_steps
@@ -128,30 +127,30 @@ def _wrapped(env: Environment, name: str) -> Environment:
 
 
 def _called(call: str) -> tuple[str, dict[str, Any]]:
-    """Return name and keyword arguments, which are literals, of a call; nothing is evaluated."""
+    """Return name and keyword arguments of a call; these are literals, nothing is evaluated."""
     node = ast.parse(call.strip(), mode="eval").body
     arguments: dict[str, Any] = {}
     if isinstance(node, ast.Call):
         if node.args:
-            raise ValueError("arguments need their names")
+            raise ValueError("arguments need names")
         arguments = {str(k.arg): ast.literal_eval(k.value) for k in node.keywords}
         node = node.func
     if not isinstance(node, ast.Name):
-        raise TypeError("there is no name of a class behind the colon")
+        raise TypeError("there is no class name after the colon")
     return node.id, arguments
 
 
 def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
-    """Return an environment with observations and actions as the algorithm sees them, and checked.
+    """Return an environment adapted to the algorithm's spaces, which checks all values.
 
     Args:
-        env: has a step limit.
-        name: what messages call it.
-        settings: how its actions are read.
+        env: an environment with a step limit.
+        name: its name in messages.
+        settings: settings of its action space.
 
     Raises:
-        UnsupportedEnvironment: it has no time limit, or spaces that are not supported; all that is
-            wrong is said at once, and the environment is closed.
+        UnsupportedEnvironment: it has no time limit, or unsupported spaces. The message lists all
+            problems, and the environment is closed.
     """
     observations = actions = None
     problems = []
@@ -177,7 +176,7 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
 
 
 def _remedy(error: Exception, config: Config) -> str:
-    """Return what to do about an exception that an environment's making raised."""
+    """Return the remedy for an exception of ``gymnasium.make``."""
     text = str(error)
     if isinstance(error, gym.error.DependencyNotInstalled | ImportError):
         for package, extra in _EXTRAS.items():
@@ -185,39 +184,39 @@ def _remedy(error: Exception, config: Config) -> str:
                 return f'install it with: pip install "udrl[{extra}]"'
         if isinstance(error, ModuleNotFoundError) and ":" in config.environment:
             return (
-                "install the package that provides it, or start in the directory that the module "
-                "is in"
+                "install the package that provides it, or start in the directory that contains "
+                "the module"
             )
         return "install the package that provides it"
     if isinstance(error, gym.error.Error):
         return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
     if threading.current_thread() is not threading.main_thread() and _is_of_threads(text):
         return (
-            "it has to be made in the main thread of a process: train without --in-process (in "
+            "it must be made in the main thread of a process: train without --in-process (in "
             "Python: in_process=False), and watch it with udrl play instead of the board"
         )
     if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
         return (
-            "another copy of it, or another program, has that port; if only one copy can run at a "
+            "another copy of it, or another program, uses this port; if only one copy can run at a "
             "time, add --actors 1 --envs-per-actor 1"
         )
     if isinstance(error, TypeError) and "unexpected keyword argument" in text:
-        return "environment_kwargs has its arguments; leave out those that it does not take"
+        return "remove arguments that it does not accept from environment_kwargs"
     if isinstance(error, TypeError) and "missing" in text and "required" in text:
-        return "give it that, e.g. --set 'environment_kwargs={NAME=VALUE}'"
+        return "pass the argument, e.g. --set 'environment_kwargs={NAME=VALUE}'"
     return (
-        f"the fault is in the environment or its arguments; in Python, "
+        f"the cause is in the environment or its arguments; in Python, "
         f"gymnasium.make({config.environment!r}) shows where"
     )
 
 
 def _is_of_threads(text: str) -> bool:
-    """Say whether an exception's text is one of those that come from a thread of one's own."""
+    """Return whether an exception's text says that the code must run in the main thread."""
     return any(word in text.lower() for word in ("main thread", "event loop", "signal"))
 
 
 def specify(env: Environment, config: Config) -> EnvironmentSpec:
-    """Return the spec of an environment that :func:`make_environment` made."""
+    """Return the specification of an environment from :func:`make_environment`."""
     assert env.spec is not None
     assert env.spec.max_episode_steps is not None
     space, actions = (env.get_wrapper_attr(name).plain for name in ("observations", "actions"))
@@ -233,7 +232,7 @@ def specify(env: Environment, config: Config) -> EnvironmentSpec:
 
 
 def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int | None:
-    """Return the number of the leaf that says which actions are allowed."""
+    """Return the number of the leaf with the action mask."""
     name = config.actions.action_mask
     if name is None:
         return None
@@ -242,14 +241,14 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
     found = [k for k, path in enumerate(leaves) if below_observation(path) == (key,)]
     if not found:
         raise UnsupportedEnvironment(
-            f"action_mask = {name!r}: environment {config.environment!r} shows no such entry; "
+            f"action_mask = {name!r}: environment {config.environment!r} has no such entry; "
             f"expected 'info', or one of {', '.join(repr(path[-1]) for path in leaves if path)}"
         )
     leaf = leaves_of(space)[found[0]].space
     if not isinstance(leaf, Bits | Vector) or leaf.size != actions.n_parameters:
         raise UnsupportedEnvironment(
             f"action_mask = {name!r}: it is {leaf}, expected {actions.n_parameters} numbers, 0 or "
-            f"1, as {actions} has outputs"
+            f"1, one for each output of {actions}"
         )
     return found[0]
 
@@ -257,8 +256,11 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
 def limit_steps(env: Environment, max_steps: int) -> None:
     """Set the time limit of the environment's next episodes, in steps.
 
-    The limit that ``gymnasium.make`` put there is moved instead of counting steps outside, because
-    what stands outside it (:class:`~udrl.environments.sparse.RewardAtEnd`) must see the cut.
+    This changes Gymnasium's ``TimeLimit`` wrapper instead of counting steps outside, because the
+    wrappers outside it must see the truncation (:class:`~udrl.environments.sparse.RewardAtEnd`).
+
+    Raises:
+        UnsupportedEnvironment: it has no ``TimeLimit``.
     """
     if not env.set_wrapper_attr("_max_episode_steps", max_steps, force=False):
         raise UnsupportedEnvironment(

@@ -1,4 +1,4 @@
-"""Which actions are allowed, as a part of what is observed (``action_mask``)."""
+"""The action mask as part of the observation (``action_mask``)."""
 
 from typing import Any
 
@@ -10,24 +10,24 @@ from udrl.environments.conversions import describe
 from udrl.errors import EnvironmentFault
 from udrl.spaces import Key
 
-#: Key of the mask in ``info``, and in what is observed.
+#: Key of the mask in ``info``, and in observations.
 MASK = "action_mask"
 OBSERVATION = "observation"
 
 
 def below_observation(path: tuple[Key, ...]) -> tuple[Key, ...]:
-    """Return the way to a leaf from where our wrappers' own keys are."""
+    """Return a leaf's path below the nested ``observation`` keys that our wrappers add."""
     while path[:1] == (OBSERVATION,):
         path = path[1:]
     return path
 
 
 class ObserveMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Shows the environment's observation in a ``Dict``, with ``info["action_mask"]``.
+    """Adds ``info["action_mask"]`` to the observation, in a ``Dict``.
 
     Args:
         env: any environment whose ``info`` has the mask after every reset and step.
-        size: numbers of the mask, one for each output of the behavior function.
+        size: length of the mask, one number for each output of the behavior function.
     """
 
     def __init__(self, env: gym.Env[Any, Any], size: int) -> None:
@@ -43,14 +43,14 @@ class ObserveMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._shown("reset", observation, info), info
+        return self._with_mask("reset", observation, info), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._shown("step", observation, info), reward, terminated, truncated, info
+        return self._with_mask("step", observation, info), reward, terminated, truncated, info
 
-    def _shown(self, where: str, observation: Any, info: Any) -> dict[str, Any]:
+    def _with_mask(self, where: str, observation: Any, info: Any) -> dict[str, Any]:
         try:
             given = info[MASK]
         except (KeyError, TypeError, IndexError) as error:

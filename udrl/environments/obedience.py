@@ -1,7 +1,7 @@
-"""An environment in which obeying the command is trivial.
+"""An environment in which following the command is trivial.
 
-Action 1 gives reward 1, action 0 gives 0, and the episode ends after a number of steps that the
-observation counts down. "Return r within h steps" is obeyed by choosing action 1 exactly r times.
+Action 1 has reward 1, action 0 has reward 0, and the episode ends after a number of steps that the
+observation counts down. To obtain a return r, choose action 1 exactly r times.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 
 class Obedience(gym.Env[npt.NDArray[np.float32], np.int64]):
-    """Collect as much as you are told to.
+    """The reward is the action.
 
     Args:
         steps: length of every episode.
@@ -34,7 +34,7 @@ class Obedience(gym.Env[npt.NDArray[np.float32], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Begin with all steps left."""
+        """Begin an episode."""
         super().reset(seed=seed)
         self._left = self._steps
         return self._observe(), {}
@@ -42,6 +42,6 @@ class Obedience(gym.Env[npt.NDArray[np.float32], np.int64]):
     def step(
         self, action: np.int64
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Give what was asked for."""
+        """Take a step; the reward is the action."""
         self._left -= 1
         return self._observe(), float(action), self._left <= 0, False, {}

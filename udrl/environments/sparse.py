@@ -1,4 +1,4 @@
-"""Section 3.4: the same task with all reward at the last step."""
+"""Section 3.4: sparse rewards, all at the last step."""
 
 from typing import Any, SupportsFloat
 
@@ -6,10 +6,10 @@ import gymnasium as gym
 
 
 class RewardAtEnd(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Withholds the rewards of an episode and gives their sum, a float, with its last step.
+    """Withholds the rewards of an episode and returns their sum, a float, at the last step.
 
-    It belongs outside the time limit, so that it sees an episode that is cut
-    (``additional_wrappers`` of a registration stand there).
+    Apply it outside the time limit, so that it sees truncations. Gymnasium applies a registration's
+    ``additional_wrappers`` there.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -20,12 +20,12 @@ class RewardAtEnd(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; nothing is withheld yet."""
+        """Begin an episode, with nothing withheld."""
         self._withheld = 0.0
         return super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Give 0 until the episode ends, then everything that was withheld."""
+        """Take a step; the reward is 0 until the episode ends, then the sum of all rewards."""
         observation, reward, terminated, truncated, info = super().step(action)
         self._withheld += float(reward)
         given = self._withheld if terminated or truncated else 0.0

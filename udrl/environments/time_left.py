@@ -1,4 +1,4 @@
-"""The time that is left as a part of what is observed (``observe_time``)."""
+"""The time left as part of the observation (``observe_time``)."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ TIME_LEFT = "time_left"
 
 
 class ObserveTime(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Shows the environment's observation in a ``Dict``, with the time that is left.
+    """Adds the time left to the observation, in a ``Dict``.
 
-    That is 1 at an episode's first step and counts down to 0 at the step limit.
+    It is 1 at an episode's first observation and counts down to 0 at the step limit.
 
     Args:
         env: any environment.
@@ -34,25 +34,25 @@ class ObserveTime(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._step = 0
-        return self._shown(observation), info
+        return self._with_time(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._step += 1
-        return self._shown(observation), reward, terminated, truncated, info
+        return self._with_time(observation), reward, terminated, truncated, info
 
-    def _shown(self, observation: Any) -> dict[str, Any]:
+    def _with_time(self, observation: Any) -> dict[str, Any]:
         left = 1 - self._step / self._max_steps
         return {OBSERVATION: observation, TIME_LEFT: np.array([left], np.float32)}
 
 
 def observation_space(seen: spaces.Space[Any]) -> spaces.Dict:
-    """Return the space of observations with the time that is left."""
+    """Return the space of observations with the time left."""
     return spaces.Dict([(OBSERVATION, seen), (TIME_LEFT, spaces.Box(0, 1, (1,), np.float32))])
 
 
-def shown_in_all_steps(observations: Any, n: int, max_steps: int) -> dict[str, Any]:
-    """Return ``n`` observations as the wrapper would have shown them."""
+def add_time_left(observations: Any, n: int, max_steps: int) -> dict[str, Any]:
+    """Return an episode's ``n`` observations as the wrapper would have returned them."""
     left = np.array([[1 - step / max_steps] for step in range(n)], np.float32)
     return {OBSERVATION: observations, TIME_LEFT: left}

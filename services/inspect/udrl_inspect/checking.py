@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from udrl.acting import EpisodeGenerator
 from udrl.commands import CommandSampler
 from udrl.config import Config, change, flat
-from udrl.cost import slow
+from udrl.cost import slow_training_warning
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
 from udrl.fitting import choose, fits
@@ -105,7 +105,7 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
     advice += _unusual(fitted, episodes, repeats=repeats)
-    if long := slow(fitted, spec):
+    if long := slow_training_warning(fitted, spec):
         advice.append(f"{long[0].upper()}{long[1:]}.")
     return Check(
         environment=config.environment,

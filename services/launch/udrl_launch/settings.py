@@ -18,7 +18,7 @@ from udrl.config import (
     preset,
     preset_names,
     read_toml,
-    refuse_idle,
+    refuse_ineffective,
     refuse_unknown,
     setting_names,
 )
@@ -175,5 +175,5 @@ def gather(
         return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)
-    refuse_idle(config, asked_for)
+    refuse_ineffective(config, asked_for)
     return Settings(config, part(Budget), part(Fleet), frozenset(left_open))

@@ -13,7 +13,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.config import Budget, Config, flat
-from udrl.cost import slow
+from udrl.cost import slow_training_warning
 from udrl.episode import Episode
 from udrl.errors import StoreError
 from udrl.fitting import fit
@@ -113,7 +113,7 @@ def _create(
             f"environment {config.environment} does not repeat an episode from its seed"
         )
         log.warning("the run is not exact: %s", progress.inexact_reason)
-    if long := slow(config, generator.spec):
+    if long := slow_training_warning(config, generator.spec):
         log.warning("%s", long)
     hello = Hello(
         protocol=PROTOCOL,
