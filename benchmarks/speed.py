@@ -313,7 +313,7 @@ def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
     def update() -> None:
         if state.behavior.value is not None:
             step(value_loss(state.behavior.value(observed), command[:, 0]))
-        step(state.behavior.loss(state.behavior.obey(observed, command), action))
+        step(state.behavior.loss(state.behavior.forward_relative(observed, command), action))
 
     return _seconds(update, 100)
 

@@ -1,4 +1,4 @@
-"""What kinds of actions are to training, in torch; :mod:`udrl.actions` is without it."""
+"""Losses and values of actions, in torch; :mod:`udrl.actions` does not need torch."""
 
 from torch import Tensor
 from torch.nn import functional
@@ -7,11 +7,11 @@ from udrl.actions import ActionSpace, Product
 
 
 def negative_log_likelihood(space: ActionSpace, parameters: Tensor, action: Tensor) -> Tensor:
-    """Return the mean of -ln P(a) over a batch, nats.
+    """Return the mean of -ln P(a) over a batch, in nats.
 
     Args:
-        space: of the actions.
-        parameters: of P, float32 [batch, n_parameters].
+        space: the action space.
+        parameters: parameters of P, float32 [batch, n_parameters].
         action: a, int64 [batch, *shape].
     """
     if not isinstance(space, Product):
@@ -25,14 +25,14 @@ def negative_log_likelihood(space: ActionSpace, parameters: Tensor, action: Tens
 
 
 def of_action(space: ActionSpace, values: Tensor, action: Tensor) -> Tensor:
-    """Return the value of an action, float32 [batch], from one for each parameter.
+    """Return the values of actions, float32 [batch].
 
-    That of several components is the sum of theirs.
+    The value of an action with several components is the sum of their values.
 
     Args:
-        space: of the actions.
-        values: float32 [batch, n_parameters].
-        action: int64 [batch, *shape].
+        space: the action space.
+        values: one value for each value of each component, float32 [batch, n_parameters].
+        action: a, int64 [batch, *shape].
     """
     if not isinstance(space, Product):
         return values.gather(1, action[:, None])[:, 0]

@@ -1,7 +1,7 @@
 """Sizes and constants of the network of section 3.2 and Appendix B.2, and of the value function.
 
-They are what the behavior function in torch (:mod:`udrl.behavior`) and the acting graph
-(:mod:`udrl.graph`) have in common.
+The behavior function in torch (:mod:`udrl.behavior`) and the acting graph (:mod:`udrl.graph`) share
+them.
 """
 
 import math
@@ -16,37 +16,36 @@ FILTER, STRIDE, PADDING = 3, 2, 1
 #: Units in each hidden layer of the value function.
 VALUE_WIDTH = 64
 
-#: D(s) is at least this, in scaled return: where V fits perfectly, every gain would be infinite.
-LEAST_DEVIATION = 3e-3
+#: Lower bound of D(s), in scaled return. Without it, advantages would be infinite where V is exact.
+MIN_DEVIATION = 3e-3
 
-#: D(s) is a squareplus, (d + sqrt(d^2 + this)) / 2: what softplus is for, of operations that IEEE
-#: 754 rounds in one way only, so that it does not matter which instructions compute them.
+#: D(s) is a squareplus, (d + sqrt(d^2 + SQUAREPLUS)) / 2. Unlike softplus, it only has operations
+#: whose rounding IEEE 754 defines, so the result does not depend on the processor's instructions.
 SQUAREPLUS = 2.0
 
-#: Relative desired returns are kept within so many deviations.
+#: Relative desired returns are clipped to this many deviations.
 DEVIATIONS = 2.0
 
-
-#: Normalised observations are kept within so many deviations of their mean.
+#: Normalised observations are clipped to this many deviations from their mean.
 NORMAL_BOUND = 10.0
 
-#: Added to the logits of actions that are not allowed.
+#: Added to the logits of masked actions.
 FORBIDDEN = -1e9
 
-#: In the names of tensors that are set once and not trained.
+#: Part of the names of tensors that are set once and not trained.
 NORMALISER = "normaliser"
 
 
 def is_trained(name: str) -> bool:
-    """Say whether training changes a tensor of this name at every update."""
+    """Return whether the optimizer updates a tensor of this name."""
     return NORMALISER not in name.split(".")
 
 
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:
-    """Return the widths of the behavior function: of its features, and of the layers that follow.
+    """Return the widths of the behavior function's features and of the layers after them.
 
-    An image's convolutions stand before all layers of ``hidden``; any other encoder, also the one
-    of a record, is the first. Where there is a memory, its state is the features.
+    The convolutions of an image come before all layers of ``hidden``; any other encoder, including
+    that of a record, is the first of these layers. With a memory, its state is the features.
     """
     if isinstance(space, Image):
         widths = (n_features(space, network.convolutions, 0), *network.hidden)
@@ -56,7 +55,7 @@ def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int
 
 
 def state_sizes(network: NetworkSettings) -> tuple[int, ...]:
-    """Return how many numbers the behavior function and the value function remember."""
+    """Return the state sizes of the behavior function's and the value function's memories."""
     if network.memory == "none":
         return ()
     own = (network.memory_size,)
@@ -64,14 +63,14 @@ def state_sizes(network: NetworkSettings) -> tuple[int, ...]:
 
 
 def n_features(space: ObservationSpace, channels: Sequence[int], width: int) -> int:
-    """Return how many features an encoder makes: of an image what its convolutions leave."""
+    """Return the number of an encoder's features: for an image, the output of its convolutions."""
     if not isinstance(space, Image):
         return width
     return channels[-1] * math.prod(image_sizes(space, len(channels))[-1])
 
 
 def image_sizes(space: Image, n_layers: int) -> list[tuple[int, int]]:
-    """Return height and width behind each of so many convolutions."""
+    """Return height and width after each of ``n_layers`` convolutions."""
     sizes = [(space.height, space.width)]
     for _ in range(n_layers):
         height, width = ((n + 2 * PADDING - FILTER) // STRIDE + 1 for n in sizes[-1])

@@ -1,7 +1,8 @@
-"""The examples of a version's updates as tensors, drawn at once and gathered many at a time.
+"""Batches: the examples of a version's updates as tensors.
 
-Without a memory the examples of a batch are drawn one by one. With one they are windows of
-``memory_window`` consecutive steps of an episode, which begin at multiples of it.
+All examples of a version are drawn at once, and gathered for several updates at a time. Without a
+memory, examples are drawn individually. With a memory, a batch consists of windows of
+``memory_window`` consecutive steps of an episode, which begin at multiples of ``memory_window``.
 """
 
 import math
@@ -21,25 +22,25 @@ from udrl.streams import Stream
 from udrl.targets import ReturnInTime
 from udrl.value import relative
 
-#: Paths of what was before an observation.
+#: Paths of the leaves that ``observe_previous`` adds.
 _PREVIOUS = [(key,) for key in PREVIOUS]
-#: Bytes of observations that are gathered at once for the next updates.
+#: Bytes of observations that are gathered at once, for the next updates.
 _GATHERED_BYTES = 16 << 20
 
 Seen = tuple[Tensor, ...]
 
 
 class Draw(NamedTuple):
-    """What the examples of all updates are.
+    """The examples of all updates.
 
     Attributes:
-        segments: int64 [updates, examples] each.
-        hidden: from which of them the previous action and reward are hidden, bool of that shape;
-            None: from none.
-        windows: with a memory, which windows of the buffer they are (:class:`Windows`), int64
-            [updates, windows]; of each window there are as many examples as it has steps.
-        valid: with a memory, which examples count, bool [updates, examples]: an episode's last
-            window may be shorter, and its last step is there again until it is full.
+        segments: the examples' segments, int64 [updates, examples] each.
+        hidden: whether the previous action and reward are hidden from an example, bool [updates,
+            examples]; None: from no example.
+        windows: with a memory, numbers of the windows (:class:`Windows`), int64 [updates, windows].
+            The examples are then the steps of these windows.
+        valid: with a memory, whether an example counts, bool [updates, examples]. An episode's last
+            window may be incomplete; it is padded with the last step.
     """
 
     segments: Segments
@@ -49,16 +50,16 @@ class Draw(NamedTuple):
 
 
 class Windows:
-    """The windows of all episodes in the buffer, episode by episode.
+    """The windows of all episodes in the buffer, numbered episode by episode.
 
     Args:
         lengths: T of each episode, by rank.
-        size: steps of a window.
+        size: steps per window.
 
     Attributes:
-        size: steps of a window.
+        size: steps per window.
         first: number of each episode's first window, int64 [episodes].
-        counts: how many it has, likewise.
+        counts: number of each episode's windows, int64 [episodes].
     """
 
     def __init__(self, lengths: npt.NDArray[np.int64], size: int) -> None:
@@ -68,10 +69,10 @@ class Windows:
         self._lengths = lengths
 
     def draw(self, uniforms: npt.NDArray[np.float64]) -> Draw:
-        """Turn numbers into windows: an episode uniformly, then one of its windows uniformly.
+        """Draw windows: an episode uniformly, then one of its windows uniformly.
 
         Args:
-            uniforms: in [0, 1), float64 [2, updates, windows].
+            uniforms: random numbers in [0, 1), float64 [2, updates, windows].
         """
         rank = (uniforms[0] * len(self._lengths)).astype(np.int64)
         chunk = (uniforms[1] * self.counts[rank]).astype(np.int64)
@@ -82,11 +83,11 @@ class Windows:
     def steps(
         self, rank: npt.NDArray[np.int64], chunk: npt.NDArray[np.int64]
     ) -> tuple[Segments, npt.NDArray[np.bool_]]:
-        """Return the trailing segments of windows' steps, and which of them exist.
+        """Return the trailing segments of windows' steps, and whether each step exists.
 
         Args:
-            rank: of the episodes, int64 of any shape.
-            chunk: number of the window in its episode, likewise.
+            rank: ranks of the episodes, int64 of any shape.
+            chunk: number of the window within its episode, int64 of the same shape.
 
         Returns:
             int64 [..., size] each, bool [..., size].
@@ -102,9 +103,9 @@ def draw_examples(stream: Stream, experience: RankedExperience, config: Config) 
     """Draw the examples of all updates of a version.
 
     Args:
-        stream: its numbers.
+        stream: the version's random stream.
         experience: the buffer.
-        config: the settings.
+        config: the run's settings.
     """
     training, updates = config.training, config.training.n_updates_per_iter
     if config.network.memory == "none":
@@ -118,23 +119,23 @@ def draw_examples(stream: Stream, experience: RankedExperience, config: Config) 
         draw = Windows(experience.lengths, training.memory_window).draw(uniforms)
     if not config.observe_previous:
         return draw
-    # Of a window from all steps or from none, as an agent that copies itself needs one.
-    together = draw.segments.rank if draw.windows is None else draw.windows
-    hidden = stream.uniforms(together.size).reshape(together.shape) < training.drop_previous
-    times = draw.segments.rank.shape[1] // together.shape[1]
+    # Hidden from all steps of a window or from none: a single visible action could be copied.
+    units = draw.segments.rank if draw.windows is None else draw.windows
+    hidden = stream.uniforms(units.size).reshape(units.shape) < training.drop_previous
+    times = draw.segments.rank.shape[1] // units.shape[1]
     return draw._replace(hidden=hidden.repeat(times, axis=1))
 
 
 class Batch(NamedTuple):
-    """The examples of an update, where the networks are.
+    """The examples of an update, on the networks' device.
 
     Attributes:
-        seen: s, as the networks see it, [batch, *shape] of each leaf.
+        seen: s, as the networks see it, [batch, *shape] for each leaf.
         command: (desired return, desired horizon), each scaled, float32 [batch, 2]; relative to
-            what is expected, once that is known.
+            V(s) and D(s) once these are known.
         action: a, int64 [batch, *action_shape].
-        windows: with a memory, numbers of the windows, int64 [windows]; on no device.
-        valid: with a memory, which examples count, bool [batch].
+        windows: with a memory, numbers of the windows, int64 [windows], a numpy array.
+        valid: with a memory, whether an example counts, bool [batch].
     """
 
     seen: Seen
@@ -149,15 +150,15 @@ class Batch(NamedTuple):
 
 
 class Batches:
-    """The batches of a version's updates, gathered many at a time.
+    """The batches of a version's updates, gathered several at a time.
 
-    The tensors are torch's own memory: it is aligned to 64 bytes, which numpy's is not, and the
-    rounding of a matrix product may depend on alignment.
+    The rounding of a matrix product may depend on alignment, so the tensors are allocated by torch,
+    which aligns them to 64 bytes; numpy does not.
 
     Args:
-        draw: what they are.
+        draw: the examples.
         experience: the buffer.
-        config: the settings.
+        config: the run's settings.
     """
 
     def __init__(self, draw: Draw, experience: RankedExperience, config: Config) -> None:
@@ -182,7 +183,7 @@ class Batches:
         """Yield the batches of all updates.
 
         Args:
-            hide: hide the previous action and reward from the examples drawn for that.
+            hide: whether to hide the previous action and reward, from the examples drawn for it.
         """
         draw = self._draw
         for first in range(0, len(draw.segments.rank), self._at_once):
@@ -202,7 +203,7 @@ class Batches:
                 )
 
     def _fill(self, segments: Segments) -> int:
-        """Gather the examples of some updates, and return of how many."""
+        """Gather the examples of some updates, and return the number of updates."""
         n = len(segments.rank)
         command, action = self._commands[:n].numpy(), self._actions[:n].numpy()
         flat = Segments(*(s.reshape(-1) for s in segments))
@@ -218,5 +219,5 @@ class Batches:
 
 
 def tensor_of(array: npt.NDArray[Any]) -> Tensor:
-    """Return an array as a tensor in torch's own memory; a leaf of a record has odd strides."""
+    """Return a copy of an array as a tensor allocated by torch; strides may be arbitrary."""
     return torch.from_numpy(np.ascontiguousarray(array)).clone()

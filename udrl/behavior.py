@@ -1,9 +1,10 @@
-"""Section 2.3.2: the behavior function, B(s, c; theta), from observation and command to actions.
+"""Section 2.3.2: the behavior function B(s, c; theta), which maps observation and command to P(a).
 
-Its architecture is section 3.2's. An encoder makes features of the observation. The command, scaled
-by fixed factors, passes a fully connected sigmoid layer and is multiplied element-wise with them;
-fully connected layers follow. With a ``memory`` the features are what is remembered of all
-observations of the episode (:mod:`udrl.recurrence`), for which each network has a state.
+Its architecture is that of section 3.2. An encoder computes features of the observation. The
+command, scaled by fixed factors, passes a fully connected sigmoid layer and is multiplied
+element-wise with the features; fully connected layers follow. With a ``memory``, the features
+summarise all observations of the episode so far (:mod:`udrl.recurrence`), and each network has a
+state.
 """
 
 from itertools import pairwise
@@ -30,11 +31,10 @@ class BehaviorFunction(nn.Module):
 
     Args:
         spec: observation and action space.
-        config: ``frame_stack``, ``convolutions`` (of images), ``hidden``, ``activation``,
-            ``precision``, ``baseline``.
+        config: the settings of ``network``, and ``precision``.
 
     Attributes:
-        value: what desired returns are relative to; None where ``baseline`` is ``none``.
+        value: value function that desired returns are relative to; None without a ``baseline``.
     """
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
@@ -54,7 +54,7 @@ class BehaviorFunction(nn.Module):
     def _assemble(
         self, spec: EnvironmentSpec, network: NetworkSettings, precision: torch.dtype
     ) -> None:
-        """Make the network of section 3.2."""
+        """Create the layers of section 3.2."""
         activation = self._activation
         first, *_ = widths = layer_widths(spec.observation_space, network)
         space, width = spec.observation_space, network.hidden[0]
@@ -72,10 +72,11 @@ class BehaviorFunction(nn.Module):
         """Return the parameters of P(a | s, c).
 
         Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
             command: (desired return, desired horizon), each scaled, float32 [batch, 2].
-            states: with a memory, of behavior and value function before the first step of each
-                window, float32 [windows, size] each; a batch is then windows of consecutive steps.
+            states: with a memory, states of behavior and value function before the first step of
+                each window, float32 [windows, size] each. A batch then consists of windows of
+                consecutive steps.
 
         Returns:
             float32 [batch, n_parameters].
@@ -84,32 +85,32 @@ class BehaviorFunction(nn.Module):
         if self.value is not None:
             with torch.no_grad():
                 command = relative(command, self.value(seen, others[0]))
-        return self.obey(seen, command, state)
+        return self.forward_relative(seen, command, state)
 
-    def obey(
+    def forward_relative(
         self, seen: tuple[Tensor, ...], command: Tensor, state: Tensor | None = None
     ) -> Tensor:
-        """Return the same for commands that are relative already, where there is a value."""
+        """Like :meth:`forward`, for commands already relative to V(s), if there is a baseline."""
         if self.custom is not None:
-            return self._allowed(seen, self.custom(*seen, command))
-        features = self.remember(seen, state)[0]
+            return self._masked(seen, self.custom(*seen, command))
+        features = self.encode(seen, state)[0]
         features = features * torch.sigmoid(apply(self.command, command.to(features.dtype)))
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
             features = self._activation(apply(layer, features))
-        return self._allowed(seen, apply(self.action, features).float())
+        return self._masked(seen, apply(self.action, features).float())
 
-    def _allowed(self, seen: tuple[Tensor, ...], parameters: Tensor) -> Tensor:
-        """Return parameters with those of forbidden actions far too low."""
+    def _masked(self, seen: tuple[Tensor, ...], parameters: Tensor) -> Tensor:
+        """Return parameters with a large negative number added to those of masked actions."""
         if self._mask is None:
             return parameters
         allowed = seen[self._mask][:, -self._actions.n_parameters :].float()
         return parameters - (allowed - 1.0) * FORBIDDEN
 
-    def remember(
+    def encode(
         self, seen: tuple[Tensor, ...], state: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """Return the features of observations, and with a memory its state after each window."""
+        """Return the features of observations, and the memory's state after each window."""
         features: Tensor = self.encoder(*seen)
         if self.memory is None:
             return features, None
@@ -126,15 +127,15 @@ class BehaviorFunction(nn.Module):
         return negative_log_likelihood(self._actions, parameters, action)
 
 
-#: Index of the stream that seeds torch's own generator.
-_OWN = 2
+#: Index of the random stream that seeds torch's generator.
+_TORCH_SEED = 2
 
 
 def initialise(config: Config, spec: EnvironmentSpec) -> BehaviorFunction:
-    """Return the behavior function of weights version 0, a function of the run's seed."""
-    stream = Stream(stream_key(config.seed, Purpose.INITIALISE, index=_OWN))
+    """Return the behavior function of weights version 0, which depends only on the settings."""
+    stream = Stream(stream_key(config.seed, Purpose.INITIALISE, index=_TORCH_SEED))
     with torch.random.fork_rng(devices=[]):
-        # For a network of somebody's own, which draws its parameters itself.
+        # For custom networks, which draw their parameters themselves.
         torch.manual_seed(int(stream.integers(1, 0, 2**52)[0]))
         behavior = BehaviorFunction(spec, config)
     draw_weights(behavior, config, 0, ("command", "action", "value.expected"))

@@ -1,4 +1,4 @@
-"""The state of training as weights and optimizer (:mod:`udrl.weights`), and back."""
+"""Encoding and decoding of the training state, as weights and optimizer (:mod:`udrl.weights`)."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ from udrl.weights import MOMENTS, decode_weights, encode_weights, optimizer_shap
 
 
 def encode_optimizer(state: TrainingState) -> bytes:
-    """Return Adam's state, and the critic, as safetensors; no moments at version 0."""
+    """Return Adam's state and the critic as safetensors; at version 0, Adam has no state."""
     tensors: dict[str, npt.NDArray[np.float32]] = {}
     if state.critic is not None:
         for name, tensor in state.critic.state_dict().items():
@@ -34,7 +34,7 @@ def decode_state(
     """Return the training state of a version >= 1.
 
     Raises:
-        InvalidWeights: the bytes are not those of such a state.
+        InvalidWeights: the bytes are not a state of this configuration.
     """
     behavior, critic = BehaviorFunction(spec, config), make_critic(config, spec)
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items()}
@@ -52,5 +52,5 @@ def decode_state(
 
 
 def _tensors(weights: Weights) -> Mapping[str, torch.Tensor]:
-    # torch's own memory is aligned, which safetensors' is not; rounding may depend on that.
+    # Rounding may depend on alignment: torch aligns its memory, safetensors does not.
     return {name: torch.from_numpy(array).clone() for name, array in weights.items()}

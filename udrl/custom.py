@@ -1,8 +1,9 @@
-"""A behavior function of your own (``behavior = "package.module:Class"``).
+"""Custom behavior functions (``behavior = "package.module:Class"``).
 
-It is a torch module that is made from the environment's specification and the network's settings::
+A custom behavior function is a torch module, created from the environment's specification and the
+network's settings::
 
-    class Mine(torch.nn.Module):
+    class MyNetwork(torch.nn.Module):
         def __init__(self, spec: EnvironmentSpec, network: NetworkSettings) -> None:
             super().__init__()
             ...
@@ -11,15 +12,15 @@ It is a torch module that is made from the environment's specification and the n
             *observation, command = inputs
             ...
 
-``observation`` is what the networks see (:mod:`udrl.memory`), [batch, *shape] of each leaf,
-float32, uint8 or int32. ``command`` is (desired return, desired horizon), scaled, and relative to
-V(s) with a ``baseline``, float32 [batch, 2]. What is returned are the parameters of P(a | s, c),
-float32 [batch, n_parameters]. It must be a function of its inputs and parameters alone, without
-dropout, and of operators that ONNX has in operator set 13. It draws its parameters itself, with
-torch's generator seeded for the run.
+``observation`` has the stacked observations (:mod:`udrl.memory`), one tensor for each leaf,
+[batch, *shape], float32, uint8 or int32. ``command`` is (desired return, desired horizon), scaled,
+and relative to V(s) with a ``baseline``, float32 [batch, 2]. The module returns the parameters of
+P(a | s, c), float32 [batch, n_parameters]. The result must depend only on inputs and parameters (no
+dropout), and use only operators of ONNX's operator set 13. The module draws its own parameters,
+with torch's generator, which is seeded for the run.
 
-Whoever creates a run needs torch and the class, and so does the learner. Actors and all others
-compute the graph that is exported from it when the run is created.
+The process that creates a run needs torch and the class, and so does the learner. All other
+processes compute the ONNX graph that is exported from the module when the run is created.
 """
 
 import io
@@ -40,10 +41,10 @@ from udrl.targets import ReturnInTime
 
 
 def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
-    """Return a module of the class that ``behavior`` names.
+    """Return an instance of the class named by ``behavior``.
 
     Raises:
-        ConfigError: it cannot be imported or made, or is no module.
+        ConfigError: the class cannot be imported or instantiated, or is no torch module.
     """
     name = network.behavior or ""
     module, colon, attribute = name.partition(":")
@@ -53,8 +54,8 @@ def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
         made = getattr(import_module(module), attribute)(spec, network)
     except Exception as error:
         raise ConfigError(
-            f"behavior {name!r} cannot be made: {type(error).__name__}: {error}; name a class that "
-            f"is importable here, as package.module:Class, and is made from a specification and "
+            f"behavior {name!r} cannot be created: {type(error).__name__}: {error}; name a class "
+            f"that is importable here, as package.module:Class, and takes a specification and "
             f"settings (udrl.custom)"
         ) from error
     if not isinstance(made, nn.Module):
@@ -66,7 +67,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
     """Return the module as an ONNX model; its parameters are initializers without values.
 
     Raises:
-        ConfigError: it cannot be exported, or returns something else than logits.
+        ConfigError: it cannot be exported, or its output has the wrong shape or dtype.
     """
     module = make_custom(network, spec).train(mode=False)
     shapes = FrameStack(spec.observation_space, network.frame_stack).shapes
@@ -85,7 +86,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
             raise
         raise ConfigError(
             f"behavior {network.behavior!r} cannot be computed or exported: "
-            f"{type(error).__name__}: {error}; see udrl.custom for what it may be"
+            f"{type(error).__name__}: {error}; see udrl.custom for its requirements"
         ) from error
     trained = {name for name, tensor in module.named_parameters() if tensor.requires_grad}
     if others := sorted(module.state_dict().keys() - trained):
@@ -118,7 +119,7 @@ def _export(module: nn.Module, inputs: list[Tensor]) -> onnx.ModelProto:
     names = [f"input.{k}" for k in range(len(inputs))]
     file = io.BytesIO()
     with warnings.catch_warnings():
-        # The newer exporter needs packages more, and gives the parameters other names.
+        # The newer exporter needs more packages and renames the parameters.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             module,

@@ -1,9 +1,9 @@
-"""From what is observed to a vector of features (section 3.2, Appendix B.2).
+"""Encoders: from observations to feature vectors (section 3.2, Appendix B.2).
 
-A vector passes one fully connected layer, a category has an embedding, an image passes
-convolutions, each with a 3x3 filter and a stride of 2. The leaves of a record have an encoder each,
-and a fully connected layer joins their features. The behavior function and the value function
-(:mod:`udrl.value`) each have an encoder of their own. :mod:`udrl.graph` has the same for acting.
+A vector passes one fully connected layer, a category has an embedding, an image passes convolutions
+with 3x3 filters and a stride of 2. Each leaf of a record has its own encoder, and a fully connected
+layer joins their features. The behavior function, the value function and the critic
+(:mod:`udrl.value`) each have their own encoder. :mod:`udrl.graph` has the same encoders for acting.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,14 @@ from udrl.spaces import Categories, Category, Image, LeafSpace, ObservationSpace
 
 Activation = Callable[[Tensor], Tensor]
 
-# In place, to touch less memory: the gradient of a layer needs its input only.
+# In place, to save memory: a layer's gradient needs only its input.
 ACTIVATIONS: dict[str, Activation] = {"relu": torch.relu_, "tanh": torch.tanh_}
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 def fully_connected(n_in: int, n_out: int) -> nn.Linear:
-    """Return a layer whose values come from ``initialise`` or a checkpoint."""
+    """Return a layer without values; these come from ``initialise`` or a checkpoint."""
     layer: nn.Linear = nn.utils.skip_init(nn.Linear, n_in, n_out)
     return layer
 
@@ -42,8 +42,8 @@ class Encoder(nn.Module):
     """Features of observations of one kind.
 
     Args:
-        activation: after each layer.
-        precision: that it computes in.
+        activation: activation after each layer.
+        precision: dtype of the arithmetic.
     """
 
     def __init__(self, activation: Activation, precision: torch.dtype) -> None:
@@ -52,19 +52,19 @@ class Encoder(nn.Module):
         self._precision = precision
 
     def forward(self, *seen: Tensor) -> Tensor:
-        """Return features, [batch, n_features], of what the networks see (:mod:`udrl.memory`)."""
+        """Return features, [batch, n_features], of stacked observations (:mod:`udrl.memory`)."""
         raise NotImplementedError
 
     def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
-        """Set what the numbers of a leaf are relative to, float64 [size]."""
+        """Set mean and deviation for the normalisation of a leaf, float64 [size]."""
         raise NotImplementedError
 
 
 class Normaliser(nn.Module):
-    """Numbers relative to their mean in the warm-up, in units of their deviation there.
+    """Normalises vectors by their mean and standard deviation in the warm-up.
 
     Args:
-        size: of the vectors.
+        size: size of the vectors.
     """
 
     def __init__(self, size: int) -> None:
@@ -75,17 +75,17 @@ class Normaliser(nn.Module):
         self.scale: Tensor
 
     def set(self, mean: Tensor, deviation: Tensor) -> None:
-        """Set both, float64 [size]; what does not vary keeps its unit."""
+        """Set mean and deviation, float64 [size]; constant elements are not rescaled."""
         self.mean.copy_(mean)
         self.scale.copy_(1 / torch.where(deviation > 0, deviation, 1))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return float32 [batch, size], bounded."""
+        """Return normalised and clipped vectors, float32 [batch, size]."""
         return ((observation - self.mean) * self.scale).clamp(-NORMAL_BOUND, NORMAL_BOUND)
 
 
 class VectorEncoder(Encoder):
-    """One fully connected layer, of normalised numbers if that is wanted."""
+    """One fully connected layer, with optional normalisation of its input."""
 
     def __init__(
         self,
@@ -101,27 +101,27 @@ class VectorEncoder(Encoder):
         self.layer = fully_connected(size, width)
 
     def forward(self, *seen: Tensor) -> Tensor:
-        """Return features, [batch, width], of numbers, [batch, size]."""
+        """Return features, [batch, width], of vectors, [batch, size]."""
         (observation,) = seen
         if self.normaliser is not None:
             observation = self.normaliser(observation)
         return self._activation(apply(self.layer, observation.to(self._precision)))
 
     def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
-        """Set what the numbers are relative to, float64 [size]."""
+        """Set mean and deviation for the normalisation, float64 [size]."""
         assert self.normaliser is not None, leaf
         self.normaliser.set(mean, deviation)
 
 
 class CategoryEncoder(Encoder):
-    """A learned vector for each category of each component, at each place of the stack; their sum.
+    """Sum of learned vectors: one per component and position in the stack, for its category.
 
     Args:
-        ns: categories of each component.
-        length: of the stack.
-        width: of the vectors.
-        activation: of the sum.
-        precision: that it computes in.
+        ns: number of categories of each component.
+        length: length of the stack.
+        width: size of the vectors.
+        activation: activation after the sum.
+        precision: dtype of the features.
     """
 
     def __init__(
@@ -178,14 +178,14 @@ class ImageEncoder(Encoder):
 
 
 class RecordEncoder(Encoder):
-    """An encoder for each leaf, and a fully connected layer from all their features.
+    """An encoder for each leaf, and a fully connected layer over all their features.
 
     Args:
-        encoders: of the leaves.
-        n_features: that they make together.
-        width: of the layer.
-        activation: after it.
-        precision: that it computes in.
+        encoders: encoders of the leaves.
+        n_features: total number of their features.
+        width: width of the layer.
+        activation: activation after the layer.
+        precision: dtype of the arithmetic.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class RecordEncoder(Encoder):
         return self._activation(apply(self.joined, torch.cat(features, 1)))
 
     def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
-        """Set what the numbers of a leaf are relative to, float64 [size]."""
+        """Set mean and deviation for the normalisation of a leaf, float64 [size]."""
         encoder = self.leaves[leaf]
         assert isinstance(encoder, Encoder)
         encoder.normalise(leaf, mean, deviation)
@@ -219,14 +219,14 @@ def make_encoder(
     activation: Activation,
     precision: torch.dtype,
 ) -> Encoder:
-    """Return an encoder of a kind of observations.
+    """Return the encoder for an observation space.
 
     Args:
-        space: of single observations.
-        network: ``frame_stack``, ``convolutions``.
-        width: of the features; what an image's convolutions leave is as wide as it is.
-        activation: after each layer.
-        precision: that it computes in.
+        space: space of single observations.
+        network: ``frame_stack``, ``convolutions``, ``normalise_observations``.
+        width: number of features. Ignored for images: there, the convolutions determine it.
+        activation: activation after each layer.
+        precision: dtype of the arithmetic.
     """
     if not isinstance(space, Record):
         return _of_leaf(space, network, width, activation, precision)

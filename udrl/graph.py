@@ -1,15 +1,15 @@
 """The acting graph: the behavior function as an ONNX model (sections 2.3.2 and 3.2).
 
-Everything that acts computes this graph in ONNX Runtime; :mod:`udrl.behavior` is the same function
-in torch, for training. A graph without values belongs to a run and says what its weights are; with
-the weights of one version it becomes an :class:`udrl.inference.ActingFunction`.
+Acting always computes this graph in ONNX Runtime; :mod:`udrl.behavior` is the same function in
+torch, for training. A graph without values belongs to a run and defines names and shapes of its
+weights. With the weights of a version it becomes an :class:`udrl.inference.ActingFunction`.
 
-Inputs: ``observation``, what the networks see ([batch, *shape], :mod:`udrl.memory`); of a record
-one for each leaf, with its name behind, as ``observation['inventory'][2]``; and ``command``,
-desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
-Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters]. Where there is a
-memory, ``state`` is another input, float32 [batch, size], zeros at an episode's first step, and
-``next_state`` another output, which is the state at the next step.
+Inputs: ``observation``, the stacked observations ([batch, *shape], :mod:`udrl.memory`); for a
+record one input for each leaf, with its path in the name, e.g. ``observation['inventory'][2]``; and
+``command``, desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
+Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters]. With a memory,
+there is another input, ``state``, float32 [batch, size], zeros at an episode's first step, and
+another output, ``next_state``, the state at the next step.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from udrl.architecture import (
     DEVIATIONS,
     FILTER,
     FORBIDDEN,
-    LEAST_DEVIATION,
+    MIN_DEVIATION,
     NORMAL_BOUND,
     NORMALISER,
     PADDING,
@@ -48,14 +48,14 @@ from udrl.targets import ReturnInTime
 #: The tensors of a weights version by name, float32.
 Weights = Mapping[str, npt.NDArray[np.float32]]
 
-# As old as the operators below allow, so that old runtimes can read an exported agent.
+# The oldest version that the operator set allows, so that old runtimes can read exported agents.
 _IR_VERSION = 7
 
 _OPERATORS = {"relu": "Relu", "tanh": "Tanh"}
 
 
 def acting_graph(network: NetworkSettings, spec: EnvironmentSpec) -> bytes:
-    """Return the graph of a run, an ONNX model whose weights have no values yet."""
+    """Return the graph of a run, an ONNX model with weights without values."""
     graph = _Builder(network, spec)
     graph.logits()
     return graph.model()
@@ -65,7 +65,7 @@ def weight_shapes(graph: bytes) -> dict[str, tuple[int, ...]]:
     """Return the shape of each tensor of a weights version, by name.
 
     Raises:
-        InvalidWeights: the bytes are no graph.
+        InvalidWeights: the graph is invalid.
     """
     return {t.name: tuple(t.dims) for t in _parse(graph).graph.initializer if not t.raw_data}
 
@@ -92,10 +92,10 @@ class _Builder(Nodes):
         self._mask = spec.action_mask
         self._n_parameters = spec.action_space.n_parameters
         self._target = ReturnInTime(network)
-        self._states: list[str] = []  # the next ones
+        self._states: list[str] = []  # outputs with the memories' next states
 
     def model(self) -> bytes:
-        """Return the model, with what was appended last as its output."""
+        """Return the model, whose output is that of the last node."""
         observed = [
             helper.make_tensor_value_info(
                 name, helper.np_dtype_to_tensor_dtype(leaf.dtype), ["batch", *shape]
@@ -107,7 +107,7 @@ class _Builder(Nodes):
         if self._states:
             size = sum(state_sizes(self._network))
             states = [helper.make_tensor_value_info("state", TensorProto.FLOAT, ["batch", size])]
-            # Behind the logits, which stay the last of their nodes.
+            # Appended after the output of the last node is renamed to logits.
             self.nodes.append(helper.make_node("Concat", self._states, ["next_state"], axis=1))
             outputs.append(("next_state", size))
         graph = helper.make_graph(
@@ -140,7 +140,7 @@ class _Builder(Nodes):
         network = self._network
         if network.behavior is not None:
             logits = self._custom()
-            return logits if self._mask is None else self._allowed(logits)
+            return logits if self._mask is None else self._masked(logits)
         activation = _OPERATORS[network.activation]
         first, *_ = widths = layer_widths(self._space, network)
         features = self._encode("encoder", activation, network.hidden[0])
@@ -153,11 +153,11 @@ class _Builder(Nodes):
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self.append(activation, self.layer(f"layers.{k}", features, n_in, n_out))
         logits = self.layer("action", features, widths[-1], self._n_parameters)
-        return logits if self._mask is None else self._allowed(logits)
+        return logits if self._mask is None else self._masked(logits)
 
     def _custom(self) -> str:
-        """Append a network of somebody's own, as torch exports it; see :mod:`udrl.custom`."""
-        # By name, since it imports torch, which nobody needs for any other graph.
+        """Append a custom network, as exported by torch; see :mod:`udrl.custom`."""
+        # Imported here, because it imports torch, which no other graph needs.
         try:
             exported = import_module("udrl.custom").exported
         except ModuleNotFoundError as error:
@@ -174,24 +174,27 @@ class _Builder(Nodes):
             else:
                 names[tensor.name] = self.weight(f"custom.{tensor.name}", *tensor.dims)
         for node in model.graph.node:
-            mine = onnx.NodeProto()
-            mine.CopyFrom(node)
-            mine.name = ""
-            mine.input[:] = [names[name] if name else "" for name in node.input]
+            copy = onnx.NodeProto()
+            copy.CopyFrom(node)
+            copy.name = ""
+            copy.input[:] = [names[name] if name else "" for name in node.input]
             for name in node.output:
                 names[name] = f"custom.{len(self.nodes)}.{name}"
-            mine.output[:] = [names[name] for name in node.output]
-            self.nodes.append(mine)
-        # As the last node, whose output is renamed.
+            copy.output[:] = [names[name] for name in node.output]
+            self.nodes.append(copy)
+        # model() renames the output of the last node.
         return self.append("Identity", names[model.graph.output[0].name])
 
     def _relative_command(self) -> str:
-        """Append what the behavior function reads of a command."""
+        """Append the command as the behavior function reads it."""
         command = self._command()
         return command if self._network.baseline == "none" else self._relative(command)
 
-    def _allowed(self, logits: str) -> str:
-        """Append what the last mask of the stack says of the logits: 0, or far too little."""
+    def _masked(self, logits: str) -> str:
+        """Append the action mask: add a large negative number to logits of masked actions.
+
+        Only the newest mask of the stack counts.
+        """
         n = self._n_parameters
         length = self._network.frame_stack
         mask = self.columns(self._leaves[self._mask or 0][0], (length - 1) * n, length * n)
@@ -204,7 +207,7 @@ class _Builder(Nodes):
         return self._expected("critic", self._n_parameters)
 
     def _command(self) -> str:
-        """Append what is read of a command: bounded and scaled (:mod:`udrl.targets`)."""
+        """Append the command, bounded and scaled (:mod:`udrl.targets`)."""
         command, target = "command", self._target
         if target.horizon_follows:
             desired_return = self.column(command, 0)
@@ -221,7 +224,7 @@ class _Builder(Nodes):
         root = self.append("Mul", d, d)
         root = self.append("Sqrt", self.append("Add", root, self.number(SQUAREPLUS)))
         deviation = self.append("Mul", self.append("Add", d, root), self.number(0.5))
-        deviation = self.append("Add", deviation, self.number(LEAST_DEVIATION))
+        deviation = self.append("Add", deviation, self.number(MIN_DEVIATION))
         above = self.append("Sub", self.column(command, 0), self.column(expected, 0))
         bounded = self.append(
             "Clip",
@@ -232,7 +235,7 @@ class _Builder(Nodes):
         return self.append("Concat", bounded, self.column(command, 1), axis=1)
 
     def _expected(self, name: str, n: int) -> str:
-        """Append a network that expects ``n`` numbers of an observation."""
+        """Append a network with ``n`` outputs, a value function or critic (:mod:`udrl.value`)."""
         features = self._encode(f"{name}.encoder", "Tanh", VALUE_WIDTH)
         width = n_features(self._space, self._network.convolutions, VALUE_WIDTH)
         if self._network.memory != "none":
@@ -328,7 +331,11 @@ def _parse(graph: bytes) -> onnx.ModelProto:
 
 
 def with_weights(graph: bytes, weights: Weights) -> bytes:
-    """Return a graph with values."""
+    """Return a graph with the values of its weights.
+
+    Raises:
+        InvalidWeights: the graph is invalid, or the weights do not belong to it.
+    """
     model = _parse(graph)
     for tensor in model.graph.initializer:
         if not tensor.raw_data:

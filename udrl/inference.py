@@ -1,4 +1,4 @@
-"""Acting functions: a run's graph with the weights of a version, in ONNX Runtime."""
+"""The behavior function for acting: a run's graph with a version's weights, in ONNX Runtime."""
 
 import functools
 import math
@@ -14,7 +14,7 @@ from udrl.memory import Seen
 from udrl.spaces import noise
 from udrl.streams import Purpose, Stream, stream_key
 
-#: Of what can be observed, by ONNX Runtime's names.
+#: Dtypes of observations by ONNX Runtime's names.
 _DTYPES: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
     "tensor(uint8)": np.dtype(np.uint8),
@@ -30,15 +30,15 @@ _COMMAND, _STATE = "command", "state"
 
 
 class Call(Protocol):
-    """The rows of one call: fill in the inputs, run, read the logits; again and again.
+    """Arrays of one call, which can be reused: fill in the inputs, run, read the outputs.
 
     Attributes:
         seen: observations as the networks see them (:mod:`udrl.memory`), [n, *shape] each.
         command: desired return and desired horizon, float64 [n, 2].
-        state: what is remembered of the episodes so far, float32 [n, size], zeros at their first
-            step; without a memory the size is 0.
-        logits: float32 [n, n_parameters], what the last run returned.
-        next_state: likewise, the state at the next step.
+        state: state of the memory, float32 [n, size], zeros at an episode's first step; without a
+            memory the size is 0.
+        logits: output of the last run, float32 [n, n_parameters].
+        next_state: output of the last run, the state at the next step, float32 [n, size].
     """
 
     seen: Seen
@@ -53,7 +53,7 @@ class Call(Protocol):
 
 
 class Acting(Protocol):
-    """What :mod:`udrl.acting` asks for actions: an :class:`ActingFunction`, or a stand-in."""
+    """What :mod:`udrl.acting` needs of a behavior function: :class:`ActingFunction`, or a fake."""
 
     def call(self, n: int) -> Call:
         """Return a call of ``n`` rows."""
@@ -61,21 +61,22 @@ class Acting(Protocol):
 
 
 class ActingFunction:
-    """B(s, c; theta) of one weights version, ready to act.
+    """B(s, c; theta) of one weights version, for acting.
 
-    A row's logits are by definition those of a call with this row alone. Several rows go in one
-    call where that gives the same bits, which is tried out once per process and number of rows.
+    A row's logits are defined as those of a call with this row alone. Rows are computed in one
+    batch only if that gives the same bits, which is tested once per process, graph and number of
+    rows.
 
     Args:
-        graph: of the run (:func:`udrl.graph.acting_graph`).
-        weights: of the version.
+        graph: acting graph of the run (:func:`udrl.graph.acting_graph`).
+        weights: weights of the version.
 
     Attributes:
-        graph: the same.
-        weights: the same.
+        graph: as given.
+        weights: as given.
 
     Raises:
-        InvalidWeights: the bytes are no graph, or the weights are not those of the graph.
+        InvalidWeights: the graph is invalid, or the weights do not belong to it.
     """
 
     def __init__(self, graph: bytes, weights: Weights) -> None:
@@ -86,42 +87,42 @@ class ActingFunction:
 
     @property
     def model(self) -> bytes:
-        """The graph with the weights: an ONNX model of its own."""
+        """The graph with the weights: a complete ONNX model."""
         return with_weights(self.graph, self.weights)
 
     def call(self, n: int) -> Call:
-        """Return a call of ``n`` rows. It is not for several threads at once."""
+        """Return the call for ``n`` rows, always the same. Not thread-safe."""
         if n not in self._calls:
-            together = n == 1 or is_exact_together(self.graph, n)
-            rows = _Together if together else _OneByOne
-            self._calls[n] = rows(self._session, n)
+            exact = n == 1 or is_exact_in_batch(self.graph, n)
+            kind = _BatchCall if exact else _RowByRowCall
+            self._calls[n] = kind(self._session, n)
         return self._calls[n]
 
     @property
     def state_size(self) -> int:
-        """Numbers that are remembered of an episode."""
+        """Size of the memory's state per episode; 0 without a memory."""
         last = self._session.get_inputs()[-1]
         return int(last.shape[1]) if last.name == _STATE else 0
 
     def logits(self, seen: Seen, command: Commands, state: State | None = None) -> Logits:
-        """Return the logits of rows, float32 [n, n_parameters]; for any thread.
+        """Return the logits of rows, float32 [n, n_parameters]. Thread-safe.
 
         Args:
             seen: observations as the networks see them.
             command: desired return and desired horizon, float64 [n, 2].
-            state: what is remembered; None: nothing, as at an episode's first step.
+            state: state of the memory; None: empty, as at an episode's first step.
         """
         return self.advance(seen, command, state)[0]
 
     def advance(
         self, seen: Seen, command: Commands, state: State | None = None
     ) -> tuple[Logits, State]:
-        """Return the logits of rows, as :meth:`logits`, and the states at the next step."""
+        """Return the logits of rows, like :meth:`logits`, and the states at the next step."""
         names = [one.name for one in self._session.get_inputs()]
         given: list[npt.NDArray[Any]] = [*seen, command]
         if self.state_size:
-            nothing = np.zeros((len(command), self.state_size), np.float32)
-            given.append(nothing if state is None else state)
+            empty = np.zeros((len(command), self.state_size), np.float32)
+            given.append(empty if state is None else state)
         rows = [
             self._session.run(None, {n: a[k : k + 1] for n, a in zip(names, given, strict=True)})
             for k in range(len(command))
@@ -130,8 +131,8 @@ class ActingFunction:
         return logits, after[0] if after else np.zeros((len(command), 0), np.float32)
 
 
-class _Together:
-    """All rows in one run of the session, with inputs and output bound to arrays."""
+class _BatchCall:
+    """All rows in one run of the session, with inputs and outputs bound to arrays."""
 
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
         inputs = {one.name: one for one in session.get_inputs()}
@@ -159,11 +160,11 @@ class _Together:
         self._session.run_with_iobinding(self._binding)
 
 
-class _OneByOne:
-    """A run of the session for each row, on machines where company changes a row's bits."""
+class _RowByRowCall:
+    """One run of the session per row, for machines on which batching changes a row's bits."""
 
     def __init__(self, session: onnxruntime.InferenceSession, n: int) -> None:
-        self._one = one = _Together(session, 1)
+        self._one = one = _BatchCall(session, 1)
         self.seen: Seen = tuple(array.repeat(n, axis=0) for array in one.seen)
         self.command = one.command.repeat(n, axis=0)
         self.state = one.state.repeat(n, axis=0)
@@ -181,10 +182,10 @@ class _OneByOne:
 
 
 @functools.cache
-def is_exact_together(graph: bytes, n: int) -> bool:
-    """Say whether a call of ``n`` rows gives each the bits that a call for it alone gives."""
+def is_exact_in_batch(graph: bytes, n: int) -> bool:
+    """Return whether a batch of ``n`` rows gives the same bits as single calls, in a probe."""
     function = _probe(graph)
-    rows = _Together(function._session, n)
+    rows = _BatchCall(function._session, n)
     seen, rows.command[:], rows.state[:] = probe_rows(function, n)
     for mine, probed in zip(rows.seen, seen, strict=True):
         mine[:] = probed
@@ -199,7 +200,7 @@ def _probe(graph: bytes) -> ActingFunction:
 
 
 def probe_weights(graph: bytes) -> Weights:
-    """Return weights to try a machine's arithmetic with, which need no torch to be made.
+    """Return random weights for testing a machine's arithmetic. They do not require torch.
 
     Tensor k, in the order of names, has the numbers of stream (0, probe, 0, k), mapped to +-1 /
     sqrt(inputs of a unit) and rounded to float32.
@@ -207,13 +208,13 @@ def probe_weights(graph: bytes) -> Weights:
     weights = {}
     for k, (name, shape) in enumerate(sorted(weight_shapes(graph).items())):
         numbers = Stream(stream_key(0, Purpose.PROBE, 0, k)).uniforms(math.prod(shape))
-        bound = 1 / math.sqrt(math.prod(shape[1:]))  # rounded alike everywhere, as a power is not
+        bound = 1 / math.sqrt(math.prod(shape[1:]))  # correctly rounded everywhere, unlike a power
         weights[name] = ((numbers * 2 - 1) * bound).astype(np.float32).reshape(shape)
     return weights
 
 
 def probe_rows(function: ActingFunction, n: int) -> tuple[Seen, Commands, State]:
-    """Return observations of noise, commands in [-100, 100), and states in [-1, 1)."""
+    """Return random observations, commands in [-100, 100), and states in [-1, 1)."""
     stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
     like = function.call(1).seen
     seen = tuple(noise(stream, one.dtype, (n, *one.shape[1:])) for one in like)
@@ -225,12 +226,12 @@ def probe_rows(function: ActingFunction, n: int) -> tuple[Seen, Commands, State]
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    # More threads would only wait for each other in calls this small, and might sum otherwise.
+    # More threads do not speed up calls this small, and could change the order of summation.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what it would print is in the error
+    options.log_severity_level = 4  # the error contains what it would log
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no base of their own
+    except Exception as error:  # its errors have no common base class
         raise InvalidWeights(
             f"acting graph: ONNX Runtime cannot read it: {error}; install the versions of onnx "
             f"and onnxruntime that the run was created with"
@@ -242,7 +243,7 @@ def _session(model: bytes) -> onnxruntime.InferenceSession:
     )
     if not any(known):
         raise InvalidWeights(
-            f"acting graph: from {names[0]} to {names[1]}, expected from observations and command "
-            f"to logits; the run was created by another version of udrl"
+            f"acting graph: inputs {names[0]}, outputs {names[1]}; expected observations and "
+            f"command as inputs, logits as output; another version of udrl created the run"
         )
     return session

@@ -1,4 +1,4 @@
-"""The weights that the networks of a run begin with (Appendix B.2), a function of its seed."""
+"""Initial weights of the networks (Appendix B.2), which depend only on the run's settings."""
 
 from collections.abc import Collection
 
@@ -17,15 +17,16 @@ def draw_weights(
     Args:
         module: the network.
         config: ``seed``, ``initialisation``, ``activation``.
-        number: of the network in the run, from 0 on; each has random numbers of its own.
-        without_activation: names of layers that no activation follows.
+        number: number of the network in the run, from 0; each has its own random stream.
+        without_activation: names of layers without an activation after them.
     """
     stream = Stream(stream_key(config.seed, Purpose.INITIALISE, index=number))
     generator = torch.Generator().manual_seed(int(stream.integers(1, 0, 2**52)[0]))
     gain = nn.init.calculate_gain(config.network.activation)
     for name, layer in module.named_modules():
         if isinstance(layer, nn.Embedding):
-            # Vectors as different as can be, as long as those of the first layer for one-hot input.
+            # Vectors as different as possible, with the norm that a first layer with one-hot input
+            # would give.
             nn.init.orthogonal_(layer.weight, 1.0, generator)
             with torch.no_grad():
                 layer.weight.mul_(gain / layer.weight.norm(dim=1, keepdim=True))

@@ -1,4 +1,4 @@
-"""What the networks remember: the most recent observations of an episode, or the last alone."""
+"""Frame stacks: the most recent observations of an episode as the networks' input."""
 
 from typing import Any
 
@@ -7,22 +7,22 @@ import numpy.typing as npt
 
 from udrl.spaces import LeafSpace, Observations, ObservationSpace, leaves_of, parts_of
 
-#: What the networks see: an array for each leaf of the observations, [n, *shape].
+#: The networks' input: an array for each leaf of the observations, [n, *shape].
 Seen = tuple[npt.NDArray[Any], ...]
 
 
 class FrameStack:
-    """The last ``frame_stack`` observations, one after another along the first dimension.
+    """The last ``frame_stack`` observations, concatenated along the first dimension.
 
-    Before an episode's first observation there is the first again.
+    At the start of an episode, the first observation is repeated.
 
     Args:
-        space: of single observations.
-        length: how many, ``frame_stack``.
+        space: space of single observations.
+        length: number of observations, ``frame_stack``.
 
     Attributes:
-        length: how many.
-        shapes: of what the networks see of each leaf; of a category [length].
+        length: number of observations.
+        shapes: shape of the networks' input for each leaf; [length] for a category.
     """
 
     def __init__(self, space: ObservationSpace, length: int) -> None:
@@ -30,21 +30,21 @@ class FrameStack:
         self.shapes = tuple(_stacked(leaf.space, length) for leaf in leaves_of(space))
 
     def times(self, t: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the times of the observations that are seen at times ``t``.
+        """Return the times of the observations in the stacks of times ``t``.
 
         Args:
             t: int64 [n].
 
         Returns:
-            int64 [n, length]: t - length + 1 to t; 0 for those before the episode.
+            int64 [n, length]: t - length + 1 to t; 0 instead of negative times.
         """
         times: npt.NDArray[np.int64] = np.maximum(t[:, None] - np.arange(self.length)[::-1], 0)
         return times
 
     def join(self, observations: Observations) -> Seen:
-        """Return what the networks see of observations, [n, length, *observation_shape].
+        """Return the networks' input for observations, [n, length, *observation_shape].
 
-        Of a length of 1 it is a view.
+        They are views if the length is 1.
         """
         n = len(observations)
         return tuple(
@@ -54,6 +54,6 @@ class FrameStack:
 
 
 def _stacked(space: LeafSpace, length: int) -> tuple[int, ...]:
-    """Return the shape of so many elements, one after another along the first dimension."""
+    """Return the shape of ``length`` elements, concatenated along the first dimension."""
     first, *rest = space.shape or (1,)
     return (length * first, *rest)

@@ -1,4 +1,4 @@
-"""Nodes and tensors of an ONNX graph, one after another."""
+"""Building an ONNX graph node by node."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-#: As old as the operators allow, so that old runtimes can read an exported agent.
+#: The oldest operator set with all operators used, so that old runtimes can read exported agents.
 OPSET = 13
 
 
 class Nodes:
-    """Appends nodes; each method returns the name of a result.
+    """Appends nodes and tensors to a graph; each method returns the name of its result.
 
     Attributes:
-        nodes: so far.
-        tensors: constants, and weights, which have no values yet.
+        nodes: the nodes, in order.
+        tensors: constants, and weights without values.
     """
 
     def __init__(self) -> None:
@@ -24,31 +24,31 @@ class Nodes:
         self.tensors: list[onnx.TensorProto] = []
 
     def layer(self, name: str, features: str, n_in: int, n_out: int) -> str:
-        """Append a fully connected layer, its weight stored as torch does."""
+        """Append a fully connected layer; its weight has torch's layout, [n_out, n_in]."""
         weight = self.weight(f"{name}.weight", n_out, n_in)
         bias = self.weight(f"{name}.bias", n_out)
         return self.append("Gemm", features, weight, bias, transB=1)
 
     def column(self, matrix: str, index: int) -> str:
-        """Append the selection of one column, [batch, 1]."""
+        """Append a selection of one column, [batch, 1]."""
         return self.columns(matrix, index, index + 1)
 
     def columns(self, matrix: str, first: int, last: int) -> str:
-        """Append the selection of columns, [batch, last - first]."""
+        """Append a selection of columns ``first`` to ``last`` - 1, [batch, last - first]."""
         where = (self.constant(np.array([n])) for n in (first, last, 1))
         return self.append("Slice", matrix, *where)
 
     def weight(self, name: str, *shape: int) -> str:
-        """Append a weight of a shape, without values."""
+        """Append a weight without values, float32."""
         self.tensors.append(onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT))
         return name
 
     def number(self, value: float) -> str:
-        """Append a constant, float32."""
+        """Append a scalar constant, float32."""
         return self.constant(np.array(value, np.float32))
 
     def constant(self, value: npt.NDArray[np.generic]) -> str:
-        """Append a constant."""
+        """Append a constant, of the dtype of ``value``."""
         name = f"constant.{len(self.tensors)}"
         self.tensors.append(numpy_helper.from_array(value, name))
         return name

@@ -1,8 +1,8 @@
-"""What the networks remember of an episode (section 6): a gated recurrent unit.
+"""Memory of the networks (section 6): a gated recurrent unit.
 
-It stands between the encoder and the command, so that what is remembered depends on observations
-alone: training then computes from them what acting computed, whatever had been commanded.
-:mod:`udrl.graph` has the same for acting, one step at a time.
+It comes between the encoder and the command, so its state depends on observations alone. Training
+can therefore recompute the states of acting from the observations, independently of the commands.
+:mod:`udrl.graph` has the same unit for acting, one step at a time.
 """
 
 from torch import Tensor, nn
@@ -12,8 +12,8 @@ class Memory(nn.Module):
     """A gated recurrent unit over the features of consecutive steps.
 
     Args:
-        n_in: features.
-        size: numbers that are remembered.
+        n_in: number of features.
+        size: size of the state.
     """
 
     def __init__(self, n_in: int, size: int) -> None:
@@ -22,12 +22,12 @@ class Memory(nn.Module):
         self.cell = nn.GRU(n_in, size, batch_first=True)
 
     def forward(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what is remembered after each step, and after the last.
+        """Return the state after each step, and after the last step of each window.
 
         Args:
-            features: of windows of consecutive steps, one window after another,
+            features: features of windows of consecutive steps, window by window,
                 [windows * steps, n_in].
-            state: before the first step of each window, float32 [windows, size].
+            state: state before the first step of each window, float32 [windows, size].
 
         Returns:
             [windows * steps, size] in the precision of the features, float32 [windows, size].

@@ -1,7 +1,7 @@
 """Section 2.3.3: supervised examples from segments of the episodes in the replay buffer.
 
-An example asks: in state s_t1, what action began a behavior that earned the desired return
-sum(r[t1..t2-1]) in the desired horizon t2 - t1? The answer is a_t1. Trailing segments have t2 = T.
+An example teaches that in state s_t1, action a_t1 began a behavior that obtained the desired return
+sum(r[t1..t2-1]) within the desired horizon t2 - t1. Trailing segments have t2 = T.
 """
 
 from collections.abc import Iterator
@@ -20,11 +20,12 @@ from udrl.memory import FrameStack, Seen
 from udrl.spaces import leaves_of
 from udrl.targets import Desired, ReturnInTime
 
+#: Steps per page.
 _PAGE = 64
-#: More steps than an episode has.
+#: More than the steps of any episode.
 _NEVER = 2**62
-#: Pages that there are at least, once there are any.
-_FIRST_PAGES = 256
+#: Minimum number of pages to allocate at once.
+_MIN_PAGES = 256
 
 Indices = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.float64]
@@ -32,7 +33,7 @@ Array = npt.NDArray[Any]
 
 
 class Segments(NamedTuple):
-    """Segments, one per element: episode (by rank in the buffer), t1 and t2, int64 arrays."""
+    """Segments as int64 arrays of one shape: the episode's rank in the buffer, t1 and t2."""
 
     rank: Indices
     t1: Indices
@@ -43,10 +44,10 @@ class Examples(NamedTuple):
     """Inputs and targets of the behavior function, one per row.
 
     Attributes:
-        seen: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape] of each leaf.
-        command: what the segment returned, or its label (:meth:`RankedExperience.label`), and in
-            how many steps, float64 [n, 2].
-        action: a_t1, elements of the action space.
+        seen: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape] for each leaf.
+        command: desired return, which is the segment's return or its label
+            (:meth:`RankedExperience.label`), and desired horizon in steps, float64 [n, 2].
+        action: a_t1, n elements of the action space.
     """
 
     seen: Seen
@@ -57,20 +58,20 @@ class Examples(NamedTuple):
 def draw_segments(
     uniforms: Numbers, lengths: Indices, kind: Literal["trailing", "all"]
 ) -> Segments:
-    """Turn random numbers into segments: an episode uniformly, then the times uniformly.
+    """Draw segments: an episode uniformly, then the times uniformly.
 
     Args:
-        uniforms: in [0, 1), float64 [3, ...]; the third row decides t2, and trailing segments
-            ignore it.
+        uniforms: random numbers in [0, 1), float64 [3, ...]; trailing segments ignore the third
+            row.
         lengths: T of each episode, by rank.
-        kind: ``trailing``: 0 <= t1 < T, t2 = T. ``all``: every pair 0 <= t1 < t2 <= T is as likely
-            as any other of the same episode.
+        kind: ``trailing``: 0 <= t1 < T, t2 = T. ``all``: 0 <= t1 < t2 <= T, with every pair of an
+            episode equally likely.
     """
     rank = (uniforms[0] * len(lengths)).astype(np.int64)
     length = lengths[rank]
     if kind == "trailing":
         return Segments(rank, (uniforms[1] * length).astype(np.int64), length)
-    # Two different times out of 0..T: the second skips the first.
+    # Two different times in 0..T: the second draw skips the first time.
     one = (uniforms[1] * (length + 1)).astype(np.int64)
     other = (uniforms[2] * length).astype(np.int64)
     other += other >= one
@@ -86,16 +87,14 @@ class _Place:
 class Experience:
     """The steps of the buffer's episodes in flat arrays, from which examples are gathered.
 
-    Steps lie in pages of 64, handed out and taken back as episodes come and go, so that neither
-    copies what stays. There are as many pages as were needed so far, at most twice; step limits
-    are often far beyond what episodes last.
-
-    Raises:
-        ConfigError: there is not enough memory for what is needed.
+    Steps are stored in pages of 64, which are allocated and freed with their episodes, so that
+    other episodes need not be copied. The arrays grow as needed, at least doubling, because step
+    limits are often much longer than episodes.
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:
-        # An agent that sees the time coming expects nothing after it (Pardo et al., 2018).
+        # If the agent observes the time left, the limit is like a terminal state (Pardo et al.,
+        # 2018).
         self._ends_at = spec.max_episode_steps if config.observe_time else _NEVER
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
         seen, acted = spec.observation_space, spec.action_space
@@ -120,7 +119,11 @@ class Experience:
         return set(self._places)
 
     def add(self, episode: Episode) -> None:
-        """Take in an episode; there must be room (remove the evicted first)."""
+        """Add an episode; evicted episodes must be removed before.
+
+        Raises:
+            ConfigError: there is not enough memory.
+        """
         slot = self._free_slots.pop()
         count = -(-episode.length // _PAGE)
         self._make_room(count)
@@ -136,56 +139,56 @@ class Experience:
         self._places[episode.command_id] = _Place(slot, pages)
 
     def _make_room(self, count: int) -> None:
-        """See to it that an episode of ``count`` pages can be taken in."""
+        """Make room for an episode of ``count`` pages."""
         width = self._page_table.shape[1]
         if count > width:
             wider = max(count, 2 * width) - width
             self._page_table = np.pad(self._page_table, ((0, 0), (0, wider)))
-        there = len(self._earned) // _PAGE
+        pages = len(self._earned) // _PAGE
         if count > len(self._free_pages):
-            more = max(count - len(self._free_pages), there, _FIRST_PAGES)
+            more = max(count - len(self._free_pages), pages, _MIN_PAGES)
             try:
                 self._observations = _longer(self._observations, more * _PAGE)
                 self._actions = _longer(self._actions, more * _PAGE)
                 self._earned = _longer(self._earned, more * _PAGE)
             except MemoryError as error:
                 raise ConfigError(
-                    f"the learner needs memory for {(there + more) * _PAGE:,} steps and has not "
-                    f"got it; lower replay_size, recent_size or max_train_steps"
+                    f"the learner cannot allocate memory for {(pages + more) * _PAGE:,} steps; "
+                    f"lower replay_size, recent_size or max_train_steps"
                 ) from error
-            self._free_pages[:0] = range(there, there + more)[::-1]
+            self._free_pages[:0] = range(pages, pages + more)[::-1]
 
     def remove(self, episode_id: int) -> None:
-        """Forget an episode."""
+        """Remove an episode."""
         place = self._places.pop(episode_id)
         self._free_slots.append(place.slot)
         self._free_pages.extend(place.pages.tolist())
 
     def by_rank(self, ids: list[int]) -> "RankedExperience":
-        """Return a view in which episodes go by their rank in the buffer, given as ids."""
+        """Return a view in which episodes have the order of ``ids``, by rank in the buffer."""
         slots = np.array([self._places[i].slot for i in ids], np.int64)
         return RankedExperience(self, slots)
 
 
 def _longer(array: Array, more: int) -> Array:
-    """Return an array with room for ``more`` rows behind its own."""
+    """Return a copy of an array with ``more`` uninitialised rows appended."""
     longer = np.empty((len(array) + more, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
     return longer
 
 
 class RankedExperience:
-    """The episodes of an :class:`Experience` in the order of the buffer, least return first.
+    """The episodes of an :class:`Experience` in the order of the buffer, lowest return first.
 
     Attributes:
-        lengths: of the episodes, by rank.
-        labels: the desired return of each step's trailing segment, in the order of
-            :meth:`steps`, float64 [steps]; None: what was obtained.
+        lengths: lengths of the episodes by rank, int64 [episodes].
+        labels: desired return of each step's trailing segment, in the order of :meth:`steps`,
+            float64 [steps]; None: the obtained return.
         expected: (V, D) at every step, in the same order, scaled, float32 [steps, 2]
             (:mod:`udrl.value`); None: unknown.
-        shapes: of observations as the networks see them, for each leaf.
-        leaves: of the observation space.
-        action_shape: of one action.
+        shapes: shape of the networks' input for each leaf.
+        leaves: leaves of the observation space.
+        action_shape: shape of an action.
     """
 
     def __init__(self, experience: Experience, slots: Indices) -> None:
@@ -200,7 +203,7 @@ class RankedExperience:
         self._first_step: Indices = np.cumsum(self.lengths) - self.lengths
 
     def examples(self, segments: Segments) -> Examples:
-        """Gather the examples that segments stand for."""
+        """Gather the examples of segments."""
         held = self._experience
         slot = self._slots[segments.rank]
         row = self._row(slot, segments.t1)
@@ -217,16 +220,16 @@ class RankedExperience:
         return Examples(self._observed(slot, segments.t1), command, held._actions[row])
 
     def expected_at(self, segments: Segments) -> npt.NDArray[np.float32] | None:
-        """Return (V, D) of s_t1, float32 [n, 2], if it is known."""
+        """Return (V, D) of s_t1, float32 [n, 2]; None if unknown."""
         return None if self.expected is None else self.expected[self._step(segments)]
 
     def _step(self, segments: Segments) -> Indices:
-        """Return the number of each t1 in the order of :meth:`steps`."""
+        """Return the index of each t1 in the order of :meth:`steps`."""
         steps: Indices = self._first_step[segments.rank] + segments.t1
         return steps
 
     def steps(self, at_once: int = 4096) -> Iterator[tuple[Seen, Array]]:
-        """Yield what the network sees at every step, and the action, episode by episode."""
+        """Yield observations, as the networks see them, and actions of all steps, by episode."""
         slot, t = self._all_steps()
         actions = self._experience._actions
         for first in range(0, len(t), at_once):
@@ -234,22 +237,22 @@ class RankedExperience:
             yield self._observed(slot[part], t[part]), actions[self._row(slot[part], t[part])]
 
     def label(self, expected: npt.NDArray[np.floating[Any]], lam: float) -> None:
-        """Make lambda-returns the desired returns of all trailing segments.
+        """Label all trailing segments with lambda-returns as their desired returns.
 
-        G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. After a terminal state nothing is
-        expected; after a truncation what was expected a step before (the last observation is not
-        kept), except at the environment's own limit where the time that is left is observed.
+        G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. V is 0 after a terminal state. After a
+        truncation it is V of the last stored observation, because that after it is not kept. At the
+        environment's own limit it is 0 if the time left is observed.
 
         Args:
-            expected: V at every step, in the order of :meth:`steps`, float32.
+            expected: V at every step, not scaled, in the order of :meth:`steps`, [steps].
             lam: lambda, in [0, 1].
         """
         held, slots, first = self._experience, self._slots, self._first_step
         last = first + self.lengths - 1
         earned = held._earned[self._row(*self._all_steps())]
-        goes_on = held._truncated[slots] & (self.lengths < held._ends_at)
-        beyond = np.where(goes_on, expected[last], 0.0)
-        # What follows each step: rewards earned until then, V, and (where it ends) the label.
+        continues = held._truncated[slots] & (self.lengths < held._ends_at)
+        beyond = np.where(continues, expected[last], 0.0)
+        # Values after each step: rewards earned so far, V, and at the end the label.
         earned_next, expected_next = np.roll(earned, -1), np.roll(expected, -1)
         earned_next[last], expected_next[last] = held._returns[slots], beyond
         labels = earned_next - earned + (1 - lam) * expected_next

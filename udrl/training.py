@@ -1,4 +1,4 @@
-"""Section 2.3.3: a fixed number of Adam updates turns weights version v-1 into version v."""
+"""Section 2.3.3: weights version v is version v-1 after a fixed number of Adam updates."""
 
 import contextlib
 import os
@@ -27,14 +27,14 @@ from udrl.whole_buffer import at_all_steps
 
 @dataclass
 class TrainingState:
-    """All that training changes: version v of the behavior function and its optimizer.
+    """The state of training: version v of the networks, and their optimizer.
 
     Attributes:
         version: v; 0 is untrained.
         behavior: B(s, c; theta).
-        critic: where ``baseline`` is ``action_value``.
-        optimizer: of both.
-        loss: mean cross-entropy, in nats, over the updates that made this version; NaN at 0.
+        critic: critic, if ``baseline`` is ``action_value``.
+        optimizer: optimizer of both networks.
+        loss: mean cross-entropy, in nats, over the updates of this version; NaN for version 0.
     """
 
     version: int
@@ -45,63 +45,64 @@ class TrainingState:
 
     @property
     def weights(self) -> Weights:
-        """The weights that act."""
+        """The behavior function's weights."""
         return weights_of(self.behavior)
 
     def parameters(self) -> dict[str, nn.Parameter]:
-        """Return all that is trained, by name."""
-        return trained(self.behavior, self.critic)
+        """Return all trainable parameters by name."""
+        return trainable_parameters(self.behavior, self.critic)
 
 
-#: What those who compute exactly found, in the order in which they began.
-_before: list[tuple[bool, bool, str | None]] = []
-_exactly = threading.Lock()
-#: What CUDA's matrix products need to be deterministic.
+#: Settings found by each active :func:`exact_arithmetic`, in order of entry.
+_found_settings: list[tuple[bool, bool, str | None]] = []
+_settings_lock = threading.Lock()
+#: Environment variable without which CUDA's matrix products are not deterministic.
 _WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
 
 
 def weights_of(behavior: BehaviorFunction) -> Weights:
-    """Return a behavior function's parameters as arrays of their own."""
+    """Return a behavior function's parameters and buffers as new arrays."""
     return {n: t.detach().cpu().numpy().copy() for n, t in behavior.state_dict().items()}
 
 
 def use_one_thread() -> None:
-    """Let torch compute deterministically in one thread."""
+    """Make torch compute deterministically, in one thread."""
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
-    os.environ.setdefault(_WORKSPACE, ":4096:8")  # CUDA's matrix products too
+    os.environ.setdefault(_WORKSPACE, ":4096:8")
     torch.use_deterministic_algorithms(mode=True)
 
 
 @contextlib.contextmanager
 def exact_arithmetic() -> Iterator[None]:
-    """Let torch compute deterministically in one thread, and leave it as it was.
+    """Make torch compute deterministically in one thread, and restore its settings on exit.
 
-    Others may do so at the same time, in threads of this process; the last one restores.
+    Several threads of a process may use this at the same time; the last to exit restores the
+    settings.
     """
-    threads = torch.get_num_threads()  # which torch keeps for each thread apart
-    with _exactly:
+    threads = torch.get_num_threads()  # torch has one value for each thread
+    with _settings_lock:
         found = (
             torch.are_deterministic_algorithms_enabled(),
             torch.is_deterministic_algorithms_warn_only_enabled(),
             os.environ.get(_WORKSPACE),
         )
-        _before.append(found)
+        _found_settings.append(found)
         use_one_thread()
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-        with _exactly:
-            # All but the first began within another; what the first found goes last.
-            deterministic, warns_only, workspace = _before.pop()
+        with _settings_lock:
+            # Whichever thread exits last pops the first entry, which has the original settings.
+            deterministic, warns_only, workspace = _found_settings.pop()
             torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
             if workspace is None:
                 os.environ.pop(_WORKSPACE, None)
 
 
 def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
-    """Return version 0, a function of the seed."""
+    """Return version 0, which depends only on the settings and the seed."""
     behavior, critic = initialise(config, spec), make_critic(config, spec)
     if critic is not None:
         draw_weights(critic, config, 1, ("expected",))
@@ -109,7 +110,7 @@ def untrained(config: Config, spec: EnvironmentSpec) -> TrainingState:
 
 
 def make_critic(config: Config, spec: EnvironmentSpec) -> Critic | None:
-    """Return a critic without weights, if the run has one."""
+    """Return a critic without initial weights; None unless ``baseline`` is ``action_value``."""
     if config.network.baseline != "action_value":
         return None
     return Critic(spec, config.network, PRECISIONS[config.arithmetic.precision])
@@ -118,17 +119,19 @@ def make_critic(config: Config, spec: EnvironmentSpec) -> Critic | None:
 def assemble(
     version: int, behavior: BehaviorFunction, critic: Critic | None, config: Config
 ) -> TrainingState:
-    """Return the state of a version with a new Adam, on the device that trains."""
+    """Return the state of a version with a new Adam optimizer, on the training device."""
     behavior.to(config.arithmetic.device)
     if critic is not None:
         critic.to(config.arithmetic.device)
-    parameters = trained(behavior, critic).values()
+    parameters = trainable_parameters(behavior, critic).values()
     adam = torch.optim.Adam(parameters, lr=config.training.learning_rate, fused=True)
     return TrainingState(version, behavior, critic, adam)
 
 
-def trained(behavior: BehaviorFunction, critic: Critic | None) -> dict[str, nn.Parameter]:
-    """Return the parameters of the networks by name; the critic's begin with ``critic``."""
+def trainable_parameters(
+    behavior: BehaviorFunction, critic: Critic | None
+) -> dict[str, nn.Parameter]:
+    """Return the parameters of the networks by name; the critic's begin with ``critic.``."""
     parameters = dict(behavior.named_parameters())
     if critic is not None:
         parameters |= {f"critic.{name}": p for name, p in critic.named_parameters()}
@@ -138,7 +141,7 @@ def trained(behavior: BehaviorFunction, critic: Critic | None) -> dict[str, nn.P
 def train(state: TrainingState, experience: RankedExperience, config: Config) -> None:
     """Advance ``state`` by one version, on the buffer after iteration ``state.version``.
 
-    The numbers that choose the examples come from the stream (seed, training, new version).
+    The examples are drawn with the random stream (seed, training, new version).
     """
     version = state.version + 1
     stream = Stream(stream_key(config.seed, Purpose.TRAINING, version))
@@ -152,7 +155,7 @@ def train(state: TrainingState, experience: RankedExperience, config: Config) ->
 
 
 def _normalise(state: TrainingState, experience: RankedExperience) -> None:
-    """Let all networks read numbers relative to their mean in the buffer."""
+    """Set all networks' normalisation to the mean and deviation of vectors in the buffer."""
     vectors = [k for k, leaf in enumerate(experience.leaves) if isinstance(leaf.space, Vector)]
     parts = [[seen[k] for k in vectors] for seen, _ in experience.steps()]
     networks = [state.behavior, state.behavior.value, state.critic]
@@ -167,21 +170,22 @@ def _normalise(state: TrainingState, experience: RankedExperience) -> None:
 def _update(
     state: TrainingState, experience: RankedExperience, draw: Draw, config: Config
 ) -> float:
-    """Make one Adam update for each row of a draw; return the sum of their losses."""
+    """Make one Adam update for each batch of a draw; return the sum of the losses."""
     batches = Batches(draw, experience, config)
     losses = torch.zeros((), dtype=torch.float64, device=config.arithmetic.device)
     behavior = state.behavior
     if behavior.value is not None:
         _learn_value(state, behavior.value, experience, batches, config)
-    remembered = None
+    states = None
     if behavior.memory is not None:
         size = behavior.memory.size
-        remembered = at_all_steps(
-            lambda seen, _, before: behavior.remember(seen, before), size, experience, config
+        states = at_all_steps(
+            lambda seen, _, before: behavior.encode(seen, before), size, experience, config
         ).states
     step = _Stepper(state)
     for batch in batches.gather(hide=True):
-        parameters = behavior.obey(batch.seen, batch.command, _remembered(batch, remembered))
+        state_before = _initial_states(batch, states)
+        parameters = behavior.forward_relative(batch.seen, batch.command, state_before)
         loss = behavior.loss(batch.counted(parameters), batch.counted(batch.action))
         step(loss)
         losses += loss.detach()
@@ -195,10 +199,10 @@ def _learn_value(
     batches: Batches,
     config: Config,
 ) -> None:
-    """Bring V, and Q before it, to the lambda-returns; then label the examples anew.
+    """Fit V to lambda-returns, or with a critic, Q to these and V to Q; relabel the examples.
 
-    Each makes one update for each row. They do not change any more in this version, so the examples
-    carry V and D from here on.
+    Each network makes one update per batch. V and D do not change again in this version, so they
+    are then stored for all steps of the buffer.
     """
     step, scale, lam = _Stepper(state), config.network.return_scale, config.training.return_lambda
     critic, size = state.critic, sum(state_sizes(config.network)[1:])
@@ -218,31 +222,27 @@ def _learn_value(
             expected, after = critic.expect(seen, before)
             return critic.value_of(expected, action), after
 
-        remembered = at_all_steps(critic_at, size, experience, config).states if size else None
+        states = at_all_steps(critic_at, size, experience, config).states if size else None
         for batch in batches.gather():
-            q = critic(batch.seen, batch.action, _remembered(batch, remembered))
+            q = critic(batch.seen, batch.action, _initial_states(batch, states))
             step(batch.counted(q - batch.command[:, 0]).square().mean())
         labels = at_all_steps(critic_at, size, experience, config).outputs
         experience.labels = labels / np.float64(scale)
     for batch in batches.gather():
-        expected = value(batch.seen, _remembered(batch, found.states))
+        expected = value(batch.seen, _initial_states(batch, found.states))
         step(value_loss(batch.counted(expected), batch.counted(batch.command[:, 0])))
     experience.expected = at_all_steps(value_at, size, experience, config).outputs
     if critic is None:
         experience.label(experience.expected[:, 0] / scale, lam)
 
 
-def _remembered(batch: Batch, states: Tensor | None) -> Tensor | None:
-    """Return what is remembered before each window of a batch."""
+def _initial_states(batch: Batch, states: Tensor | None) -> Tensor | None:
+    """Return the memory's state before each window of a batch."""
     return None if states is None else states[torch.from_numpy(batch.windows).to(states.device)]
 
 
 class _Stepper:
-    """Makes Adam's updates.
-
-    Args:
-        state: what it updates.
-    """
+    """Makes Adam updates of a training state."""
 
     def __init__(self, state: TrainingState) -> None:
         self._parameters = list(state.parameters().values())
@@ -250,16 +250,16 @@ class _Stepper:
         self._one = torch.ones((), device=self._parameters[0].device)
 
     def __call__(self, loss: Tensor) -> None:
-        """Make one, of the parameters that a loss depends on."""
+        """Update the parameters that a loss depends on."""
         for parameter in self._parameters:
-            parameter.grad = None  # Optimizer.zero_grad costs a fiftieth of an update
+            parameter.grad = None  # Optimizer.zero_grad would take 2 % of an update's time
         loss.backward(self._one)
         self._optimizer.step()
 
 
 @contextlib.contextmanager
 def _threads(n: int) -> Iterator[None]:
-    """Let this thread's tensors be computed by n; torch keeps the number for each thread apart."""
+    """Let torch use ``n`` threads for computations that this thread starts."""
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:

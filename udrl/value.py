@@ -1,27 +1,27 @@
-"""A value function, and desired returns relative to it. Not in the paper, which has none.
+"""A value function as the baseline of desired returns. Not in the paper.
 
-One action changes an episode's return by little; states and luck decide most of it. So the behavior
-function learns little from whole returns, and hardly reads the desired return. With ``baseline =
-"value"`` a second network learns V(s), the return to expect from a state, and D(s), by how much
-returns deviate from it. They serve twice:
+A single action has little effect on an episode's return, compared to the state and to chance.
+Whole returns therefore teach the behavior function little, and it hardly uses the desired return.
+With ``baseline = "value"`` a second network learns V(s), the expected return from a state, and
+D(s), the mean absolute deviation of returns from V(s). They are used in two ways:
 
-- Examples are labelled with lambda-returns instead of observed ones: after a few steps V stands for
-  the rewards that follow (``return_lambda``).
-- The behavior function reads (desired return - V(s)) / D(s). In training that is what an action
-  gained, the generalised advantage estimate of Schulman et al. (2016), in units that are alike in
-  all states. In acting it asks for better or worse than usual, until V(s) is what is desired.
+- Examples are labelled with lambda-returns instead of observed returns: after some steps, V
+  replaces the rewards that follow (``return_lambda``).
+- The behavior function reads (desired return - V(s)) / D(s). In training this is the generalised
+  advantage estimate of Schulman et al. (2016), in units comparable between states. In acting it
+  demands better or worse results than usual, until V(s) equals the desired return.
 
-Where chance decides, what an action gained was luck for the most part, and an agent that is asked
-for the best of it gambles. With ``baseline = "action_value"`` a third network, the critic, learns
-Q(s, a), what an action brings on average. V and D are then learned from Q, and what the behavior
-function reads in training is (Q(s, a) - V(s)) / D(s).
+In stochastic environments, advantages are mostly luck, and an agent that is commanded to obtain
+high ones takes risks. With ``baseline = "action_value"`` a third network, the critic, learns
+Q(s, a), the expected return after an action. V and D are then learned from Q, and in training the
+behavior function reads (Q(s, a) - V(s)) / D(s).
 """
 
 import torch
 from torch import Tensor, nn
 
 from udrl.action_losses import of_action
-from udrl.architecture import DEVIATIONS, LEAST_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
+from udrl.architecture import DEVIATIONS, MIN_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.recurrence import Memory
@@ -29,13 +29,13 @@ from udrl.setting_groups import NetworkSettings
 
 
 class _Expectation(nn.Module):
-    """What to expect of an observation: an encoder and two layers.
+    """Common base of value function and critic: an encoder and two layers.
 
     Args:
-        spec: observation space.
-        network: ``frame_stack``, ``convolutions`` (of images).
-        precision: that it computes in.
-        n: numbers that are expected.
+        spec: specification of the environment.
+        network: settings of the encoder, and ``memory``.
+        precision: dtype of the arithmetic.
+        n: number of outputs.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class _Expectation(nn.Module):
     def expect(
         self, seen: tuple[Tensor, ...], state: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """Return what is expected, and with a memory its state after each window.
+        """Return the outputs, and with a memory, its state after each window.
 
         Args:
-            seen: s, as the networks see it, [batch, *shape] each.
-            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
+            state: with a memory, its state before each window, float32 [windows, VALUE_WIDTH].
 
         Returns:
             float32 [batch, n], float32 [windows, VALUE_WIDTH].
@@ -69,12 +69,12 @@ class _Expectation(nn.Module):
 
 
 class ValueFunction(_Expectation):
-    """V(s) and D(s): the scaled return to expect, and its mean absolute deviation.
+    """V(s) and D(s): the expected scaled return, and its mean absolute deviation.
 
     Args:
-        spec: observation space.
-        network: ``frame_stack``, ``convolutions`` (of images).
-        precision: that it computes in.
+        spec: specification of the environment.
+        network: settings of the encoder, and ``memory``.
+        precision: dtype of the arithmetic.
     """
 
     def __init__(
@@ -83,28 +83,23 @@ class ValueFunction(_Expectation):
         super().__init__(spec, network, precision, 2)
 
     def forward(self, seen: tuple[Tensor, ...], state: Tensor | None = None) -> Tensor:
-        """Return (V(s), D(s)), float32 [batch, 2].
-
-        Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
-            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
-        """
+        """Return (V(s), D(s)), float32 [batch, 2]; see :meth:`expect` for the arguments."""
         return self.value_of(self.expect(seen, state)[0])
 
     def value_of(self, expected: Tensor) -> Tensor:
-        """Return (V, D), float32 [batch, 2], from what is expected."""
+        """Return (V, D), float32 [batch, 2], from the network's outputs, [batch, 2]."""
         value, d = expected.unbind(1)
-        deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + LEAST_DEVIATION
+        deviation = (d + (d * d + SQUAREPLUS).sqrt()) * 0.5 + MIN_DEVIATION
         return torch.stack([value, deviation], dim=1)
 
 
 class Critic(_Expectation):
-    """Q(s, .): the scaled return to expect after each action. Only the learner needs it.
+    """Q(s, .): the expected scaled return after each action. Only the learner needs it.
 
     Args:
-        spec: observation and action space.
-        network: ``frame_stack``, ``convolutions`` (of images).
-        precision: that it computes in.
+        spec: specification of the environment.
+        network: settings of the encoder, and ``memory``.
+        precision: dtype of the arithmetic.
     """
 
     def __init__(
@@ -119,25 +114,25 @@ class Critic(_Expectation):
         """Return Q(s, a), float32 [batch].
 
         Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] of each leaf.
+            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
             action: a, int64 [batch], or [batch, components].
-            state: with a memory, before each window, float32 [windows, VALUE_WIDTH].
+            state: with a memory, its state before each window, float32 [windows, VALUE_WIDTH].
         """
         return self.value_of(self.expect(seen, state)[0], action)
 
     def value_of(self, expected: Tensor, action: Tensor) -> Tensor:
-        """Return Q, float32 [batch], from what is expected of each action."""
+        """Return Q, float32 [batch], from the network's outputs, [batch, n_parameters]."""
         return of_action(self._actions, expected, action)
 
 
 def value_loss(expected: Tensor, label: Tensor) -> Tensor:
-    """Return the loss of (V(s), D(s)), [batch, 2], for lambda-returns, scaled, float32 [batch]."""
+    """Return the loss of (V(s), D(s)), [batch, 2], for scaled returns ``label``, [batch]."""
     error = label - expected[:, 0]
     return error.square().mean() + (error.detach().abs() - expected[:, 1]).square().mean()
 
 
 def relative(command: Tensor, expected: Tensor) -> Tensor:
-    """Return scaled commands, [..., 2], with the desired return relative to what is expected.
+    """Return scaled commands, [..., 2], with the desired return relative to V(s) and D(s).
 
     Args:
         command: (desired return, desired horizon), each scaled, float32 [..., 2].

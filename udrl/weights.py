@@ -1,8 +1,8 @@
-"""Weights and optimizer state as safetensors; never pickle.
+"""Weights and optimizer state as safetensors, without pickle.
 
-A version's weights are one blob with its tensors by name. Its optimizer is another, with Adam's two
-moments of each tensor and its step count, and with the critic, if there is one. What comes from
-outside is validated for names, shapes, dtypes and finite values before it is used.
+A version's weights are one blob, with tensors by name. Its optimizer state is another, with Adam's
+two moments and step count of each tensor, and with the critic, if there is one. Names, shapes,
+dtypes and finiteness of external data are checked before use.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from udrl.errors import InvalidWeights
 from udrl.graph import Weights, weight_shapes
 from udrl.inference import ActingFunction
 
-#: Adam's state of a tensor of the same shape.
+#: Names of Adam's moments, which have the shape of their tensor.
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -28,14 +28,14 @@ def encode_weights(weights: Weights) -> bytes:
 
 
 def decode_weights(blob: bytes, shapes: Shapes) -> Weights:
-    """Return the tensors that :func:`encode_weights` wrote.
+    """Decode tensors that :func:`encode_weights` encoded.
 
     Args:
-        blob: from outside.
-        shapes: what is expected, by name (:func:`udrl.graph.weight_shapes`).
+        blob: untrusted bytes.
+        shapes: expected shapes by name (:func:`udrl.graph.weight_shapes`).
 
     Raises:
-        InvalidWeights: the bytes are not that, or a value is not finite.
+        InvalidWeights: names, shapes or dtypes are wrong, or a value is not finite.
     """
     try:
         tensors = safetensors.numpy.load(blob)
@@ -62,21 +62,21 @@ def decode_weights(blob: bytes, shapes: Shapes) -> Weights:
 
 
 def decode_behavior(graph: bytes, blob: bytes) -> ActingFunction:
-    """Return the behavior function of a run's graph and a version's weights.
+    """Return the behavior function of a run's graph and a version's encoded weights.
 
     Raises:
-        InvalidWeights: the bytes are no graph, or not the weights of it.
+        InvalidWeights: the graph is invalid, or the weights do not belong to it.
     """
     return ActingFunction(graph, decode_weights(blob, weight_shapes(graph)))
 
 
 def optimizer_shapes(shapes: Shapes, critic: Shapes) -> dict[str, tuple[int, ...]]:
-    """Return the shape of each tensor of an optimizer's state, by name.
+    """Return the shapes of an optimizer's state by name.
 
     Args:
-        shapes: of the weights.
-        critic: of the critic's tensors, which only the learner needs, so that they are part of it
-            (:func:`udrl.graph.critic_shapes`).
+        shapes: shapes of the weights.
+        critic: shapes of the critic's tensors (:func:`udrl.graph.critic_shapes`). Only the learner
+            needs them, so they are part of the optimizer's state.
     """
     expected: dict[str, tuple[int, ...]] = dict(critic)
     for name, shape in (*shapes.items(), *critic.items()):

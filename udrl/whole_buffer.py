@@ -1,4 +1,4 @@
-"""Networks evaluated at every step of the buffer: what is expected there, and what remembered."""
+"""Evaluation of networks at every step of the buffer: their outputs and memory states."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,21 +12,21 @@ from udrl.batches import Seen, Windows, tensor_of
 from udrl.config import Config
 from udrl.segments import RankedExperience, Segments
 
-#: From what is seen, the actions (int64) and the states before: the outputs, and the states after.
+#: Maps observations, actions (int64) and states before to outputs and states after.
 Network = Callable[[Seen, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
 
-#: Episodes whose windows are evaluated at once.
+#: Number of episodes whose windows are evaluated at once.
 _AT_ONCE = 128
 
 
 class BufferOutputs(NamedTuple):
-    """What a network says of the buffer.
+    """A network's results on the buffer.
 
     Attributes:
-        outputs: at each step, in the order of :meth:`.segments.RankedExperience.steps`,
+        outputs: outputs at each step, in the order of :meth:`.segments.RankedExperience.steps`,
             [steps, ...].
-        states: with a memory, before each window (:class:`udrl.batches.Windows`), float32
-            [windows, size], where the network is.
+        states: with a memory, its state before each window (:class:`udrl.batches.Windows`), float32
+            [windows, size], on the network's device.
     """
 
     outputs: npt.NDArray[np.float32]
@@ -39,8 +39,8 @@ def at_all_steps(
     """Evaluate a network at every step of the buffer.
 
     Args:
-        network: in inference.
-        size: numbers that it remembers; 0: nothing.
+        network: the network; called in inference mode.
+        size: size of its memory's state; 0: no memory.
         experience: the buffer.
         config: ``memory_window``, ``device``.
     """
@@ -50,7 +50,7 @@ def at_all_steps(
             outputs, states = _window_by_window(network, size, experience, config)
         else:
             outputs, states = _part_by_part(network, experience, device), None
-    # Training cannot use what was made in inference mode, but a copy of it.
+    # Training cannot use tensors made in inference mode, but it can use copies.
     return BufferOutputs(outputs, None if states is None else states.clone())
 
 
@@ -59,7 +59,7 @@ def _part_by_part(
 ) -> npt.NDArray[np.float32]:
     return np.concatenate(
         [
-            network(_placed(arrays, device), _acted(actions, device), None)[0].cpu().numpy()
+            network(_to_device(arrays, device), _to_indices(actions, device), None)[0].cpu().numpy()
             for arrays, actions in experience.steps()
         ]
     )
@@ -74,17 +74,19 @@ def _window_by_window(
     first_step = np.cumsum(lengths) - lengths
     outputs: npt.NDArray[np.float32] | None = None
     for chunk in range(int(windows.counts.max())):
-        there = np.flatnonzero(windows.counts > chunk)
-        for ranks in np.split(there, range(_AT_ONCE, len(there), _AT_ONCE)):
+        unfinished = np.flatnonzero(windows.counts > chunk)
+        for ranks in np.split(unfinished, range(_AT_ONCE, len(unfinished), _AT_ONCE)):
             segments, valid = windows.steps(ranks, np.full(len(ranks), chunk))
             examples = experience.examples(Segments(*(s.reshape(-1) for s in segments)))
             numbers = torch.from_numpy(windows.first[ranks] + chunk).to(device)
             found, after = network(
-                _placed(examples.seen, device), _acted(examples.action, device), states[numbers]
+                _to_device(examples.seen, device),
+                _to_indices(examples.action, device),
+                states[numbers],
             )
             assert after is not None
-            goes_on = torch.from_numpy(windows.counts[ranks] > chunk + 1).to(device)
-            states[numbers[goes_on] + 1] = after[goes_on]
+            continues = torch.from_numpy(windows.counts[ranks] > chunk + 1).to(device)
+            states[numbers[continues] + 1] = after[continues]
             values = found.cpu().numpy()
             if outputs is None:
                 outputs = np.empty((int(lengths.sum()), *values.shape[1:]), np.float32)
@@ -94,9 +96,9 @@ def _window_by_window(
     return outputs, states
 
 
-def _placed(arrays: tuple[npt.NDArray[Any], ...], device: str) -> Seen:
+def _to_device(arrays: tuple[npt.NDArray[Any], ...], device: str) -> Seen:
     return tuple(tensor_of(one).to(device) for one in arrays)
 
 
-def _acted(actions: npt.NDArray[Any], device: str) -> Tensor:
+def _to_indices(actions: npt.NDArray[Any], device: str) -> Tensor:
     return torch.from_numpy(actions.astype(np.int64)).to(device)

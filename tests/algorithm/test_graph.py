@@ -18,7 +18,7 @@ from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.graph import acting_graph, weight_shapes
-from udrl.inference import ActingFunction, Call, is_exact_together, probe_rows, probe_weights
+from udrl.inference import ActingFunction, Call, is_exact_in_batch, probe_rows, probe_weights
 from udrl.memory import Seen
 from udrl.spaces import (
     Bits,
@@ -213,11 +213,11 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
         asked.append(n)
         return False
 
-    monkeypatch.setattr(module, "is_exact_together", never)
+    monkeypatch.setattr(module, "is_exact_in_batch", never)
     function = ActingFunction(graph, probe_weights(graph))
     seen, command, _ = probe_rows(function, 6)
     call = function.call(6)
-    assert isinstance(call, module._OneByOne)
+    assert isinstance(call, module._RowByRowCall)
     for rows in ([0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0]):
         fill(call, picked(seen, rows), command[rows])
         call.run()
@@ -228,19 +228,19 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
 def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings(seed=3, hidden=[48])
     graph = acting_graph(config.network, VECTOR)
-    run = module._Together.run
+    run = module._BatchCall.run
 
-    def last_differs(self: module._Together) -> None:
+    def last_differs(self: module._BatchCall) -> None:
         run(self)
         if len(self.logits) > 1:
             self.logits[-1] = np.nextafter(self.logits[-1], np.float32(np.inf))
 
-    is_exact_together.cache_clear()
+    is_exact_in_batch.cache_clear()
     with monkeypatch.context() as patch:
-        patch.setattr(module._Together, "run", last_differs)
-        assert not is_exact_together(graph, 4)
-    is_exact_together.cache_clear()
-    assert is_exact_together(graph, 4)
+        patch.setattr(module._BatchCall, "run", last_differs)
+        assert not is_exact_in_batch(graph, 4)
+    is_exact_in_batch.cache_clear()
+    assert is_exact_in_batch(graph, 4)
 
 
 def test_a_graph_is_a_function_of_settings_and_spaces() -> None:

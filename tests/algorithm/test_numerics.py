@@ -116,12 +116,12 @@ def test_the_training_class_sees_a_change_of_the_last_bit(
     config = settings()
     expected = training_class(config, LANDER)
     assert training_class(config, LANDER) == expected
-    obey = BehaviorFunction.obey
+    forward_relative = BehaviorFunction.forward_relative
 
     def rounds_otherwise(self: BehaviorFunction, *inputs: Any) -> Tensor:
-        return obey(self, *inputs) * (1 + 2**-23)
+        return forward_relative(self, *inputs) * (1 + 2**-23)
 
-    monkeypatch.setattr(BehaviorFunction, "obey", rounds_otherwise)
+    monkeypatch.setattr(BehaviorFunction, "forward_relative", rounds_otherwise)
     assert training_class(config, LANDER) != expected
 
 

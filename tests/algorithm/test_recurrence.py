@@ -97,7 +97,7 @@ def test_training_remembers_what_acting_remembers() -> None:
     state = untrained(config, generator.spec)
     train(state, ranked, config)
     behavior = state.behavior
-    found = at_all_steps(lambda seen, _, before: behavior.remember(seen, before), 8, ranked, config)
+    found = at_all_steps(lambda seen, _, before: behavior.encode(seen, before), 8, ranked, config)
     windows = Windows(ranked.lengths, config.training.memory_window)
     function = ActingFunction(acting_graph(config.network, generator.spec), state.weights)
     first = 0

@@ -185,7 +185,7 @@ def test_segments_keep_the_shape_of_the_numbers_they_are_made_of(kind: Kind) -> 
 def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(
     length: int, first_pages: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(segments, "_FIRST_PAGES", first_pages)
+    monkeypatch.setattr(segments, "_MIN_PAGES", first_pages)
     held = experience(replay_size=3, max_steps=200)
     episodes = {i: random_episode(i, n) for i, n in enumerate([200, length, 200])}
     for episode in episodes.values():
@@ -224,7 +224,7 @@ class ExperienceAsADictionary(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.few = mock.patch.object(segments, "_FIRST_PAGES", 1)
+        self.few = mock.patch.object(segments, "_MIN_PAGES", 1)
         self.few.start()
         self.held = experience(self.replay_size, self.max_steps)
         self.model: dict[int, Episode] = {}
