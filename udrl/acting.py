@@ -9,9 +9,9 @@
         for outcome in generator.step():
             ...  # an Episode, or a Failure
 
-The behavior function is evaluated for all environments in one call. Which rows stand beside it does
-not change a row's result (:class:`udrl.inference.ActingFunction`), so an episode depends on its
-command alone.
+The behavior function is evaluated for all environments in one call. A row's result does not depend
+on the other rows (:class:`udrl.inference.ActingFunction`), so an episode depends only on its
+command.
 """
 
 from collections import Counter
@@ -35,12 +35,12 @@ from udrl.rows import Rows
 from udrl.spaces import parts_of
 from udrl.targets import ReturnInTime
 
-#: Failures under the same command after which it is hopeless.
+#: Number of failures of a command after which it is not retried.
 MAX_FAILURES = 3
 
 
 class Failure(NamedTuple):
-    """An episode that could not be finished, through the environment's fault."""
+    """An episode that could not be completed, because the environment failed."""
 
     command: Command
     error: EnvironmentFault
@@ -51,12 +51,12 @@ class EpisodeGenerator:
 
     Args:
         config: the run's settings.
-        n_environments: episodes that can run at the same time.
-        make: makes one environment.
-        first_index: of the environments (:data:`udrl.environments.making.INDEX`).
+        n_environments: number of environments, which run at the same time.
+        make: factory of environments.
+        first_index: index of the first environment (:data:`udrl.environments.making.INDEX`).
 
     Attributes:
-        spec: of the environments.
+        spec: specification of the environment.
 
     Raises:
         UnsupportedEnvironment: the environment cannot be made or is not supported.
@@ -72,52 +72,50 @@ class EpisodeGenerator:
         self._rows = Rows(config, n_environments, make, first_index)
         self.spec = self._rows.spec
         self._memory = FrameStack(self.spec.observation_space, config.network.frame_stack)
-        # What the networks see where it is no more than what is observed.
+        # Without frame stacks, the networks' input is a view of the observations.
         single = self._memory.length == 1
         self._seen = self._memory.join(self._rows.observation) if single else None
         self._target = ReturnInTime(config.network)
         self._recording = Recording(self.spec, n_environments)
         self._commands: list[Command | None] = [None] * n_environments
         self._behaviors: list[Acting | None] = [None] * n_environments
-        # Rows that are acting, those that take the mode, and the calls that answer for all:
-        # planned anew when an episode begins or ends.
+        # Rows with an episode, those with greedy actions, and the calls that compute their logits.
+        # They are planned again when an episode begins or ends.
         self._active: list[int] = []
         self._greedy: list[int] = []
         self._calls: list[tuple[Call, npt.NDArray[np.int64]]] = []
         self._planned = True
 
-        # Of each row: c_t = (dr_t, dh_t), the parameters of P(a | s_t, c_t), and what the command
-        # says of choosing.
+        # For each row: c_t = (dr_t, dh_t) and its cap, the memory's state, the parameters of
+        # P(a | s_t, c_t), and the temperature.
         self._desired = np.zeros((n_environments, self._target.size))
         self._cap = np.full(n_environments, np.inf)
         self._n_capped = 0
-        # What is remembered of its episode.
-        remembered = sum(state_sizes(config.network))
-        self._state = np.zeros((n_environments, remembered), np.float32)
+        self._state = np.zeros((n_environments, sum(state_sizes(config.network))), np.float32)
         self._parameters = np.zeros((n_environments, self.spec.action_space.n_parameters))
         self._temperature = np.ones((n_environments, 1))
-        # How many rows have random actions.
+        # Number of rows whose commands may have random actions.
         self._n_random = 0
 
     @property
     def free(self) -> int:
-        """Episodes that could be started now."""
+        """Number of environments without an episode."""
         return self._commands.count(None)
 
     @property
     def running(self) -> list[Command]:
-        """The commands being carried out."""
+        """Commands of the running episodes."""
         return [c for c in self._commands if c is not None]
 
     def start(self, command: Command, behavior: Acting | None) -> Failure | None:
         """Begin an episode; there must be a free environment.
 
         Args:
-            command: c_0, and all else that the episode depends on.
-            behavior: the version that the command names; None in the warm-up, which needs none.
+            command: the command.
+            behavior: the command's weights version; None in the warm-up.
 
         Returns:
-            A failure when the environment could not be reset, else None.
+            A failure if the environment could not be reset, otherwise None.
         """
         row = self._commands.index(None)
         error = self._rows.reset(row, command.environment_seed, command.max_steps)
@@ -140,28 +138,28 @@ class EpisodeGenerator:
         return None
 
     def step(self) -> list[Episode | Failure]:
-        """Advance every running episode by one step and return those that ended, in any order."""
+        """Advance all running episodes by one step and return those that ended, in any order."""
         rows, recording = self._rows, self._recording
         if not self._planned:
             self._plan()
         decisions = recording.begin_round(rows.observation)
         self._evaluate()
         actions = self._choose(*decisions)
-        over, broken = rows.step(self._active, actions)
+        ended, failed = rows.step(self._active, actions)
         recording.end_round(actions, rows.reward)
-        # Lines 8, 9 and 11 of Algorithm 2; nobody reads the rows of idle environments.
+        # Lines 8, 9 and 11 of Algorithm 2; the values in idle rows are not used.
         self._target.advance(self._desired, rows.reward)
         if self._n_capped:
             self._target.bound(self._desired, self._cap)
-        outcomes: list[Episode | Failure] = [self._finish(*ended) for ended in over]
-        return outcomes + [self._give_up(row, error) for row, error in broken]
+        outcomes: list[Episode | Failure] = [self._finish(*episode) for episode in ended]
+        return outcomes + [self._fail(row, error) for row, error in failed]
 
     def close(self) -> None:
         """Close all environments."""
         self._rows.close()
 
     def _plan(self) -> None:
-        """Gather the rows of each weights version into a call."""
+        """Assign the rows of each weights version to one call."""
         self._active = [row for row, c in enumerate(self._commands) if c is not None]
         self._greedy = [row for row in self._active if self._command_of(row).temperature == 0]
         rows_of: dict[Acting, list[int]] = {}
@@ -173,15 +171,15 @@ class EpisodeGenerator:
         self._planned = True
 
     def _evaluate(self) -> None:
-        """Compute the parameters of P(a | s_t, c_t) in every row."""
+        """Compute the parameters of P(a | s_t, c_t) in all rows with a behavior function."""
         if not self._calls:
             return
         seen = self._seen
         if seen is None:
             seen = self._recording.stacks(self._memory)
         for call, rows in self._calls:
-            for all_rows, asked in zip(seen, call.seen, strict=True):
-                all_rows.take(rows, axis=0, out=asked, mode="clip")
+            for all_rows, given in zip(seen, call.seen, strict=True):
+                all_rows.take(rows, axis=0, out=given, mode="clip")
             self._desired.take(rows, axis=0, out=call.command, mode="clip")
             if self._state.shape[1]:
                 self._state.take(rows, axis=0, out=call.state, mode="clip")
@@ -191,7 +189,7 @@ class EpisodeGenerator:
                 self._state[rows] = call.next_state
 
     def _choose(self, numbers: npt.NDArray[np.float64], random: npt.NDArray[np.bool_]) -> Actions:
-        """Choose a_t in every row: sampled, the mode, or random, as its command says."""
+        """Choose a_t in every row according to its command: sampled, greedy, or random."""
         space = self.spec.action_space
         actions = space.sample(self._parameters, self._temperature, numbers)
         if self._greedy:
@@ -210,7 +208,7 @@ class EpisodeGenerator:
             return _failure("step", command, EnvironmentFault(found))
         return episode
 
-    def _give_up(self, row: int, error: Exception) -> Failure:
+    def _fail(self, row: int, error: Exception) -> Failure:
         self._recording.drop(row)
         command = self._release(row)
         self._rows.replace(row)
@@ -247,9 +245,9 @@ def _failure(where: str, command: Command, error: Exception) -> Failure:
 def generate_episodes(
     generator: EpisodeGenerator, commands: Iterable[Command], behavior: Acting | None
 ) -> list[Episode]:
-    """Carry out commands with one behavior function and return the episodes, by command id.
+    """Run commands with one behavior function and return the episodes, ordered by command id.
 
-    A command that fails is tried again, which changes nothing else.
+    Failed commands are retried, which does not affect other episodes.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
@@ -260,9 +258,9 @@ def generate_episodes(
 def iterate_episodes(
     generator: EpisodeGenerator, commands: Iterable[Command], behavior: Acting | None
 ) -> Iterator[Episode]:
-    """As :func:`generate_episodes`, but yield each episode when it ends, in any order.
+    """Like :func:`generate_episodes`, but yield each episode when it ends, in any order.
 
-    For many episodes of which only a few numbers are kept: images take much memory.
+    This saves memory if the caller does not keep the episodes.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.

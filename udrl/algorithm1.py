@@ -1,6 +1,6 @@
-"""Algorithm 1, in one process and one page: the reference that the services must equal.
+"""Algorithm 1 in one process and on one page: the reference for the services.
 
-At ``lead = 0`` the distributed system gives the same bits as this file.
+With ``lead = 0``, the distributed system's results are bit-identical to this file's.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -26,12 +26,16 @@ from udrl.training import TrainingState, exact_arithmetic, train, untrained
 
 @dataclass
 class Run:
-    """Where a run stands after an iteration.
+    """State of a run after an iteration.
 
     Attributes:
-        iteration: the last one completed.
+        buffer: the replay buffer.
+        state: the state of training.
+        experience: the steps of the buffer's episodes.
+        iteration: last completed iteration.
         env_steps: steps of warm-up and exploratory episodes.
-        evaluations: by iteration.
+        evaluations: evaluations by iteration.
+        digests: digests of the buffer's episodes, by id.
     """
 
     buffer: ReplayBuffer
@@ -43,13 +47,13 @@ class Run:
     digests: dict[int, Digest] = field(default_factory=dict)
 
     def add(self, episodes: Sequence[Episode]) -> None:
-        """Add episodes to the replay buffer (2.3.1), which keeps the best."""
+        """Add episodes to the replay buffer (2.3.1), which evicts the worst."""
         self.env_steps += sum(e.length for e in episodes)
         entries = [Entry(e.episode_return, e.command_id, e.length) for e in episodes]
         evicted = {entry.id for entry in self.buffer.admit(entries)}
-        for gone in evicted & self.experience.ids():
-            self.experience.remove(gone)
-            del self.digests[gone]
+        for episode_id in evicted & self.experience.ids():
+            self.experience.remove(episode_id)
+            del self.digests[episode_id]
         for episode in episodes:
             if episode.command_id not in evicted:
                 self.experience.add(episode)
@@ -74,14 +78,18 @@ def algorithm1(
     report: Callable[[Run], None] = lambda run: None,
     left_open: Collection[str] = (),
 ) -> Run:
-    """Train with Algorithm 1 until the budget is spent, and return where the run stands.
+    """Train with Algorithm 1 until a stopping criterion is met, and return the final state.
 
     Args:
-        config: its ``lead`` must be 0.
-        budget: when to stop.
-        n_environments: episodes generated side by side; changes the speed, not the result.
+        config: the run's settings; ``lead`` must be 0.
+        budget: stopping criteria.
+        n_environments: episodes generated at the same time; affects speed, not the result.
         report: called after every iteration.
-        left_open: settings to choose by what the environment is like (:mod:`udrl.fitting`).
+        left_open: names of automatic settings (:mod:`udrl.fitting`).
+
+    Raises:
+        ConfigError: ``lead`` is not 0, or other settings cannot be used.
+        EnvironmentFault: the environment failed three times under the same command.
     """
     if config.lead != 0:
         raise ConfigError(
@@ -93,7 +101,7 @@ def algorithm1(
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
 
-    # 1: initialise replay buffer with warm-up episodes using random actions (or others')
+    # 1: initialise replay buffer with warm-up episodes using random actions (or a dataset)
     run = Run(
         ReplayBuffer(config.buffer),
         untrained(config, generator.spec),  # 2: initialise a behavior function
@@ -120,13 +128,13 @@ def algorithm1(
             episodes = generate_episodes(generator, evaluation, behavior)
             run.evaluations[run.iteration] = summarise([e.episode_return for e in episodes])
         due = evaluation_due(run.iteration, before, run.env_steps, config.evaluation.eval_every)
-        stop = run.env_steps >= budget.max_env_steps or _lands(run, budget)
+        stop = run.env_steps >= budget.max_env_steps or _reached_stop_return(run, budget)
         report(run)
     generator.close()
     return run
 
 
-def _lands(run: Run, budget: Budget) -> bool:
+def _reached_stop_return(run: Run, budget: Budget) -> bool:
     latest = run.evaluations.get(run.iteration)
     return (
         budget.stop_return is not None and latest is not None and latest.mean >= budget.stop_return

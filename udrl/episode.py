@@ -1,4 +1,4 @@
-"""What an episode is, and the one function that every sum of rewards goes through."""
+"""Episodes, and the one function that computes all sums of rewards."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,7 @@ Rewards = npt.NDArray[np.float32]
 def cumulative(rewards: Rewards) -> npt.NDArray[np.float64]:
     """Return P, float64 of length T+1, with P[t] = r_0 + ... + r_{t-1}, summed in that order."""
     sums = np.zeros(len(rewards) + 1)
-    # numpy's add.accumulate is sequential, unlike its pairwise sum: one order of rounding for all.
+    # add.accumulate is sequential, unlike numpy's pairwise sum, so the rounding is always the same.
     np.add.accumulate(rewards, dtype=np.float64, out=sums[1:])
     return sums
 
@@ -26,13 +26,12 @@ class Episode:
     """A trajectory of T steps (section 2.1), a pure function of its command.
 
     Attributes:
-        command_id: the id of the command that it answers, and its own.
-        observations: what the environment showed at each step, elements of the observation space,
-            one observation and no stack each (:mod:`udrl.memory`).
-        actions: a_t, elements of the action space.
+        command_id: id of the command, and of the episode.
+        observations: s_t, T elements of the observation space, not stacked (:mod:`udrl.memory`).
+        actions: a_t, T elements of the action space.
         rewards: r_t, float32 [T], rounded once, at the environment.
-        terminated: the environment reached a terminal state.
-        truncated: a time limit ended it.
+        terminated: whether the environment reached a terminal state.
+        truncated: whether a time limit ended the episode.
     """
 
     command_id: int
@@ -44,7 +43,7 @@ class Episode:
 
     @property
     def length(self) -> int:
-        """T."""
+        """Number of steps, T."""
         return len(self.rewards)
 
     @cached_property
@@ -59,7 +58,7 @@ class Episode:
 
 
 def fault(episode: Episode, spec: EnvironmentSpec) -> str | None:
-    """Say in what way an episode cannot be one of an environment, or None."""
+    """Return why an episode is invalid for an environment; None: it is valid."""
     rewards, n = episode.rewards, len(episode.rewards) if episode.rewards.ndim == 1 else -1
     if rewards.dtype != np.float32 or not 1 <= n <= spec.max_episode_steps:
         return (

@@ -1,8 +1,8 @@
-"""Settings that fit an environment, chosen by what random episodes in it show.
+"""Automatic settings: values chosen from random episodes of the environment.
 
-What suits an environment depends on how long its episodes are and how large its returns. Settings
-that are left open (``auto``, :data:`OPEN`) are chosen when a run is created, from random episodes
-that are played for it. A :class:`udrl.config.Config` holds the choice.
+Good values depend on the length of episodes and on the magnitude of returns. Settings that are
+``auto`` (:data:`OPEN`) are chosen when a run is created, from random episodes. A
+:class:`udrl.config.Config` holds the chosen values.
 """
 
 import math
@@ -18,35 +18,37 @@ from udrl.config import OPEN, Config, change
 from udrl.episode import Episode
 from udrl.offline import settle_dataset
 
-#: Random episodes that are looked at: so many, and more until there are enough env steps; fewer if
-#: they are long.
-_EPISODES, _MOST_EPISODES, _STEPS, _PLENTY = 40, 500, 1_000, 10_000
-#: Steps of an episode that are looked at.
-_LONGEST = 2_000
-#: Steps for which a random action may be held, and how many of the best episodes count.
-_HOLDS, _COUNT = (2, 8, 32), 3
-#: With what probability a random action begins at a step: where chance decides, and elsewhere.
-_RATE_BY_CHANCE, _RATE = 0.15, 0.05
-#: What the network reads well.
-_LEAST, _MOST = 0.1, 10.0
-#: Fewest episodes and env steps of the warm-up: where a reward is rare, one must be found by chance
+#: Usual and maximum number of random episodes to sample.
+_EPISODES, _MAX_EPISODES = 40, 500
+#: Env steps above which sampling stops: after the usual number of episodes, and before.
+_STEPS, _MAX_STEPS = 1_000, 10_000
+#: Upper bound of the time limit of sampled episodes, in steps.
+_MAX_LENGTH = 2_000
+#: Candidates for the steps for which random actions are held; number of best episodes to compare.
+_HOLDS, _N_BEST = (2, 8, 32), 3
+#: ``held_rate`` in stochastic and in other environments.
+_STOCHASTIC_RATE, _RATE = 0.15, 0.05
+#: Magnitudes of the network's inputs that it learns well from.
+_MIN_INPUT, _MAX_INPUT = 0.1, 10.0
+#: Minimum episodes and env steps of the warm-up. If rewards are rare, random actions must find one
 #: before there is anything to learn from.
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000
-#: Lambda of the lambda-returns: they reach over a quarter of a random episode, at the least.
-_LEAST_LAMBDA, _REACH = 0.95, 4.0
+#: Minimum ``return_lambda``. Lambda-returns reach over at least 1 / _REACH of a random episode.
+_MIN_LAMBDA, _REACH = 0.95, 4.0
 
 
 def fit(config: Config, left_open: Collection[str]) -> Config:
-    """Return the settings of a new run, with those chosen that were left open.
+    """Return the settings of a new run, with values for the automatic ones.
 
-    The environment is made once, and only if anything is open.
+    This makes one environment, and only if a setting is automatic.
 
     Args:
-        config: the settings; the values of open ones have no meaning.
-        left_open: names of open ones, among :data:`udrl.config.OPEN`.
+        config: the settings; the values of automatic ones are ignored.
+        left_open: names of the automatic settings, among :data:`udrl.config.OPEN`.
 
     Raises:
-        ConfigError: the settings contradict what was chosen, or the dataset cannot be used.
+        ConfigError: the settings are not compatible with the chosen values, or the dataset cannot
+            be used.
         UnsupportedEnvironment: the environment does not exist or is not supported.
         EnvironmentFault: the environment failed three times under the same command.
     """
@@ -63,16 +65,16 @@ def choose(
     generator: EpisodeGenerator,
     episodes: Sequence[Episode] | None = None,
 ) -> Config:
-    """Return settings with the open ones chosen.
+    """Return settings with values for the automatic ones.
 
     Args:
-        config: the settings; the values of open ones have no meaning.
-        left_open: names of open ones, among :data:`udrl.config.OPEN`.
-        generator: plays the first commands of the warm-up.
-        episodes: to look at instead.
+        config: the settings; the values of automatic ones are ignored.
+        left_open: names of the automatic settings, among :data:`udrl.config.OPEN`.
+        generator: runs the first commands of the warm-up.
+        episodes: episodes to use instead of these.
 
     Raises:
-        ConfigError: the settings contradict what was chosen.
+        ConfigError: the settings are not compatible with the chosen values.
         EnvironmentFault: the environment failed three times under the same command.
     """
     assert OPEN.keys() >= set(left_open)
@@ -89,107 +91,108 @@ def choose(
     reach = max(*map(abs, returns), max(returns) - min(returns), 0.0)
     if episodes is None:
         n_warm_up = max(_WARM_UP, math.ceil(_WARM_UP_STEPS / length))
-    baseline = "action_value" if sample.by_chance else "value"
+    stochastic = sample.is_stochastic
+    baseline = "action_value" if stochastic else "value"
     if config.training.segments == "all":
-        baseline = "none"  # no other goes with them
+        baseline = "none"  # the only one that all segments allow
     chosen = {
-        # An agent that does not see a step limit cannot plan for it. Where episodes end long before
-        # it, the time left says little, and agents that saw it learned more slowly.
+        # To plan for the step limit, an agent must observe the time left. If episodes usually end
+        # long before the limit, agents that observe it learn more slowly.
         "observe_time": 2 * length > _limit(config, generator),
         "return_scale": _rounded(1 / reach) if reach else 1.0,
-        # How long an episode lasts is luck too, and one that is asked to be short would gamble.
-        "horizon_scale": 0.0 if sample.by_chance else _rounded(1 / length),
+        # Short episodes are partly luck; given a short horizon, the agent would take risks.
+        "horizon_scale": 0.0 if stochastic else _rounded(1 / length),
         "baseline": baseline,
-        "return_lambda": max(_LEAST_LAMBDA, round(1 - _REACH / length, 3)),
+        "return_lambda": max(_MIN_LAMBDA, round(1 - _REACH / length, 3)),
         "n_warm_up_episodes": n_warm_up,
         "warm_up_hold": hold,
-        # Averages need all actions to be tried again and again.
-        "held_actions": 0.5 if sample.by_chance else 0.25,
-        "held_rate": _RATE_BY_CHANCE if sample.by_chance else _RATE,
+        # To estimate average outcomes, all actions must be tried repeatedly.
+        "held_actions": 0.5 if stochastic else 0.25,
+        "held_rate": _STOCHASTIC_RATE if stochastic else _RATE,
         "hold_steps": hold,
     }
     return change(config, **{name: chosen[name] for name in left_open})
 
 
 class Sample:
-    """What episodes show; they are not kept.
+    """Statistics of episodes; the episodes are not kept.
 
     Attributes:
-        returns: of each.
-        lengths: of each, steps.
-        by_chance: whether the same action after the same observation had different consequences. By
-            chance, or by what is not observed: an agent cannot tell. Where no observation comes
-            twice, nothing can be said, and the answer is no.
+        returns: return of each episode.
+        lengths: length of each episode, in steps.
+        is_stochastic: whether the same action after the same observation had different outcomes:
+            the environment is stochastic, or only partially observed, which looks the same to an
+            agent. False if no observation occurs twice.
     """
 
     def __init__(self) -> None:
         self.returns: list[float] = []
         self.lengths: list[int] = []
-        self.by_chance = False
-        self._consequences: dict[bytes, bytes] = {}
+        self.is_stochastic = False
+        self._outcomes: dict[bytes, bytes] = {}
 
     def best(self) -> list[float]:
-        """Return the returns of the best few, the least first."""
-        return sorted(self.returns)[-_COUNT:]
+        """Return the best few returns, lowest first."""
+        return sorted(self.returns)[-_N_BEST:]
 
     def add(self, episode: Episode) -> None:
-        """Look at an episode."""
+        """Add an episode to the statistics."""
         self.returns.append(episode.episode_return)
         self.lengths.append(episode.length)
         seen = [blake2b(o.tobytes(), digest_size=16).digest() for o in episode.observations]
-        # What would have followed after a truncation is not known.
+        # The outcome of a truncated last step is unknown.
         for t in range(episode.length - episode.truncated):
-            done = seen[t] + episode.actions[t].tobytes()
-            follows = episode.rewards[t].tobytes() + b"".join(seen[t + 1 : t + 2])
-            self.by_chance |= self._consequences.setdefault(done, follows) != follows
+            step = seen[t] + episode.actions[t].tobytes()
+            outcome = episode.rewards[t].tobytes() + b"".join(seen[t + 1 : t + 2])
+            self.is_stochastic |= self._outcomes.setdefault(step, outcome) != outcome
 
 
 def _best_hold(config: Config, generator: EpisodeGenerator) -> tuple[int, Sample]:
-    """Return for how many steps random actions should be held, and episodes in which they are.
+    """Return the best number of steps to hold random actions for, and the sample with this number.
 
-    Where one step moves little, actions that change at every step cancel each other, and hardly any
-    random episode obtains more than the usual. Only there they are held: for as many steps as let
-    the best few of some episodes obtain most, and all of these few more than the usual. If in
-    doubt, 1; and where chance decides, which might do the same.
+    If a single step has little effect, random actions cancel each other, and even the best few
+    random episodes obtain no more than the median. Only then are actions held: for the number of
+    steps with which the best few episodes obtain most, if all of these exceed the median without
+    held actions. Otherwise, and in stochastic environments, whose best episodes may be lucky, 1.
     """
     sample = _play(config, generator, 1)
     ordered = sorted(sample.returns)
-    usual = ordered[len(ordered) // 2]
+    median = ordered[len(ordered) // 2]
     found = {1: sample}
-    if ordered[-_COUNT] <= usual and not sample.by_chance:
+    if ordered[-_N_BEST] <= median and not sample.is_stochastic:
         held = {hold: _play(config, generator, hold) for hold in _HOLDS}
-        found |= {hold: one for hold, one in held.items() if one.best()[0] > usual}
+        found |= {hold: one for hold, one in held.items() if one.best()[0] > median}
     best = max(found, key=lambda hold: sum(found[hold].best()))
     return best, found[best]
 
 
 def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
-    """Play the first commands of the warm-up, with random actions held for ``hold`` steps."""
-    sampler = CommandSampler(change(config, n_warm_up_episodes=_MOST_EPISODES), generator.spec)
+    """Run the first commands of the warm-up, with random actions held for ``hold`` steps."""
+    sampler = CommandSampler(change(config, n_warm_up_episodes=_MAX_EPISODES), generator.spec)
     sample = Sample()
     for n, command in enumerate(sampler.warm_up()):
         steps = sum(sample.lengths)
-        if steps >= (_PLENTY if n < _EPISODES else _STEPS):
+        if steps >= (_MAX_STEPS if n < _EPISODES else _STEPS):
             break
         played = msgspec.structs.replace(
-            command, random_hold=hold, max_steps=min(command.max_steps, _LONGEST)
+            command, random_hold=hold, max_steps=min(command.max_steps, _MAX_LENGTH)
         )
         sample.add(*generate_episodes(generator, [played], None))
     return sample
 
 
 def fits(scale: float, size: float) -> bool:
-    """Say whether a scale makes a number that a network reads well of what is usual."""
-    return 0.0 in (size, scale) or _LEAST <= scale * size <= _MOST
+    """Return whether a scale turns values of a magnitude into suitable network inputs."""
+    return 0.0 in (size, scale) or _MIN_INPUT <= scale * size <= _MAX_INPUT
 
 
 def _limit(config: Config, generator: EpisodeGenerator) -> int:
-    """Return how many steps of a random episode are looked at, at most."""
-    training = config.max_train_steps or _LONGEST
-    return min(generator.spec.max_episode_steps, training, _LONGEST)
+    """Return the time limit of sampled episodes, in steps."""
+    training = config.max_train_steps or _MAX_LENGTH
+    return min(generator.spec.max_episode_steps, training, _MAX_LENGTH)
 
 
 def _rounded(scale: float) -> float:
-    """Return a scale that is possible, with two digits."""
-    possible = min(max(scale, 1e-6), 1e6)
-    return float(f"{possible:.2g}")
+    """Return a scale within its allowed range, rounded to two significant digits."""
+    allowed = min(max(scale, 1e-6), 1e6)
+    return float(f"{allowed:.2g}")

@@ -1,11 +1,11 @@
-"""An agent as a folder that can be handed on: weights, settings, and a card that tells of it.
+"""An exported agent as a folder with weights, settings and a model card.
 
 ::
 
     model.safetensors   the behavior function's weights
-    config.json         :class:`Description`: what they are the weights of
+    config.json         :class:`Description`: settings, spaces and default command
     README.md           the model card
-    graph.onnx          with a behavior function of one's own: its graph, without weights
+    graph.onnx          the graph of a custom behavior function, without weights
 """
 
 from pathlib import Path
@@ -23,21 +23,21 @@ FORMAT = 2
 
 _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
 _GRAPH = "graph.onnx"
-#: Weights of more than this nobody has trained with this project.
-_MOST_BYTES = 4 << 30
+#: Maximum size of a file.
+_MAX_BYTES = 4 << 30
 
 
 class Description(
     Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 ):
-    """What a folder's weights are.
+    """Description of an exported agent.
 
     Attributes:
-        format: of the folder, :data:`FORMAT`.
-        settings: what they were trained with.
-        environment: what it looks like to the network.
-        desired_return: what the agent is asked for in evaluations (2.3.6).
-        desired_horizon: in how many steps.
+        format: format of the folder, :data:`FORMAT`.
+        settings: settings of the agent's run.
+        environment: specification of its environment.
+        desired_return: desired return of evaluation commands (2.3.6).
+        desired_horizon: desired horizon of evaluation commands, in steps.
     """
 
     format: int
@@ -48,21 +48,21 @@ class Description(
 
 
 class _Format(msgspec.Struct, frozen=True):
-    """What folders of all formats have."""
+    """The part of a description that all formats have."""
 
     format: int
 
 
 def save(folder: Path, policy: Policy, card: str) -> None:
-    """Write a policy to a folder, which may be there already.
+    """Write a policy to a folder, which may exist.
 
     Args:
-        folder: where to.
-        policy: the agent; what to ask it for must be known.
-        card: the text of README.md.
+        folder: new or empty folder, or one with an exported agent, which is overwritten.
+        policy: the agent, with a default command.
+        card: text of README.md.
 
     Raises:
-        ConfigError: it cannot be written, or holds what is no such policy.
+        ConfigError: the folder cannot be written, or contains something else.
     """
     assert policy.desired_return is not None
     assert policy.desired_horizon is not None
@@ -73,7 +73,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
         desired_return=policy.desired_return,
         desired_horizon=policy.desired_horizon,
     )
-    _refuse_others(folder)
+    _refuse_foreign(folder)
     described = msgspec.json.format(msgspec.json.encode(description), indent=2)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,16 +89,16 @@ def save(folder: Path, policy: Policy, card: str) -> None:
 
 
 def load(folder: str | Path) -> Policy:
-    """Return the policy that :func:`save` wrote.
+    """Return a policy written by :func:`save`.
 
-    Its ``desired_return`` and ``desired_horizon`` are what it was asked for in evaluations.
+    Its ``desired_return`` and ``desired_horizon`` are those of evaluation commands.
 
     Args:
-        folder: from ``udrl export RUN_DIR --folder FOLDER``.
+        folder: a folder written by ``udrl export RUN_DIR --folder FOLDER``.
 
     Raises:
-        ConfigError: there is no such folder.
-        InvalidData: the files are not what was written.
+        ConfigError: a file cannot be read.
+        InvalidData: a file's content is invalid.
     """
     folder = Path(folder)
     described, weights = (_read(folder / name) for name in (_DESCRIPTION, _WEIGHTS))
@@ -129,22 +129,25 @@ def load(folder: str | Path) -> Policy:
     )
 
 
-def _refuse_others(folder: Path) -> None:
-    """Raise unless a folder is empty, or holds a policy that may be written again."""
+def _refuse_foreign(folder: Path) -> None:
+    """Raise :class:`ConfigError` unless a folder is missing, empty, or has an exported agent."""
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     try:
         msgspec.json.decode(_read(folder / _DESCRIPTION), type=_Format)
     except (msgspec.DecodeError, UdrlError) as error:
         raise ConfigError(
-            f"{folder} holds something else than an exported agent; name a new folder"
+            f"{folder} contains something other than an exported agent; name a new folder"
         ) from error
 
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InvalidData(f"{path}: larger than {_MOST_BYTES:,} bytes; these are no weights")
+        if path.stat().st_size > _MAX_BYTES:
+            raise InvalidData(
+                f"{path}: {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}; export "
+                f"the run again"
+            )
         return path.read_bytes()
     except OSError as error:
         raise ConfigError(

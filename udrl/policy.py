@@ -18,7 +18,7 @@ from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
 
 class Policy:
-    """A behavior function with the settings that it was trained with (section 2.3.2).
+    """A behavior function with its settings (section 2.3.2).
 
     Its distributions are bit-identical to those that Algorithm 2 samples from (:mod:`udrl.acting`).
     An agent with a ``memory`` remembers the observations that :meth:`predict` received since
@@ -32,11 +32,11 @@ class Policy:
 
     Args:
         behavior: B(s, c; theta).
-        config: the settings that it was trained with.
-        spec: properties of its environment.
+        config: settings of its run.
+        spec: specification of its environment.
         rng: source of random numbers for actions. None: seeded by the operating system.
-        desired_return: the default command's return. None: unknown.
-        desired_horizon: the default command's horizon. None: unknown.
+        desired_return: return of the default command. None: unknown.
+        desired_horizon: horizon of the default command. None: unknown.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Policy:
             self._state = np.where(begins[:, None], np.float32(0), self._state)
 
     def make_environment(self, **kwargs: Any) -> Environment:
-        """Create the environment of the agent, with the observations that it was trained with.
+        """Create the environment of the agent, with observations as in training.
 
         Args:
             kwargs: further arguments for ``gymnasium.make``, e.g. ``render_mode="human"``.
@@ -90,7 +90,7 @@ class Policy:
         )
         if isinstance(self.spec.observation_space, Record):
             space = env.observation_space
-            # A function, because Gymnasium copies it, and a method would bring its policy.
+            # A function, because Gymnasium copies it; a method would drag the policy along.
             env = gym.wrappers.TransformObservation(
                 env, lambda record: nested(space, iter(parts_of(record))), space
             )
@@ -115,11 +115,11 @@ class Policy:
                 follows from the return (``desired_horizon = "return"``).
 
         Returns:
-            float64 [n_parameters]; of a batch [n, n_parameters].
+            float64 [n_parameters]; for a batch [n, n_parameters].
 
         Raises:
-            InvalidData: the observation has another shape than in training, a value is not finite,
-                or the temperature is below 0.
+            InvalidData: the observation's shape differs from that in training, or a value is not
+                finite.
         """
         return self.advance(observation, desired_return, desired_horizon, self._state)[0]
 
@@ -130,7 +130,7 @@ class Policy:
         desired_horizon: npt.ArrayLike,
         state: State | None,
     ) -> tuple[npt.NDArray[np.float64], State]:
-        """Return the logits, as :meth:`logits`, and the memory at the next step.
+        """Return the logits, like :meth:`logits`, and the memory at the next step.
 
         Args:
             observation: see :meth:`logits`.
@@ -183,13 +183,16 @@ class Policy:
         desired_horizon: npt.ArrayLike,
         temperature: float = 1.0,
     ) -> npt.NDArray[np.float64]:
-        """Return P(a | s, c), float64 of the shape that :meth:`logits` returns.
+        """Return P(a | s, c), float64, of the same shape as :meth:`logits`.
 
         Args:
             observation: see :meth:`logits`.
             desired_return: likewise.
             desired_horizon: likewise.
             temperature: divisor of the logits; 0 = probability 1 for the most likely action.
+
+        Raises:
+            InvalidData: see :meth:`logits`; also if the temperature is negative or not finite.
         """
         _check(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
@@ -220,8 +223,11 @@ class Policy:
             deterministic: same as a temperature of 0.
 
         Returns:
-            The action; of a batch the actions, stacked along the first dimension. A batch gets the
-            actions that as many single calls with the same random numbers would get.
+            The action; for a batch, the actions, stacked along the first dimension. They are the
+            same as those of single calls with the same random numbers.
+
+        Raises:
+            InvalidData: see :meth:`logits`; also if the temperature is negative or not finite.
         """
         _check(temperature)
         temperature = 0.0 if deterministic else temperature
@@ -241,7 +247,7 @@ class Policy:
 def _commands(
     desired_return: npt.ArrayLike, desired_horizon: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.float64], int | None]:
-    """Return commands, float64 [n, 2], and n; of a single command [1, 2], and None."""
+    """Return commands, float64 [n, 2], and n; for a single command [1, 2], and None."""
     values = np.asarray(desired_return, np.float64), np.asarray(desired_horizon, np.float64)
     try:
         desired = np.stack(np.broadcast_arrays(*values), axis=-1)
@@ -260,7 +266,7 @@ def _commands(
 
 
 def _find(leaf: Leaf, observation: Any) -> Any:
-    """Return a leaf of an observation, which can be plain or the environment's own."""
+    """Return a leaf of an observation, in the environment's form or as a structured array."""
     try:
         if isinstance(observation, np.ndarray | np.void) and observation.dtype.names:
             return observation[leaf.name]

@@ -1,4 +1,4 @@
-"""The steps of running episodes, in rings that grow with the longest of them."""
+"""The steps of running episodes, in ring buffers that grow with the longest episode."""
 
 import numpy as np
 import numpy.typing as npt
@@ -15,15 +15,15 @@ _FIRST_BYTES = 64 << 20
 
 
 class Recording:
-    """A ring of rounds: round k of all rows is kept at k % capacity.
+    """Ring buffers of rounds: a round is one step in all rows; round k is at k % capacity.
 
     Args:
-        spec: of the environments.
-        n: rows.
+        spec: specification of the environment.
+        n: number of rows.
 
     Attributes:
-        round: steps that all rows have made.
-        began: the round that each row's episode began in, int64 [n].
+        round: number of completed rounds.
+        began: first round of each row's episode, int64 [n].
     """
 
     def __init__(self, spec: EnvironmentSpec, n: int) -> None:
@@ -45,33 +45,33 @@ class Recording:
         self._commands: dict[int, Command] = {}
 
     def begin(self, row: int, command: Command) -> None:
-        """Let an episode begin in this round; its numbers are laid where its steps will look."""
+        """Begin an episode in this round, and draw its random numbers."""
         self.began[row] = self.round
         self._commands[row] = command
-        self._lay_out(row, command)
+        self._draw(row, command)
 
     def begin_round(self, observation: Observations) -> Decisions:
-        """Keep what is observed, [n, *observation_shape]; return what decides each row's action."""
+        """Store observations, [n, *observation_shape]; return the numbers that choose actions."""
         self._make_room()
         at = self.round % self._capacity
         self._rings["observations"][at] = observation
         return Decisions(self._rings["numbers"][at], self._rings["random"][at])
 
     def end_round(self, actions: npt.NDArray[np.integer], rewards: npt.NDArray[np.float32]) -> None:
-        """Keep what was done and what it brought, and go on to the next round."""
+        """Store actions and rewards, and advance to the next round."""
         at = self.round % self._capacity
         self._rings["actions"][at] = actions
         self._rings["rewards"][at] = rewards
         self.round += 1
 
     def stacks(self, memory: FrameStack) -> Seen:
-        """Return what the networks see in this round, [n, *shape] of each leaf."""
+        """Return the networks' input in this round, [n, *shape] for each leaf."""
         rounds = (self.began[:, None] + memory.times(self.round - self.began)) % self._capacity
         rows = np.arange(len(self.began))[:, None]
         return memory.join(self._rings["observations"][rounds, rows])
 
     def end(self, row: int, *, terminated: bool, truncated: bool) -> Episode:
-        """Return a row's episode, whose last step was that of the last round."""
+        """Return a row's episode, which ended in the last completed round."""
         began = int(self.began[row])
         places = self._places(began, self.round - began)
         kept = {name: self._rings[name][places, row] for name in _KEPT}
@@ -79,14 +79,15 @@ class Recording:
         return Episode(command_id=command.id, terminated=terminated, truncated=truncated, **kept)
 
     def drop(self, row: int) -> None:
-        """Forget a row's episode."""
+        """Discard a row's episode."""
         del self._commands[row]
 
     def _places(self, first: int, count: int) -> npt.NDArray[np.int64]:
-        """Return where ``count`` rounds from ``first`` on lie in the ring."""
+        """Return the ring indices of ``count`` rounds, beginning with ``first``."""
         return np.arange(first, first + count) % self._capacity
 
-    def _lay_out(self, row: int, command: Command) -> None:
+    def _draw(self, row: int, command: Command) -> None:
+        """Draw the random numbers of an episode's first ``capacity`` steps, at their places."""
         numbers, random = self._rings["numbers"], self._rings["random"]
         places = self._places(int(self.began[row]), self._capacity)
         numbers[places, row], random[places, row] = command.decisions(
@@ -94,7 +95,7 @@ class Recording:
         )
 
     def _make_room(self) -> None:
-        """Make the ring twice as long if an episode would overwrite its own beginning."""
+        """Double the capacity if an episode would overwrite its own first step."""
         first = self.round - self._capacity
         if self._capacity >= self._longest or first < 0:
             return
@@ -109,4 +110,4 @@ class Recording:
             longer[new] = ring[old]
             self._rings[name] = longer
         for row, command in self._commands.items():
-            self._lay_out(row, command)
+            self._draw(row, command)

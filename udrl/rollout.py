@@ -1,7 +1,7 @@
-"""Algorithm 2 one step at a time, for whoever watches, and may say something else on the way.
+"""Algorithm 2 one step at a time, so that an episode can be watched and its command changed.
 
-:mod:`udrl.acting` carries out thousands of commands, each to its end; this carries out one. Left
-alone it makes the same episode, to the bit.
+:mod:`udrl.acting` runs many commands to the end. With an unchanged command, both produce
+bit-identical episodes.
 """
 
 import math
@@ -23,8 +23,8 @@ from udrl.targets import ReturnInTime
 
 Result = TypeVar("Result")
 
-#: By so many steps the random numbers are drawn further, from the first on.
-_AT_A_TIME = 1024
+#: Steps for which random numbers are drawn at once.
+_AT_ONCE = 1024
 
 
 class Rollout:
@@ -33,15 +33,15 @@ class Rollout:
     Args:
         policy: the agent.
         env: its environment, from :func:`udrl.environments.make_environment`.
-        command: desired return and horizon, the seeds and the temperature.
+        command: the command, including the seeds and the temperature.
 
     Attributes:
-        temperature: of the next actions; may be set.
-        steps: taken so far.
-        episode_return: obtained so far, a sequential sum in float64.
-        terminated: the environment reached a terminal state.
-        truncated: a time limit ended the episode.
-        action: the last one, an index or one for each component; None before the first.
+        temperature: sampling temperature of the next actions; may be set.
+        steps: number of steps taken.
+        episode_return: return obtained so far, a sequential sum in float64.
+        terminated: whether the environment reached a terminal state.
+        truncated: whether a time limit ended the episode.
+        action: the last action, an index or one for each component; None before the first.
 
     Raises:
         EnvironmentFault: the environment raised an exception.
@@ -61,7 +61,7 @@ class Rollout:
         self._state: State | None = None
         self._decisions = command.decisions(0, policy.spec.action_space.shape)
         limit_steps(env, command.max_steps)
-        observation = self._carefully("reset", lambda: env.reset(seed=command.environment_seed)[0])
+        observation = self._guarded("reset", lambda: env.reset(seed=command.environment_seed)[0])
         n = policy.config.network.frame_stack
         self._recent = deque([self._plain(observation)] * n, maxlen=n)
         self.set_command(command.desired_return, command.desired_horizon)
@@ -78,7 +78,7 @@ class Rollout:
 
     @property
     def components(self) -> tuple[int, ...]:
-        """How many values there are of each component of an action."""
+        """Number of values of each component of an action."""
         return self._policy.spec.action_space.components
 
     def set_command(self, desired_return: float, desired_horizon: int) -> None:
@@ -88,12 +88,12 @@ class Rollout:
 
     @property
     def desired_return(self) -> float:
-        """What is still to be obtained, after the countdown."""
+        """Return still to be obtained, after the countdown."""
         return float(self._desired[0, 0])
 
     @property
     def desired_horizon(self) -> int:
-        """The steps that are left for it."""
+        """Steps left to obtain it."""
         if self._target.horizon_follows:
             return math.floor(self.desired_return)
         return int(self._desired[0, 1])
@@ -114,7 +114,7 @@ class Rollout:
         else:
             action = space.choose(logits, self.temperature, number)
         self.action = action = np.asarray(action).tolist()
-        observation, reward, self.terminated, self.truncated, _ = self._carefully(
+        observation, reward, self.terminated, self.truncated, _ = self._guarded(
             "step", lambda: self._env.step(action)
         )
         self._recent.append(self._plain(observation))
@@ -126,13 +126,13 @@ class Rollout:
         return float(rounded)
 
     def picture(self) -> npt.NDArray[np.uint8]:
-        """Return what a spectator sees now, uint8 [height, width, 3].
+        """Return a rendering of the current state, uint8 [height, width, 3].
 
         Raises:
             UnsupportedEnvironment: the environment was not made with a ``render_mode`` of
                 ``rgb_array``, or has none.
         """
-        picture = self._carefully("render", self._env.render)
+        picture = self._guarded("render", self._env.render)
         if (
             not isinstance(picture, np.ndarray)
             or picture.dtype != np.uint8
@@ -140,18 +140,18 @@ class Rollout:
             or picture.shape[2] != 3
         ):
             raise UnsupportedEnvironment(
-                f"environment {self._policy.config.environment!r} shows no picture of bytes, "
-                f"height x width x 3; it has to be made with render_mode='rgb_array', and to "
-                f"support that"
+                f"environment {self._policy.config.environment!r} renders no image of bytes, "
+                f"height x width x 3; it must support render_mode='rgb_array' and be created with "
+                f"it"
             )
         return picture
 
     def _decision(self) -> tuple[Any, bool]:
-        """Return the number, or numbers, that decide this step's action, and if it is random."""
+        """Return the number or numbers that choose this action, and whether it is random."""
         t = self.steps
         if t == len(self._decisions.random):
             shape = self._policy.spec.action_space.shape
-            self._decisions = self.command.decisions(t + _AT_A_TIME, shape)
+            self._decisions = self.command.decisions(t + _AT_ONCE, shape)
         return self._decisions.numbers[t], bool(self._decisions.random[t])
 
     def _advance(self) -> tuple[npt.NDArray[np.float64], State]:
@@ -160,7 +160,7 @@ class Rollout:
         )
 
     def _plain(self, observation: Any) -> npt.NDArray[Any]:
-        """Return an observation of one's own, in the dtype that the network was trained on."""
+        """Return a copy of an observation, in the dtype that the network was trained on."""
         space = self._policy.spec.observation_space
         plain = np.array(observation, space.dtype)
         if found := space.fault(plain[None], 1):
@@ -170,7 +170,8 @@ class Rollout:
             )
         return plain
 
-    def _carefully(self, where: str, call: Callable[[], Result]) -> Result:
+    def _guarded(self, where: str, call: Callable[[], Result]) -> Result:
+        """Call the environment; turn its exceptions into :class:`EnvironmentFault`."""
         try:
             return call()
         except Exception as error:

@@ -19,15 +19,15 @@ from udrl.spaces import Observations
 
 
 class Step(NamedTuple):
-    """What a step ended.
+    """Episodes that ended in a step, regularly or by an exception.
 
     Attributes:
-        over: row, terminated and truncated of each episode that has ended.
-        broken: row and exception of each environment that raised one.
+        ended: row, terminated and truncated of each episode that ended.
+        failed: row and exception of each environment that raised one.
     """
 
-    over: list[tuple[int, bool, bool]]
-    broken: list[tuple[int, Exception]]
+    ended: list[tuple[int, bool, bool]]
+    failed: list[tuple[int, Exception]]
 
 
 class Rows:
@@ -35,15 +35,14 @@ class Rows:
 
     Args:
         config: the run's settings.
-        n: how many.
-        make: makes one of them.
-        first_index: what the first of them is told that its index is
-            (:data:`udrl.environments.making.INDEX`).
+        n: number of environments.
+        make: factory of environments.
+        first_index: index of the first environment (:data:`udrl.environments.making.INDEX`).
 
     Attributes:
-        spec: of the environments.
-        observation: what each showed last, [n, *observation_shape].
-        reward: what each gave last, float32 [n].
+        spec: specification of the environment.
+        observation: last observation of each row, [n, *observation_shape].
+        reward: last reward of each row, float32 [n].
 
     Raises:
         UnsupportedEnvironment: the environment cannot be made or is not supported.
@@ -62,7 +61,7 @@ class Rows:
         self._envs: list[Environment] = []
         try:
             for row in range(n):
-                self._envs.append(self._made(row))
+                self._envs.append(self._make_row(row))
         except BaseException:
             self.close()
             raise
@@ -73,13 +72,13 @@ class Rows:
         self.reward = np.zeros(n, np.float32)
 
     def reset(self, row: int, seed: int, max_steps: int) -> Exception | None:
-        """Begin an episode; what the environment raises is returned."""
+        """Begin an episode; return the exception if the environment raises one."""
         try:
             if self._limits[row] != max_steps:
                 limit_steps(self._envs[row], max_steps)
                 self._limits[row] = max_steps
             self.observation[row], _ = self._envs[row].reset(seed=seed)
-        except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
+        except Exception as error:  # noqa: BLE001 - the environment is foreign code
             return error
         self.reward[row] = 0.0
         return None
@@ -88,32 +87,32 @@ class Rows:
         """Take a step in some of the environments.
 
         Args:
-            rows: which.
-            actions: of all rows, [n, *action_shape]; those of the others are not looked at.
+            rows: the rows of these environments.
+            actions: actions of all rows, [n, *action_shape]; only those of ``rows`` are used.
         """
         observation, reward, envs = self.observation, self.reward, self._envs
-        over: list[tuple[int, bool, bool]] = []
-        broken: list[tuple[int, Exception]] = []
+        ended: list[tuple[int, bool, bool]] = []
+        failed: list[tuple[int, Exception]] = []
         chosen = actions.tolist()
         for row in rows:
             try:
                 observation[row], reward[row], terminated, truncated, _ = envs[row].step(
                     chosen[row]
                 )
-            except Exception as error:  # noqa: BLE001 - whatever foreign code raises is its fault
-                broken.append((row, error))
+            except Exception as error:  # noqa: BLE001 - the environment is foreign code
+                failed.append((row, error))
                 continue
             if terminated or truncated:
-                over.append((row, bool(terminated), bool(truncated)))
-        return Step(over, broken)
+                ended.append((row, bool(terminated), bool(truncated)))
+        return Step(ended, failed)
 
     def replace(self, row: int) -> None:
-        """Make an environment anew that can no longer be trusted."""
+        """Replace a failed environment with a new one."""
         self._envs[row].close()
-        self._envs[row] = self._made(row)
+        self._envs[row] = self._make_row(row)
         self._limits[row] = self.spec.max_episode_steps
 
-    def _made(self, row: int) -> Environment:
+    def _make_row(self, row: int) -> Environment:
         with indexed(self._first_index + row):
             return self._make(self._config)
 

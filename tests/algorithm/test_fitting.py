@@ -128,7 +128,7 @@ def test_chance_shows_where_the_same_has_different_consequences(
     sample = Sample()
     for one in [walk((0, 0, 0.0), (1, 1, 1.0)), *others]:
         sample.add(one)
-    assert sample.by_chance is expected
+    assert sample.is_stochastic is expected
 
 
 @pytest.mark.parametrize(("slippery", "expected"), [(True, "action_value"), (False, "value")])

@@ -113,7 +113,7 @@ def test_the_package_offers_nothing_else() -> None:
 
 def test_a_folder_of_others_is_left_alone(policy: Policy, written: Path, tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("precious")
-    with pytest.raises(ConfigError, match="holds something else than an exported agent"):
+    with pytest.raises(ConfigError, match="something other than an exported agent"):
         folder.save(tmp_path, policy, "")
     assert (tmp_path / "README.md").read_text() == "precious"
     folder.save(written, policy, "# Another card\n")

@@ -125,7 +125,7 @@ def test_an_environment_that_renders_nothing_is_told_so() -> None:
     policy, env = agent()
     with (
         pytest.warns(UserWarning, match="render"),
-        pytest.raises(UnsupportedEnvironment, match=r"'CartPole-v1' shows no picture.*rgb_array"),
+        pytest.raises(UnsupportedEnvironment, match=r"'CartPole-v1' renders no image.*rgb_array"),
     ):
         Rollout(policy, env, command()).picture()
 
