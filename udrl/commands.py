@@ -30,7 +30,7 @@ TRAINING_SEEDS = (1_000_000, 10_000_000)
 SEARCH_SEEDS = (500_000, 1_000_000)
 EVALUATION_SEEDS = (1, 500_000)
 
-#: With ``n_steps_per_iter``, maximum number of exploratory episodes per iteration.
+#: Maximum number of exploratory episodes per iteration that ``n_steps_per_iter`` can lead to.
 MAX_EPISODES = 1_000
 #: Index of the first command of a run's final evaluation, within the run's last iteration.
 FINAL_EVALUATION = 500_000
@@ -170,9 +170,9 @@ class CommandSampler:
 
         A strategy (:mod:`udrl.strategies`) chooses desired return and horizon: in the paper, a
         return uniform in [M, M + S], and the mean length of the ``last_few`` best episodes. Not in
-        the paper: a share of the episodes, ``held_actions``, have held random actions. One is held
-        for ``hold_steps`` steps, beginning within the desired horizon, or with a ``held_rate``
-        many, repeatedly.
+        the paper: a share of the episodes, ``held_actions``, have held random actions: one, which
+        begins within the desired horizon and lasts for ``hold_steps`` steps, or with a
+        ``held_rate``, any number.
 
         Raises:
             ConfigError: the strategy cannot be imported, or returned an invalid command.
@@ -202,7 +202,7 @@ class CommandSampler:
         )
 
     def training_command(self, episode_id: int) -> Command:
-        """Return a warm-up or exploratory command again, without desired return and horizon."""
+        """Return a training command again, without desired return, horizon and random actions."""
         iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
         kind: Kind = "explore" if iteration else "warm_up"
         return self._commands(kind, iteration, 0, [(0.0, 0)] * (index + 1), TRAINING_SEEDS)[index]

@@ -1,8 +1,8 @@
 """Settings of a run (:class:`Config`) and its stopping criteria (:class:`Budget`).
 
-A run's result depends only on its :class:`Config`: the paper's hyperparameters (Table 2) under the
-paper's names, the network, and choices that the paper does not specify. The :class:`Budget` may
-change when a run is resumed.
+The results of a run's iterations depend only on its :class:`Config`: the paper's hyperparameters
+(Table 2) under the paper's names, the network, and choices that the paper does not specify. The
+:class:`Budget` may change when a run is resumed.
 
 A ``Config`` holds its settings in groups (:mod:`udrl.setting_groups`). In files, on the command
 line, in messages and in stores, settings are flat: each has a unique name, and there are no groups

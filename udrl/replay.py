@@ -1,9 +1,8 @@
 """Section 2.3.1: the replay buffer keeps the episodes with the highest returns.
 
 Two settings are not in the paper. ``max_age`` keeps the best episodes of the last iterations only:
-the best of all time are mostly lucky ones, and the agent would memorise them long after it could
-have replaced them. ``recent_size`` keeps the newest episodes whatever their return, so that the
-agent also trains on its present behavior.
+the best of all time are mostly lucky, and the agent would memorise them. ``recent_size`` also keeps
+the newest episodes, regardless of their return, so that the agent trains on its present behavior.
 """
 
 import bisect

@@ -73,7 +73,7 @@ class Rollout:
 
     @property
     def probabilities(self) -> npt.NDArray[np.float64]:
-        """P(a | s_t, c_t), float64 [n_parameters]: what the next action is sampled from."""
+        """Distribution P(a | s_t, c_t) of the next action, float64 [n_parameters]."""
         return self._policy.spec.action_space.probabilities(self._advance()[0], self.temperature)
 
     @property

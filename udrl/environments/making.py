@@ -190,7 +190,7 @@ def _remedy(error: Exception, config: Config) -> str:
         return "install the package that provides it"
     if isinstance(error, gym.error.Error):
         return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
-    if threading.current_thread() is not threading.main_thread() and _is_of_threads(text):
+    if threading.current_thread() is not threading.main_thread() and _needs_main_thread(text):
         return (
             "it must be made in the main thread of a process: train without --in-process (in "
             "Python: in_process=False), and watch it with udrl play instead of the board"
@@ -210,8 +210,8 @@ def _remedy(error: Exception, config: Config) -> str:
     )
 
 
-def _is_of_threads(text: str) -> bool:
-    """Return whether an exception's text says that the code must run in the main thread."""
+def _needs_main_thread(text: str) -> bool:
+    """Return whether an exception's text suggests that the code must run in the main thread."""
     return any(word in text.lower() for word in ("main thread", "event loop", "signal"))
 
 
