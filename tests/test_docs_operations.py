@@ -116,14 +116,14 @@ def test_drawing_of_the_message_flow_has_the_rights_of_each_role() -> None:
             joins.add(sender)
         elif what.endswith(", published"):
             name = what.removesuffix(", published")
-            assert name in RIGHTS[receiver].hears
+            assert name in RIGHTS[receiver].subscribes
             if sender in says:
                 says[sender].add(name)
         else:
             assert receiver == "replay"
             drawn[sender] |= set(what.split(", "))
     assert drawn == {role: set(verbs.asked_by(role)) for role in RIGHTS}
-    assert says == {role: set(rights.says) for role, rights in RIGHTS.items()}
+    assert says == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
     assert joins == {role for role, rights in RIGHTS.items() if rights.joins}
 
 

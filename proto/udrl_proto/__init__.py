@@ -1,6 +1,6 @@
-"""The wire contract: messages, key expressions, and how to ask and answer over Zenoh.
+"""The wire contract: messages, key expressions, and requests and replies over Zenoh.
 
-``proto/README.md`` is the page from which someone could write an actor in another language.
+``proto/README.md`` specifies it for implementations in other languages.
 """
 
 PROTOCOL = 2

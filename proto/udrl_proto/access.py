@@ -1,11 +1,10 @@
-"""Who may do what: one table, and the rules that a router makes of it.
+"""The permissions of each role, and the access rules of a router that enforce them.
 
 A service proves its role with a certificate whose common name is that role
-(:mod:`udrl_proto.credentials`). The router that the replay service hosts lets pass what stands
-here, and drops everything else without an answer. The replay service itself has no row: it talks
-within its own session, to which a router's rules do not apply. So nobody who connects can answer in
-its place. To a router that somebody else hosts it connects like the others, and there it may answer
-what they ask.
+(:mod:`udrl_proto.credentials`). The router hosted by the replay service forwards what is allowed
+here and silently drops everything else. The replay service itself has no row: it uses its own
+session, to which a router's rules do not apply, so no client can reply in its place. It connects to
+a separate router like any client, and may reply to requests there.
 """
 
 from typing import Any, NamedTuple
@@ -14,42 +13,41 @@ from udrl_proto import key_expressions, verbs
 
 
 class Rights(NamedTuple):
-    """What a role may do besides asking (:mod:`udrl_proto.verbs`).
+    """What a role may do besides sending requests (:mod:`udrl_proto.verbs`).
 
     Attributes:
-        hears: publications that it may receive.
-        says: publications that it may send.
-        joins: whether it may say with a liveliness token that it is here, and ask who else of its
-            role is.
+        subscribes: publications that it may receive.
+        publishes: publications that it may send.
+        joins: whether it may declare a liveliness token and query those of its own role.
     """
 
-    hears: tuple[str, ...] = ()
-    says: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
     joins: bool = False
 
 
-#: The role that hosts the router; its certificate is the only one that a server may show.
+#: The role that hosts the router; only its certificate is issued for servers.
 REPLAY = "replay"
 
-#: What those who connect may do, by role.
+#: Permissions of the clients, by role.
 RIGHTS = {
     "learner": Rights(
-        hears=(key_expressions.PROGRESS,),
-        says=(key_expressions.NEW_WEIGHTS,),
+        subscribes=(key_expressions.PROGRESS,),
+        publishes=(key_expressions.NEW_WEIGHTS,),
         joins=True,
     ),
     "actor": Rights(
-        hears=(key_expressions.NEW_WEIGHTS,),
+        subscribes=(key_expressions.NEW_WEIGHTS,),
         joins=True,
     ),
     "observer": Rights(),
 }
 
-#: Every role that there are certificates for.
+#: All roles for which certificates are issued.
 ROLES = (REPLAY, *RIGHTS)
 
 
-#: What passes a router: what it is for, the flow, and the kind of message, as Zenoh calls them.
+#: A rule of a router: its purpose, then Zenoh's names of the flow and the kind of message.
 Rule = tuple[str, str, str]
 
 
@@ -57,7 +55,7 @@ def access_control(*, hosted: bool = True) -> dict[str, Any]:
     """Return Zenoh's ``access_control`` setting for a run's router.
 
     Args:
-        hosted: the replay service hosts it; otherwise it connects to it.
+        hosted: whether the replay service hosts the router, rather than connecting to it.
     """
     wanted = {role: _of_client(role) for role in RIGHTS}
     if not hosted:
@@ -88,8 +86,8 @@ def access_control(*, hosted: bool = True) -> dict[str, Any]:
     }
 
 
-def _question(verb: str) -> str:
-    # A run is looked for whatever protocol it speaks, so that the difference can be told.
+def _request(verb: str) -> str:
+    # Runs of any protocol version can be found, so that a mismatch can be reported.
     return (
         key_expressions.every_hello()
         if verb == verbs.HELLO.name
@@ -98,37 +96,37 @@ def _question(verb: str) -> str:
 
 
 def _of_client(role: str) -> dict[Rule, list[str]]:
-    """Return what the router lets in from a role, and what it lets out to it."""
+    """Return the messages that the router accepts from a role and forwards to it."""
     rights = RIGHTS[role]
-    asks = [_question(verb) for verb in verbs.asked_by(role)]
-    hears = [key_expressions.key("*", name) for name in rights.hears]
-    says = [key_expressions.key("*", name) for name in rights.says]
+    requests = [_request(verb) for verb in verbs.asked_by(role)]
+    subscriptions = [key_expressions.key("*", name) for name in rights.subscribes]
+    publications = [key_expressions.key("*", name) for name in rights.publishes]
     alive = [key_expressions.alive("*", role, "*")] if rights.joins else []
     return {
-        ("asks", "ingress", "query"): asks,
-        ("is answered", "egress", "reply"): asks,
-        ("listens", "ingress", "declare_subscriber"): hears,
-        ("hears", "egress", "put"): hears,
-        ("says", "ingress", "put"): says,
-        ("is here", "ingress", "liveliness_token"): alive,
-        ("asks who is here", "ingress", "liveliness_query"): alive,
-        ("is told who is here", "egress", "liveliness_token"): alive,
+        ("sends requests", "ingress", "query"): requests,
+        ("receives replies", "egress", "reply"): requests,
+        ("subscribes", "ingress", "declare_subscriber"): subscriptions,
+        ("receives publications", "egress", "put"): subscriptions,
+        ("publishes", "ingress", "put"): publications,
+        ("declares presence", "ingress", "liveliness_token"): alive,
+        ("queries presence", "ingress", "liveliness_query"): alive,
+        ("receives presence", "egress", "liveliness_token"): alive,
     }
 
 
 def _of_replay() -> dict[Rule, list[str]]:
-    """Return the counterpart: what a router lets in from the replay service, and out to it."""
-    answers = [_question(verb.name) for verb in verbs.VERBS]
-    says = [key_expressions.key("*", key_expressions.PROGRESS)]
+    """Return the messages that a router accepts from the replay service and forwards to it."""
+    requests = [_request(verb.name) for verb in verbs.VERBS]
+    publications = [key_expressions.key("*", key_expressions.PROGRESS)]
     alive = [
         key_expressions.alive("*", role, "*") for role, rights in RIGHTS.items() if rights.joins
     ]
-    watches = [key_expressions.alive("*", "*", "*")]
+    watched = [key_expressions.alive("*", "*", "*")]
     return {
-        ("offers answers", "ingress", "declare_queryable"): answers,
-        ("is asked", "egress", "query"): answers,
-        ("answers", "ingress", "reply"): answers,
-        ("says", "ingress", "put"): says,
-        ("watches", "ingress", "declare_liveliness_subscriber"): watches,
-        ("is told who is here", "egress", "liveliness_token"): alive,
+        ("declares queryables", "ingress", "declare_queryable"): requests,
+        ("receives requests", "egress", "query"): requests,
+        ("sends replies", "ingress", "reply"): requests,
+        ("publishes", "ingress", "put"): publications,
+        ("watches presence", "ingress", "declare_liveliness_subscriber"): watched,
+        ("receives presence", "egress", "liveliness_token"): alive,
     }

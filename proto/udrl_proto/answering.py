@@ -1,7 +1,7 @@
-"""Answering queries: the replay service's side of the contract.
+"""Replying to queries: the replay service's side of the contract.
 
-Queries arrive on Zenoh's threads, are decoded there, and wait in one bounded queue for the one
-thread that owns the run. A query that finds the inbox full gets no answer and is asked again.
+Queries arrive on Zenoh's threads, are decoded there, and wait in a bounded inbox for the single
+thread that owns the run. If the inbox is full, a query gets no reply, and its sender retries.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -20,11 +20,11 @@ from udrl_proto.verbs import VERBS, AnyVerb
 
 @dataclass(frozen=True)
 class Question:
-    """A query that has been decoded and waits for its answer.
+    """A decoded query that waits for its reply.
 
     Attributes:
-        verb: what is asked.
-        request: its message, or the error that kept it from being one.
+        verb: the verb of its key.
+        request: the decoded message, or the error if decoding failed.
     """
 
     verb: AnyVerb
@@ -32,7 +32,7 @@ class Question:
     _query: Query
 
     def answer(self, reply: Message) -> None:
-        """Send the answer; a :class:`Problem` goes as an error reply."""
+        """Send the reply; a :class:`Problem` is sent as an error reply."""
         self._query.reply(Answer(encode(reply), is_problem=isinstance(reply, Problem)))
 
 
@@ -43,15 +43,15 @@ def serve(
     verbs: Iterable[AnyVerb] = VERBS,
     prepare: Mapping[str, Callable[[Any], Any]] = MappingProxyType({}),
 ) -> list[Declaration]:
-    """Answer verbs; undeclare them to stop.
+    """Declare a queryable for each verb; undeclare them to stop.
 
     Args:
-        transport: where.
-        run_id: whose.
-        inbox: takes the questions.
-        verbs: what is answered.
-        prepare: by the verb's name, what turns a message into what the run wants, on the thread
-            that received it.
+        transport: receives the queries.
+        run_id: the run in the keys.
+        inbox: receives the decoded queries.
+        verbs: the verbs to serve.
+        prepare: by name of a verb, a function that converts its message for the run; called on the
+            thread that received it.
     """
 
     def receiver(verb: AnyVerb) -> Callable[[Query], None]:
@@ -60,7 +60,7 @@ def serve(
         def receive(query: Query) -> None:
             request: Any
             data = query.data
-            if not inbox.has_room(len(data), bulk=verb.is_bulk):  # before the work of reading it
+            if not inbox.has_room(len(data), bulk=verb.is_bulk):  # before decoding it
                 query.drop()
                 return
             try:

@@ -1,7 +1,7 @@
-"""Asking a run's replay service: at least once, until it answers or patience ends.
+"""Requests to a run's replay service, with at-least-once delivery and a deadline.
 
-A query that stays empty or times out is asked again, since every request may be repeated without
-harm. Nothing waits without a deadline, and a wait that gets long is logged: who waits for what.
+A query without a reply is retried, since every request is harmless to repeat. Long waits are
+logged.
 """
 
 import logging
@@ -18,24 +18,24 @@ from udrl_proto.verbs import JOIN, Reply, Request, Verb
 
 log = logging.getLogger("udrl")
 
-#: Seconds that one query may take before it is asked again, at first and at last: twice as long
-#: each time, so that what answers slowly is not given ever more to do.
+#: Timeout of the first query and the longest timeout, seconds. It doubles with every retry, so
+#: that retries do not overload a slow service.
 ATTEMPT_S, LONGEST_ATTEMPT_S = 3.0, 30.0
-#: Seconds that a service goes on asking a replay service that does not answer.
+#: Seconds that a service retries a request without a reply.
 PATIENCE_S = 300.0
-#: Times that a service joins again for one question; more often nobody forgets it by chance.
+#: Most times that a service rejoins for one request; restarts alone never need more.
 _JOINS = 5
 
 
 class Asker:
-    """One service's line to the replay service of a run.
+    """Sends one service's requests to the replay service of a run.
 
     Args:
         transport: reaches the replay service.
         run_id: the run.
-        who: the asking service, for the log.
+        who: name of the requesting service, for the log.
         stop: ends every wait.
-        patience_s: seconds after which a question is given up.
+        patience_s: deadline of a request, seconds.
     """
 
     def __init__(
@@ -53,16 +53,16 @@ class Asker:
         self._patience_s = patience_s
 
     def ask(self, verb: Verb[Request, Reply], request: Request | bytes) -> Reply:
-        """Return the answer to a request.
+        """Send a request and return the reply.
 
         Args:
-            verb: what is asked.
+            verb: the kind of request.
             request: its message, encoded or not.
 
         Raises:
-            Refused: the answer is no.
-            Unreachable: no answer within the patience.
-            InvalidMessage: the answer is not of that kind.
+            Refused: the request is refused.
+            Unreachable: there is no reply within ``patience_s``.
+            InvalidMessage: the reply is not a valid message of its kind.
             Interrupted: the service is being stopped.
         """
         payload = request if isinstance(request, bytes) else encode(request)
@@ -83,8 +83,8 @@ class Asker:
             waited = now - began
             if waited >= self._patience_s:
                 raise Unreachable(
-                    f"{self._who} asked the replay service of {self._run_id} for {verb.name!r} and "
-                    f"got no answer in {waited:.0f} s; is it running and reachable?"
+                    f"{self._who} got no reply to {verb.name!r} from the replay service of "
+                    f"{self._run_id} in {waited:.0f} s; is it running and reachable?"
                 )
             if waited >= warn_at:
                 log.warning(
@@ -94,12 +94,12 @@ class Asker:
                 warn_at *= 2
             self._stop.wait(pause)
             pause = min(2 * pause, 1.0)
-        raise Interrupted(f"{self._who} was stopped while asking for {verb.name!r}")
+        raise Interrupted(f"{self._who} was stopped while waiting for {verb.name!r}")
 
     def ask_joined(
         self, verb: Verb[Request, Reply], request: Request | bytes, join: JoinRequest
     ) -> Reply:
-        """Ask as :meth:`ask` does, and join again where the replay service was started again."""
+        """Send a request as :meth:`ask` does; rejoin if the replay service was restarted."""
         for _ in range(_JOINS):
             try:
                 return self.ask(verb, request)

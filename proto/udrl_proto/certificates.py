@@ -1,6 +1,6 @@
-"""Whether key and certificates fit together, and are those of a role, now.
+"""Checks of a role's key and certificates.
 
-Importing this needs the extra ``secure``.
+Importing this module needs the extra ``secure``.
 """
 
 from datetime import UTC, datetime
@@ -13,14 +13,14 @@ from cryptography.x509.oid import NameOID
 
 from udrl.errors import ConfigError
 
-_ANEW = "copy it again, or make new keys with `udrl keys create`"
+_ANEW = "copy it again, or create new keys with `udrl keys create`"
 
 
 def check(ca: Path, certificate: Path, key: Path, role: str) -> None:
-    """Check the files that a service proves its role with.
+    """Check the files with which a service proves its role.
 
     Raises:
-        ConfigError: one is missing, unreadable, expired, another role's, or does not fit the
+        ConfigError: a file is missing, unreadable, expired, for another role, or does not match the
             others.
     """
     issuer, ours = _certificate(ca, role), _certificate(certificate, role)
@@ -36,8 +36,8 @@ def check(ca: Path, certificate: Path, key: Path, role: str) -> None:
     named = names[0].value if names else ""
     if named != role:
         raise ConfigError(
-            f"{certificate} is for the role {named!r}, {role!r} is needed here; give the folder "
-            f"{role} that `udrl keys create` made, or the one that holds it"
+            f"{certificate} is for the role {named!r}, expected {role!r}; give the folder {role} "
+            f"that `udrl keys create` made, or the folder above it"
         )
     try:
         ours.verify_directly_issued_by(issuer)
@@ -58,7 +58,7 @@ def _read(path: Path, role: str) -> bytes:
 
 
 def _certificate(path: Path, role: str) -> Certificate:
-    """Return a certificate that is valid now."""
+    """Return a certificate, after checking that it is valid now."""
     data = _read(path, role)
     try:
         certificate = load_pem_x509_certificate(data)
@@ -68,11 +68,11 @@ def _certificate(path: Path, role: str) -> Certificate:
     begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if now > end:
         raise ConfigError(
-            f"{path} expired at {end:%Y-%m-%d %H:%M} UTC; make new keys with `udrl keys create`"
+            f"{path} expired at {end:%Y-%m-%d %H:%M} UTC; create new keys with `udrl keys create`"
         )
     if now < begin:
         raise ConfigError(
-            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC, and the clock here says "
-            f"{now:%Y-%m-%d %H:%M}; set it right"
+            f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC, but the clock here says "
+            f"{now:%Y-%m-%d %H:%M}; correct the clock"
         )
     return certificate

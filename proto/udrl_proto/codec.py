@@ -1,4 +1,4 @@
-"""Messages as MessagePack: bounded before they are decoded, validated as they are typed."""
+"""Messages as MessagePack: size limits before decoding, validation against the message types."""
 
 import math
 from typing import Any, TypeVar
@@ -16,32 +16,32 @@ from udrl_proto.text import printable
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
-#: Bytes of a message that carries no arrays or weights.
+#: Largest message without arrays or weights, bytes.
 SMALL = 1 << 20
-#: Bytes of a page of episodes.
+#: Size of a page of episodes, bytes.
 PAGE = 4 << 20
-#: Bytes of anything.
+#: Largest message, bytes.
 LARGEST = 1 << 30
 
 
 def encode(message: Message) -> bytes:
     """Return a message as MessagePack: a map from field names to values."""
     plain = msgspec.to_builtins(message, builtin_types=(bytes,))
-    # What others say in an error may hold half a surrogate pair, which is not Unicode.
+    # Error text of foreign origin may hold a lone surrogate, which UTF-8 cannot encode.
     packed: bytes = msgpack.packb(plain, use_bin_type=True, unicode_errors="replace")
     return packed
 
 
 def decode(data: bytes, kind: type[AnyMessage], limit: int = SMALL) -> AnyMessage:
-    """Return the message of a certain kind in ``data``.
+    """Decode and validate a message.
 
     Args:
-        data: bytes from outside.
-        kind: the message expected.
-        limit: the most bytes that it may have.
+        data: untrusted bytes.
+        kind: the expected message type.
+        limit: largest allowed size, bytes.
 
     Raises:
-        InvalidMessage: it is too large, not MessagePack, or not that message.
+        InvalidMessage: the data are too large, not MessagePack, or not a valid ``kind``.
     """
     if len(data) > limit:
         raise InvalidMessage(f"{kind.__name__}: {len(data)} bytes, at most {limit} are allowed")
@@ -52,7 +52,7 @@ def decode(data: bytes, kind: type[AnyMessage], limit: int = SMALL) -> AnyMessag
             strict_map_key=True,
             max_str_len=SMALL,
             max_bin_len=limit,
-            # An array is allocated as long as it says it is; an element has at least one byte.
+            # msgpack allocates an array of its declared length; an element has at least one byte.
             max_array_len=min(1 << 20, len(data)),
             max_map_len=4096,
             max_ext_len=0,
@@ -71,7 +71,7 @@ def decode(data: bytes, kind: type[AnyMessage], limit: int = SMALL) -> AnyMessag
 def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     unique = dict(pairs)
     if len(unique) != len(pairs):
-        raise ValueError("a map has a key twice")
+        raise ValueError("a map has a duplicate key")
     return unique
 
 
@@ -85,7 +85,7 @@ def decode_array(message: Array) -> npt.NDArray[Any]:
     """Return the array in a message, read-only.
 
     Raises:
-        InvalidMessage: its bytes do not fill its shape.
+        InvalidMessage: the number of bytes does not match shape and dtype.
     """
     dtype = np.dtype(message.dtype)
     expected = dtype.itemsize * math.prod(message.shape)
@@ -98,7 +98,7 @@ def decode_array(message: Array) -> npt.NDArray[Any]:
 
 
 def encode_episode(episode: Episode, actor: str) -> bytes:
-    """Return an episode as its actor sends it."""
+    """Return an episode as the message that its actor sends."""
     return encode(
         EpisodeMessage(
             actor=actor,
@@ -113,14 +113,14 @@ def encode_episode(episode: Episode, actor: str) -> bytes:
 
 
 def decode_episode(message: EpisodeMessage, space: ObservationSpace) -> Episode:
-    """Return the episode in a message; its arrays fit their shapes, and that is all that is known.
+    """Return the episode in a message. Only the sizes of its arrays are checked here.
 
     Args:
-        message: from outside.
-        space: of its observations: what the structures of a record hold is not in the message.
+        message: an untrusted message.
+        space: observation space; defines the fields of records, which the message lacks.
 
     Raises:
-        InvalidMessage: an array's bytes do not fill its shape.
+        InvalidMessage: an array's number of bytes does not match its shape and dtype.
     """
     observations = decode_array(message.observations)
     if observations.dtype.kind == "V" and observations.dtype.itemsize == space.dtype.itemsize:

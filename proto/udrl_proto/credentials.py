@@ -1,7 +1,7 @@
-"""Who a service is: its private key, its certificate, and the authority that both sides trust.
+"""A service's credentials: its private key, its certificate and the certificate authority.
 
-A folder holds three files in PEM: ``ca.pem``, ``cert.pem``, ``key.pem``. ``udrl keys create`` makes
-one folder for each role. Nothing here, and no log line, holds more of a key than its path.
+A folder holds three PEM files: ``ca.pem``, ``cert.pem``, ``key.pem``. ``udrl keys create`` creates
+one folder per role. Keys are handled and logged by path only.
 """
 
 import logging
@@ -17,25 +17,25 @@ log = logging.getLogger("udrl")
 
 CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
 
-#: Seconds to find out why an endpoint that is there cannot be used.
+#: Timeout of the TLS check of an endpoint, seconds.
 _EXAMINE_S = 1.0
-#: Seconds for a server to say that it does not like our certificate.
+#: Seconds to wait for a server to reject our certificate.
 _VERDICT_S = 0.3
-#: OpenSSL's codes for a certificate of another host name or IP address.
+#: OpenSSL's codes for a mismatch of host name or IP address.
 _OTHER_NAME = (62, 64)
-#: What OpenSSL calls a server's complaint about our certificate.
+#: Parts of OpenSSL's names for a server's rejection of our certificate.
 _COMPLAINTS = ("CERTIFICATE", "UNKNOWN_CA", "DECRYPT_ERROR")
 
-_SAME_KEYS = "both sides need keys of the same `udrl keys create`"
+_SAME_KEYS = "both sides need keys from the same `udrl keys create`"
 
 
 class Credentials(NamedTuple):
-    """The files that a service proves its role with; :func:`load` has checked them.
+    """The files with which a service proves its role, checked by :func:`load`.
 
     Attributes:
-        ca: certificate of the authority; who shows none of its certificates is not talked to.
-        certificate: ours; its common name is our role.
-        key: the private key of it.
+        ca: certificate of the authority; peers without a certificate issued by it are rejected.
+        certificate: the service's own certificate; its common name is the role.
+        key: private key of that certificate.
     """
 
     ca: Path
@@ -43,7 +43,7 @@ class Credentials(NamedTuple):
     key: Path
 
     def settings(self) -> dict[str, str | bool]:
-        """Return Zenoh's settings for mutual TLS, for those who listen and those who connect."""
+        """Return Zenoh's settings for mutual TLS, both to listen and to connect."""
         tls = "transport/link/tls/"
         return {
             tls + "root_ca_certificate": str(self.ca),
@@ -57,10 +57,10 @@ class Credentials(NamedTuple):
         }
 
     def examine(self, host: str, port: int) -> None:
-        """Find out whether TLS is why an endpoint cannot be used; Zenoh says only that it cannot.
+        """Check whether TLS is why connecting failed; Zenoh does not report the reason.
 
         Raises:
-            ConfigError: its certificate is not trusted, or ours is not trusted there.
+            ConfigError: one side does not trust the other's certificate.
         """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.ca)
@@ -70,12 +70,12 @@ class Credentials(NamedTuple):
                 socket.create_connection((host, port), _EXAMINE_S) as plain,
                 context.wrap_socket(plain, server_hostname=host) as secured,
             ):
-                # In TLS 1.3 the verdict on a client's certificate comes after the handshake.
+                # In TLS 1.3 a server rejects a client's certificate only after the handshake.
                 secured.settimeout(_VERDICT_S)
                 secured.recv(1)
         except ssl.SSLCertVerificationError as error:
             remedy = (
-                f"make new keys with --host {host}, or connect by a name that it has"
+                f"create new keys with --host {host}, or connect by a name in the certificate"
                 if error.verify_code in _OTHER_NAME
                 else _SAME_KEYS
             )
@@ -84,7 +84,7 @@ class Credentials(NamedTuple):
                 f"{error.verify_message}; {remedy}"
             ) from error
         except ssl.SSLError as error:
-            # Only what says so: a server that dies meanwhile is no reason to give up.
+            # Other errors, such as a server that dies meanwhile, are worth a retry.
             if any(word in (error.reason or "") for word in _COMPLAINTS):
                 raise ConfigError(
                     f"tls/{host}:{port} does not trust {self.certificate} ({error.reason}); "
@@ -98,11 +98,11 @@ def load(folder: Path, role: str) -> Credentials:
     """Return the credentials of a role.
 
     Args:
-        folder: its own, or the one with a folder for each role.
-        role: from :data:`udrl_proto.access.ROLES`.
+        folder: the role's folder, or the folder above it.
+        role: one of :data:`udrl_proto.access.ROLES`.
 
     Raises:
-        ConfigError: a file is missing, unreadable, expired, another role's, or does not fit the
+        ConfigError: a file is missing, unreadable, expired, for another role, or does not match the
             others; or the extra ``secure`` is not installed.
     """
     try:
@@ -115,7 +115,7 @@ def load(folder: Path, role: str) -> Credentials:
     found = Credentials(own / CA, own / CERTIFICATE, own / KEY)
     certificates.check(*found, role)
     file = found.key.stat()
-    # Where root gives a key to a service, as Kubernetes does, it can only be by way of a group.
+    # A key owned by root, as in Kubernetes, can be made readable for a service only by group.
     may = 0o640 if file.st_uid == 0 and os.geteuid() != 0 else 0o600
     if file.st_mode & 0o777 & ~may:
         log.warning("%s can be read by others; chmod 600 it", found.key)

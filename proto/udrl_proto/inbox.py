@@ -1,4 +1,4 @@
-"""Where questions wait for the thread that answers them: within bounds, the short ones first."""
+"""A bounded queue of queries for the thread that replies to them; bulk comes last."""
 
 import threading
 from collections import deque
@@ -8,14 +8,14 @@ Item = TypeVar("Item")
 
 
 class Inbox(Generic[Item]):
-    """Two queues, of bulk and of all else, each of bounded length and size.
+    """Two queues of bounded length and size: one for bulk, one for all other items.
 
-    Bulk waits for all else, and takes none of its room: in a long queue of episodes, whoever asks
-    for commands or the status would give up before its turn, ask again, and wait behind them anew.
+    Bulk has the lower priority and its own bounds. Otherwise a request for commands or the status
+    would time out behind a long queue of episodes, and its retry would join the end of the queue.
 
     Args:
-        max_items: how many may wait in each.
-        max_bytes: how many bytes these may have together; a single one may have more.
+        max_items: most items in each queue.
+        max_bytes: most bytes in each queue; a single item may be larger.
     """
 
     def __init__(self, max_items: int, max_bytes: int) -> None:
@@ -24,11 +24,11 @@ class Inbox(Generic[Item]):
         self._bulk: _Lane[Item] = _Lane(max_items, max_bytes)
 
     def has_room(self, size: int, *, bulk: bool = False) -> bool:
-        """Say whether :meth:`put` would accept so many bytes now."""
+        """Return whether :meth:`put` would accept an item of ``size`` bytes now."""
         return (self._bulk if bulk else self._urgent).has_room(size)
 
     def put(self, item: Item, size: int, *, bulk: bool = False) -> bool:
-        """Let an item of so many bytes wait; False: there is no room."""
+        """Add an item of ``size`` bytes; return False if there is no room."""
         with self._changed:
             if not self.has_room(size, bulk=bulk):
                 return False
@@ -37,15 +37,15 @@ class Inbox(Generic[Item]):
             return True
 
     def must_put(self, item: Item) -> None:
-        """Let an item wait that nobody would send again, whether there is room or not."""
+        """Add an item that would not be sent again, even if the queue is full."""
         with self._changed:
             self._urgent.append(item, 0)
             self._changed.notify()
 
     def take(self, max_items: int, max_bytes: int, timeout_s: float) -> list[Item]:
-        """Return what waits: at most so many, and no more after so many bytes.
+        """Remove and return items: at most ``max_items``, and none after ``max_bytes``.
 
-        Waits for the first, ``timeout_s`` seconds at most.
+        If there are none, waits up to ``timeout_s`` seconds for the first.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._urgent.waiting or self._bulk.waiting, timeout_s)

@@ -4,7 +4,7 @@ import re
 
 from udrl_proto import PROTOCOL
 
-#: Publications; each may be lost, and nothing depends on one.
+#: Publications. Each may be lost; none is relied on.
 NEW_WEIGHTS = "news/weights"
 PROGRESS = "news/progress"
 
@@ -17,20 +17,20 @@ def key(run_id: str, verb: str) -> str:
 
 
 def alive(run_id: str, role: str, name: str) -> str:
-    """Return the key of a liveliness token; ``*`` stands for any role or name."""
+    """Return the key of a liveliness token; ``*`` matches any role or name."""
     return key(run_id, f"alive/{role}/{name}")
 
 
 def every_hello() -> str:
-    """Return the expression that finds every run on a router, whatever protocol it speaks."""
+    """Return the expression that finds every run on a router, of any protocol version."""
     return "udrl/*/*/hello"
 
 
 def parse(expression: str) -> tuple[str, str, str]:
-    """Return protocol, run id and verb of a key; the verb may hold slashes.
+    """Return protocol, run id and verb of a key; the verb may contain slashes.
 
     Raises:
-        ValueError: the expression is not a key of ours.
+        ValueError: the expression is not one of udrl's keys.
     """
     parts = expression.split("/", 3)
     if len(parts) != 4 or parts[0] != "udrl":

@@ -1,4 +1,4 @@
-"""A transport without a network, for services that share a process, and for tests."""
+"""An in-process transport, for services that share a process and for tests."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from udrl_proto.transport import Answer, Presence, Query
 
 
 class Exchange:
-    """What connects the transports of one process."""
+    """Connects the transports of one process."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -17,7 +17,7 @@ class Exchange:
         self.here: list[str] = []
 
     def tell(self, presence: Presence) -> None:
-        """Tell who watches that a service came or went."""
+        """Notify the watchers that a service appeared or disappeared."""
         with self.lock:
             watchers = [r for pattern, r in self.watching if _matches(pattern, presence.key)]
         for receive in watchers:
@@ -25,17 +25,17 @@ class Exchange:
 
 
 class MemoryTransport:
-    """One service's end of an :class:`Exchange`. What is sent is received on the sender's thread.
+    """One service's transport over an :class:`Exchange`. Callbacks run on the sender's thread.
 
     Args:
-        exchange: that it has in common with others.
+        exchange: shared by all services of the process.
     """
 
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
 
     def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
-        """Yield the answer to a question."""
+        """Yield the reply to a query, if there is one in time."""
         receive = self._exchange.answering.get(key)
         if receive is None:
             return
@@ -46,7 +46,7 @@ class MemoryTransport:
             yield query.answer
 
     def answer(self, key: str, receive: Callable[[Query], None]) -> "_Declared":
-        """Have the questions on a key received."""
+        """Call ``receive`` for each query on a key."""
         self._exchange.answering[key] = receive
         return _Declared(lambda: self._exchange.answering.pop(key))
 
@@ -58,14 +58,14 @@ class MemoryTransport:
             receive(data)
 
     def subscribe(self, key: str, receive: Callable[[bytes], None]) -> "_Declared":
-        """Have what is published on a key received."""
+        """Call ``receive`` for each publication on a key."""
         subscribed, entry = self._exchange.subscribed, (key, receive)
         with self._exchange.lock:
             subscribed.append(entry)
         return _Declared(lambda: subscribed.remove(entry))
 
     def declare_presence(self, key: str) -> "_Declared":
-        """Say that a service is here."""
+        """Announce a service."""
         with self._exchange.lock:
             self._exchange.here.append(key)
         self._exchange.tell(Presence(key, here=True))
@@ -77,12 +77,12 @@ class MemoryTransport:
         return _Declared(vanish)
 
     def present(self, key: str, timeout_s: float) -> list[str]:
-        """Return the keys of services that are here."""
+        """Return the keys of the services that are present."""
         with self._exchange.lock:
             return [held for held in self._exchange.here if _matches(key, held)]
 
     def watch(self, key: str, receive: Callable[[Presence], None]) -> "_Declared":
-        """Have it received who appears and goes."""
+        """Call ``receive`` for each service that is present, appears or disappears."""
         watching, entry = self._exchange.watching, (key, receive)
         with self._exchange.lock:
             watching.append(entry)
@@ -119,7 +119,7 @@ class _MemoryQuery:
 
 
 def _matches(pattern: str, key: str) -> bool:
-    """Say whether a key is one of a pattern's, with ``*`` for any part, and ``$*`` for any end."""
+    """Return whether a pattern matches a key: ``*`` is any part, ``$*`` the end of a part."""
     wanted, found = pattern.split("/"), key.split("/")
     return len(wanted) == len(found) and all(
         w == "*" or w == f or (w.endswith("$*") and f.startswith(w[:-2]))

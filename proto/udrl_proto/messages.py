@@ -1,8 +1,8 @@
-"""The messages that services do their work with, as types; ``codec`` makes bytes of them and back.
+"""The messages between services, as types; :mod:`udrl_proto.codec` encodes and decodes them.
 
-Those in which a run tells how it is doing are in :mod:`udrl_proto.reports`.
+Messages that report the state of a run are in :mod:`udrl_proto.reports`.
 
-A field that is not listed, missing or out of range makes the whole message invalid.
+A field that is unknown, missing or out of range makes the whole message invalid.
 """
 
 from typing import Annotated, Literal
@@ -30,10 +30,10 @@ class Array(Message, frozen=True, kw_only=True):
     """An array: C order, little-endian.
 
     Attributes:
-        dtype: numpy's name of it: ``<f4``, ``|u1``, ``<i4``; or ``|V`` and a number of bytes, of
-            the structures of a record.
-        shape: its dimensions, none of them 0.
-        data: its bytes.
+        dtype: numpy's type string: ``<f4``, ``|u1`` or ``<i4``; for records ``|V`` and the number
+            of bytes.
+        shape: sizes of the dimensions, none of them 0.
+        data: the elements' bytes.
     """
 
     dtype: Annotated[str, Meta(pattern=r"^(<f4|\|u1|<i4|\|V[1-9][0-9]{0,8})$")]
@@ -45,8 +45,9 @@ class Wait(Message, frozen=True, kw_only=True):
     """There is nothing to do now.
 
     Attributes:
-        on: who or what is being waited for, in words.
-        retry_after_s: when to ask again if no publication tells sooner, seconds.
+        on: description of what is being waited for.
+        retry_after_s: seconds until the request should be repeated, unless a publication arrives
+            earlier.
     """
 
     on: Text
@@ -54,10 +55,10 @@ class Wait(Message, frozen=True, kw_only=True):
 
 
 class Problem(Message, frozen=True, kw_only=True):
-    """The payload of an error reply: the answer is no.
+    """The payload of an error reply: the request is refused.
 
     Attributes:
-        code: a name that programs can compare (``docs/protocol.md``).
+        code: machine-readable name of the reason (``docs/protocol.md``).
         message: the value, what was expected, the remedy.
     """
 
@@ -66,7 +67,7 @@ class Problem(Message, frozen=True, kw_only=True):
 
 
 class HelloRequest(Message, frozen=True, kw_only=True):
-    """What run is this? Asked with a wildcard, it finds every run on a router."""
+    """Request for the run specification; with a wildcard key it finds every run on a router."""
 
 
 class Hello(Configured, Message, frozen=True, kw_only=True):
@@ -76,15 +77,15 @@ class Hello(Configured, Message, frozen=True, kw_only=True):
         protocol: version of this contract.
         software: version of the package that the replay service runs.
         run_id: the run's name in key expressions.
-        settings: what the run is, flat.
-        environment: what its environment looks like.
-        environment_digest: of a short episode there; empty: it does not repeat itself.
-        graph: the acting graph, an ONNX model whose weights have no values (:mod:`udrl.graph`).
-        acting_class: numerics class of the actors, set by the first that delivers
+        settings: the settings of the run, without groups.
+        environment: spaces and limits of the environment.
+        environment_digest: digest of a short episode; empty if episodes do not repeat.
+        graph: the acting graph, an ONNX model without values of the weights (:mod:`udrl.graph`).
+        acting_class: numerics class of the actors, set by the first that delivers an episode
             (``docs/protocol.md``).
-        training_class: numerics class of the learner, likewise.
+        training_class: numerics class of the learner, set by the first that delivers a version.
         allow_inexact: accept services of other numerics classes.
-        exact: whether the run's result is still a function of its configuration.
+        exact: whether the run's result still depends only on its configuration.
     """
 
     protocol: Number
@@ -101,14 +102,14 @@ class Hello(Configured, Message, frozen=True, kw_only=True):
 
 
 class JoinRequest(Message, frozen=True, kw_only=True):
-    """An actor or learner asks to take part.
+    """Request of an actor or learner to join the run.
 
     Attributes:
         id: unique to this process.
-        environments: how many an actor steps at once; 0 for a learner.
-        numerics_class: digest of its probe.
-        environment: what its own copy of the environment looks like; None: it has none.
-        environment_digest: of a short episode there.
+        environments: number of environments that an actor steps; 0 for a learner.
+        numerics_class: digest of the service's numerics probe.
+        environment: specification of the service's own environment; None if it has none.
+        environment_digest: digest of a short episode in that environment.
     """
 
     role: Role
@@ -123,19 +124,19 @@ class JoinRequest(Message, frozen=True, kw_only=True):
 
 
 class JoinReply(Message, frozen=True, kw_only=True):
-    """Welcome."""
+    """The service has joined."""
 
 
 class CommandsRequest(Message, frozen=True, kw_only=True):
-    """An actor asks for work.
+    """An actor's request for commands.
 
     Attributes:
-        wanted: how many commands it could start now.
-        running: ids of all commands that it holds and has not delivered. A command that was dealt
-            to it and is not among them is taken to be lost, and dealt again.
-        spare_cores: cores of its machine that are idle, as far as it knows.
-        env_steps_per_s: of the last seconds.
-        weights_version: the newest that it has.
+        wanted: number of commands that the actor can start now.
+        running: ids of all commands that the actor holds and has not delivered. A command dealt to
+            it that is missing here is considered lost and dealt again.
+        spare_cores: estimated number of idle cores of its machine.
+        env_steps_per_s: rate over the last seconds.
+        weights_version: newest weights version that the actor has.
     """
 
     actor: Name
@@ -147,7 +148,7 @@ class CommandsRequest(Message, frozen=True, kw_only=True):
 
 
 class CommandsReply(Message, frozen=True, kw_only=True):
-    """Commands to carry out; or, when there are none, why; or the end of the run."""
+    """Commands to run; or, if there are none, the reason to wait; or the end of the run."""
 
     commands: tuple[Command, ...] = ()
     wait: Wait | None = None
@@ -155,7 +156,7 @@ class CommandsReply(Message, frozen=True, kw_only=True):
 
 
 class EpisodeMessage(Message, frozen=True, kw_only=True):
-    """A finished episode; arrays as in :class:`udrl.episode.Episode`."""
+    """A completed episode; arrays as in :class:`udrl.episode.Episode`."""
 
     actor: Name
     command_id: Number
@@ -167,13 +168,13 @@ class EpisodeMessage(Message, frozen=True, kw_only=True):
 
 
 class EpisodeReply(Message, frozen=True, kw_only=True):
-    """What became of an episode; sent after it is on disk. Rejection is a :class:`Problem`."""
+    """Receipt for an episode, sent when it is on disk. A rejection is a :class:`Problem`."""
 
     result: Literal["accepted", "duplicate"]
 
 
 class FailureMessage(Message, frozen=True, kw_only=True):
-    """An actor could not carry out a command, through its environment's fault."""
+    """Report that an actor could not run a command because its environment failed."""
 
     actor: Name
     command_id: Number
@@ -181,18 +182,18 @@ class FailureMessage(Message, frozen=True, kw_only=True):
 
 
 class Acknowledged(Message, frozen=True, kw_only=True):
-    """It is noted."""
+    """Receipt for a message without any other reply."""
 
 
 class ChangesRequest(Message, frozen=True, kw_only=True):
-    """A learner asks for the buffer that a version is trained on: as it is after version - 1."""
+    """A learner's request for the buffer of a version: the one after iteration version - 1."""
 
     learner: Name
     version: Positive
 
 
 class ChangesReply(Message, frozen=True, kw_only=True):
-    """The buffer's episodes by rank, least return first; or what it waits for; or the end."""
+    """The buffer's episodes by rank, least return first; or the reason to wait; or the end."""
 
     ids: tuple[Number, ...] = ()
     wait: Wait | None = None
@@ -200,26 +201,26 @@ class ChangesReply(Message, frozen=True, kw_only=True):
 
 
 class EpisodesRequest(Message, frozen=True, kw_only=True):
-    """A learner asks for episodes that it does not hold."""
+    """A learner's request for episodes that it does not have."""
 
     ids: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=100_000)]
 
 
 class EpisodesReply(Message, frozen=True, kw_only=True):
-    """The first of them, as many as fit a page of 4 MB, at least one; ask again for the others."""
+    """The first requested episodes, up to 4 MB but at least one; request the rest again."""
 
     episodes: tuple[bytes, ...]
 
 
 class VersionMessage(Message, frozen=True, kw_only=True):
-    """A learner delivers a weights version.
+    """Delivery of a weights version by a learner.
 
     Attributes:
-        version: v.
+        version: its number v.
         weights: safetensors (:mod:`udrl.weights`).
-        optimizer: safetensors, Adam's state.
+        optimizer: Adam's state, safetensors.
         loss: mean cross-entropy, nats.
-        train_s: seconds that training took.
+        train_s: training time, seconds.
     """
 
     learner: Name
@@ -231,19 +232,19 @@ class VersionMessage(Message, frozen=True, kw_only=True):
 
 
 class VersionReply(Message, frozen=True, kw_only=True):
-    """What became of a version; sent after it is on disk."""
+    """Receipt for a version, sent when it is on disk."""
 
     result: Literal["accepted", "duplicate"]
 
 
 class StateRequest(Message, frozen=True, kw_only=True):
-    """A learner asks where to go on."""
+    """A learner's request for the state to continue from."""
 
     learner: Name
 
 
 class StateReply(Message, frozen=True, kw_only=True):
-    """The latest version with its optimizer; version 0 means: begin untrained."""
+    """The latest version with its optimizer state; version 0: start untrained."""
 
     version: Number
     weights: bytes = b""
@@ -251,13 +252,13 @@ class StateReply(Message, frozen=True, kw_only=True):
 
 
 class WeightsRequest(Message, frozen=True, kw_only=True):
-    """Anyone asks for a version that is kept."""
+    """Request for the weights of a version that is kept."""
 
     version: Number | Literal["latest", "best"]
 
 
 class Weights(Message, frozen=True, kw_only=True):
-    """A version's weights: the answer to a request, and what the learner publishes."""
+    """A version's weights, as a reply and as the learner's publication."""
 
     version: Number
     weights: bytes

@@ -1,4 +1,4 @@
-"""Messages in which a run tells how it is doing: its status, its history, its buffer."""
+"""Messages that report the state of a run: its status, its history, its buffer."""
 
 from typing import Annotated, Literal
 
@@ -14,7 +14,7 @@ MOST_SHOWN = 2000
 
 
 class StatusRequest(Message, frozen=True, kw_only=True):
-    """Anyone asks how the run is doing; the reply is :class:`Status`."""
+    """Request for the :class:`Status` of the run."""
 
 
 class CommandLedger(Message, frozen=True, kw_only=True):
@@ -45,7 +45,7 @@ class BufferStatus(Message, frozen=True, kw_only=True):
 
 
 class ActorStatus(Message, frozen=True, kw_only=True):
-    """An actor that is here."""
+    """An actor that has joined."""
 
     id: Name
     host: Text
@@ -60,7 +60,7 @@ class ActorStatus(Message, frozen=True, kw_only=True):
 
 
 class Waiting(Message, frozen=True, kw_only=True):
-    """Who waits for whom, why, and for how long."""
+    """A service that waits: for what, why, and for how long."""
 
     who: Text
     on: Annotated[Text, Meta()] = msgspec.field(name="for")
@@ -69,7 +69,7 @@ class Waiting(Message, frozen=True, kw_only=True):
 
 
 class EvaluationStatus(Message, frozen=True, kw_only=True):
-    """The last evaluation, or the closing one."""
+    """An evaluation."""
 
     iteration: Number
     env_steps: Number
@@ -81,7 +81,7 @@ class EvaluationStatus(Message, frozen=True, kw_only=True):
 
 
 class AuditStatus(Message, frozen=True, kw_only=True):
-    """Episodes that a second actor makes again, to compare."""
+    """Episodes that are re-run by a second actor and compared."""
 
     rate: float
     agreed: Number
@@ -90,16 +90,17 @@ class AuditStatus(Message, frozen=True, kw_only=True):
 
 
 class Quarantined(Message, frozen=True, kw_only=True):
-    """An actor that nothing is taken from any more."""
+    """An actor that is excluded from the run."""
 
     id: Name
     why: Text
 
 
 class Status(Message, frozen=True, kw_only=True):
-    """How a run is doing; every name is explained in ``docs/metrics.md``.
+    """The state of a run; every name is explained in ``docs/metrics.md``.
 
-    A replay service never says ``stopped``; who reads the file of a run that nobody works on does.
+    ``stopped`` is never reported by a replay service, only when the file of a run is read that no
+    process is running.
     """
 
     run_id: Name
@@ -138,7 +139,7 @@ class Status(Message, frozen=True, kw_only=True):
 
 
 class HistoryRequest(Message, frozen=True, kw_only=True):
-    """Anyone asks what came of the iterations after one; -1: of all."""
+    """Request for the results of the iterations after ``after``; -1: all."""
 
     after: Annotated[int, Meta(ge=-1, le=2**62)]
 
@@ -163,12 +164,12 @@ class IterationStatus(Message, frozen=True, kw_only=True):
 
 
 class History(Message, frozen=True, kw_only=True):
-    """The first of them, and the evaluations that were made in these; ask again for the others.
+    """The first requested iterations and their evaluations; request the rest again.
 
     Attributes:
-        iterations: in their order, at most :data:`HISTORY_PAGE`.
-        evaluations: likewise, without closing ones.
-        more: whether there are iterations after the last of these.
+        iterations: completed iterations in order, at most :data:`HISTORY_PAGE`.
+        evaluations: the evaluations of these iterations, without the final evaluation.
+        more: whether there are later iterations.
     """
 
     iterations: tuple[IterationStatus, ...]
@@ -177,22 +178,24 @@ class History(Message, frozen=True, kw_only=True):
 
 
 class ContentsRequest(Message, frozen=True, kw_only=True):
-    """Anyone asks what the replay buffer holds, and what its next commands ask for."""
+    """Request for the content of the replay buffer and the commands drawn from it."""
 
 
 class Contents(Message, frozen=True, kw_only=True):
-    """The replay buffer, episode by episode, and what is drawn from it.
+    """The episodes of the replay buffer and the commands drawn from it.
 
     Attributes:
-        iteration: the buffer is as it was after this one.
-        returns: of its episodes, least first; of more than :data:`MOST_SHOWN` every so many.
-        lengths: of the same episodes, steps.
-        iterations: in which they were made.
-        desired_return: what evaluations ask for, M of the ``last_few`` best; None: it is empty.
-        desired_horizon: in how many steps.
+        iteration: the iteration after which the buffer is shown.
+        returns: returns of the episodes, least first; a regular subset if there are more than
+            :data:`MOST_SHOWN`.
+        lengths: lengths of the same episodes, steps.
+        iterations: the iterations that produced them.
+        desired_return: desired return of evaluations, M of the ``last_few`` best; None if the
+            buffer is empty.
+        desired_horizon: desired horizon of evaluations, steps.
         return_std: S of the ``last_few`` best.
-        desired_returns: of exploratory commands that are outstanding.
-        desired_horizons: of the same commands.
+        desired_returns: desired returns of the outstanding exploratory commands.
+        desired_horizons: desired horizons of the same commands.
         versions: weights versions that are kept.
     """
 

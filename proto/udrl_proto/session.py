@@ -1,4 +1,4 @@
-"""Opening Zenoh sessions: the settings that every service of a run shares."""
+"""Opening Zenoh sessions with the settings that all services share, and finding runs."""
 
 import ipaddress
 import json
@@ -26,27 +26,27 @@ _ENDPOINT = re.compile(
     r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:]+\]|[^:/\s\[\]]+):(?P<port>\d+)"
 )
 
-#: Seconds of looking for a router after which that is worth a warning: it may be starting up.
+#: Seconds without a router after which a warning is logged; it may still be starting up.
 QUIET_S = 15.0
-#: Seconds between two looks, at first.
+#: First pause between two attempts to connect, seconds.
 _FIRST_PAUSE_S = 0.05
 
-#: A hung or cut-off service is noticed after this many milliseconds.
+#: Milliseconds after which a service that hangs or is cut off is noticed.
 LEASE_MS = 2000
 
-#: As many as may join; by default Zenoh turns the 1,001st away.
+#: Most clients of a router; Zenoh's default is 1,000.
 MAX_SESSIONS = 11_000
 
 
 def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
-    """Return an endpoint as it came.
+    """Return an endpoint unchanged if it is valid.
 
     Args:
-        endpoint: what was given.
+        endpoint: ``tcp/HOST:PORT`` or ``tls/HOST:PORT``.
         secure: whether keys were given.
 
     Raises:
-        ConfigError: it is not one, or of the other kind.
+        ConfigError: the endpoint is malformed, or its protocol does not fit ``secure``.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 0 < int(match["port"]) < 65536:
@@ -56,13 +56,13 @@ def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
         )
     if match["protocol"] == "tls" and not secure:
         raise ConfigError(
-            f"endpoint {endpoint!r} needs keys; add --keys DIR (`udrl keys create DIR` makes "
-            f"them), or use tcp/ where nobody has to be authenticated"
+            f"endpoint {endpoint!r} needs keys; add --keys DIR (`udrl keys create DIR` creates "
+            f"them), or use tcp/ if no authentication is needed"
         )
     if match["protocol"] == "tcp" and secure:
         raise ConfigError(
-            f"endpoint {endpoint!r} would not use the keys, and nothing would be encrypted; with "
-            f"--keys give it as tls/{endpoint.removeprefix('tcp/')}"
+            f"endpoint {endpoint!r} would ignore --keys and not be encrypted; use "
+            f"tls/{endpoint.removeprefix('tcp/')}"
         )
     return endpoint
 
@@ -88,17 +88,17 @@ def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
     tls = {} if credentials is None else credentials.settings()
     for path, value in {
         "mode": mode,
-        # Peers are named, never searched for: scouting costs 0.5 s and crosses site borders.
+        # Endpoints are always given: scouting costs 0.5 s and crosses site borders.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
-        # By default a client looks for a router that is gone after 1, 3, 7, 11 s.
+        # By default a client that lost its router retries after 1, 3, 7, 11 s.
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
             "period_increase_factor": 1.5,
         },
-        # Silent losses are reported for shared memory when a receiver is descheduled.
+        # Shared memory is reported to lose messages silently when a receiver is descheduled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
         "transport/unicast/max_sessions": MAX_SESSIONS,
@@ -109,16 +109,16 @@ def _config(mode: str, credentials: Credentials | None) -> zenoh.Config:
 
 
 def check_listening(endpoint: str, *, insecure: bool = False, secure: bool = False) -> None:
-    """Make sure that this machine could listen on an endpoint now, before anything is made for it.
+    """Check that this machine can listen on an endpoint, before a run is created for it.
 
     Args:
-        endpoint: where others would connect to.
-        insecure: allow an endpoint beyond loopback although nobody is authenticated.
+        endpoint: where clients would connect.
+        insecure: allow an endpoint beyond loopback without authentication.
         secure: whether keys were given.
 
     Raises:
-        ConfigError: the endpoint is malformed, in use, not this machine's, or would let strangers
-            in.
+        ConfigError: the endpoint is malformed, in use, not on this machine, or reachable without
+            authentication.
     """
     _check_audience(endpoint, insecure=insecure, secure=secure)
     host, port = _host_and_port(endpoint)
@@ -142,9 +142,9 @@ def _check_audience(endpoint: str, *, insecure: bool, secure: bool) -> None:
     check_endpoint(endpoint, secure=secure)
     if not secure and not insecure and not _is_loopback(endpoint):
         raise ConfigError(
-            f"endpoint {endpoint!r} can be reached from other machines and nobody would be "
-            f"authenticated; make keys (`udrl keys create DIR`) and give --keys DIR with "
-            f"tls/HOST:PORT, listen on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
+            f"endpoint {endpoint!r} can be reached from other machines without authentication; "
+            f"create keys (`udrl keys create DIR`) and give --keys DIR with tls/HOST:PORT, listen "
+            f"on tcp/127.0.0.1:PORT, or add --insecure on a network you trust"
         )
 
 
@@ -160,13 +160,13 @@ def listen(
     """Open a session that is the router of a run.
 
     Args:
-        endpoint: where others connect to.
-        insecure: allow an endpoint beyond loopback although nobody is authenticated.
-        credentials: let in only who has a certificate of the same authority, and let each do only
-            what its role may (:mod:`udrl_proto.access`).
+        endpoint: where clients connect.
+        insecure: allow an endpoint beyond loopback without authentication.
+        credentials: accept only clients with a certificate of the same authority, and limit each to
+            the permissions of its role (:mod:`udrl_proto.access`).
 
     Raises:
-        ConfigError: the endpoint is malformed, in use, or would let strangers in.
+        ConfigError: the endpoint is malformed, in use, or reachable without authentication.
     """
     _check_audience(endpoint, insecure=insecure, secure=credentials is not None)
     config = _config("router", credentials)
@@ -185,11 +185,11 @@ def connect(
     stop: threading.Event | None = None,
     credentials: Credentials | None = None,
 ) -> zenoh.Session:
-    """Open a session with the router at an endpoint, trying again until it is there.
+    """Open a session with the router at an endpoint, retrying until it is reachable.
 
     Raises:
         ConfigError: the endpoint is malformed, or one side does not trust the other's keys.
-        Unreachable: nobody answers within ``patience_s`` seconds.
+        Unreachable: there is no reply within ``patience_s`` seconds.
         Interrupted: ``stop`` was set meanwhile.
     """
     check_endpoint(endpoint, secure=credentials is not None)
@@ -208,7 +208,7 @@ def connect(
             waited = time.monotonic() - began
             if waited >= patience_s:
                 raise Unreachable(
-                    f"nobody answers at {endpoint!r} after {waited:.0f} s; start `udrl replay ENV "
+                    f"no reply from {endpoint!r} after {waited:.0f} s; start `udrl replay ENV "
                     f"--listen {endpoint}` there, or correct the endpoint"
                 ) from error
         if waited >= warn_at:
@@ -225,9 +225,9 @@ def connect(
 
 @contextmanager
 def closed_at_the_end(session: zenoh.Session) -> Iterator[None]:
-    """Close a session in the end; what cannot be closed ends with the process.
+    """Close a session at the end; one that cannot be closed ends with the process.
 
-    That must not hide what went wrong before, such as too many open files.
+    An error in closing must not hide an earlier one, such as too many open files.
     """
     try:
         yield
@@ -248,13 +248,13 @@ def find_run(
 
     Args:
         session: connected to the router.
-        run_id: which run; None: the only one.
+        run_id: the run's name; None: the only run.
         patience_s: seconds to wait for it to appear.
         stop: ends the wait.
 
     Raises:
-        Unreachable: no such run answers.
-        ConfigError: there are several runs and none was named, or it speaks another protocol.
+        Unreachable: no such run replies.
+        ConfigError: there are several runs and ``run_id`` is None, or the run has another protocol.
         Interrupted: ``stop`` was set meanwhile.
     """
     deadline = time.monotonic() + patience_s
@@ -266,7 +266,7 @@ def find_run(
             found = {name: hello for name, hello in found.items() if name == run_id}
         if len(found) > 1:
             raise ConfigError(
-                f"several runs are here: {printable(', '.join(sorted(found)))}; name one: --run RUN"
+                f"found several runs: {printable(', '.join(sorted(found)))}; choose one: --run RUN"
             )
         if found:
             ((protocol, payload),) = found.values()
@@ -279,7 +279,7 @@ def find_run(
         if time.monotonic() >= deadline:
             wanted = "no run" if run_id is None else f"no run {run_id!r}"
             raise Unreachable(
-                f"{wanted} answers after {patience_s:.0f} s; start `udrl replay ENV` or check --run"
+                f"{wanted} replied in {patience_s:.0f} s; start `udrl replay ENV` or check --run"
             )
         if stop.wait(pause):
             raise Interrupted("stopped while looking for a run")
@@ -287,7 +287,7 @@ def find_run(
 
 
 def _hellos(session: zenoh.Session) -> dict[str, tuple[str, bytes]]:
-    """Return protocol and payload of every run's answer, by run id."""
+    """Return protocol and payload of every run's reply, by run id."""
     found = {}
     for reply in session.get(
         key_expressions.every_hello(),

@@ -1,15 +1,15 @@
-"""Text that came from others, on its way to a log or a terminal."""
+"""Text from other processes, made safe for logs and terminals."""
 
 
 def printable(text: object) -> str:
-    r"""Return what a text says, with everything that a log or a terminal would obey written out.
+    r"""Return a text with all characters escaped that are not printable.
 
-    Letters of all scripts stay. Line ends, which would forge lines of a log, escape sequences,
-    and marks that turn the direction of writing become ``\n``, ``\x1b``, ``\u202e`` and the like.
+    Letters of all scripts are kept. Line ends, which would forge log lines, escape sequences and
+    marks that change the writing direction become ``\n``, ``\x1b``, ``\u202e`` and so on.
     """
-    said = str(text)
-    if said.isprintable():
-        return said
+    raw = str(text)
+    if raw.isprintable():
+        return raw
     return "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in said
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in raw
     )

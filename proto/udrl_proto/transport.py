@@ -1,7 +1,7 @@
-"""What services need of a network: questions and answers, news, and who is here.
+"""What services need from a network: queries and replies, publications, and presence.
 
-:class:`udrl_proto.zenoh_transport.ZenohTransport` is the one that runs use,
-:class:`udrl_proto.memory_transport.MemoryTransport` has no network.
+Runs use :class:`udrl_proto.zenoh_transport.ZenohTransport`;
+:class:`udrl_proto.memory_transport.MemoryTransport` needs no network.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,11 +9,11 @@ from typing import NamedTuple, Protocol
 
 
 class Answer(NamedTuple):
-    """An answer to a question.
+    """A reply to a query.
 
     Attributes:
-        data: a message.
-        is_problem: it is a :class:`udrl_proto.messages.Problem`.
+        data: an encoded message.
+        is_problem: whether it is a :class:`udrl_proto.messages.Problem`.
     """
 
     data: bytes
@@ -21,11 +21,11 @@ class Answer(NamedTuple):
 
 
 class Presence(NamedTuple):
-    """A service came, or went.
+    """A service appeared or disappeared.
 
     Attributes:
-        key: the service's.
-        here: whether it is here now.
+        key: key of the service's liveliness token.
+        here: whether the service is present now.
     """
 
     key: str
@@ -33,7 +33,7 @@ class Presence(NamedTuple):
 
 
 class Query(Protocol):
-    """A question that somebody waits to have answered; once, from any thread."""
+    """A received query; reply to it or drop it once, on any thread."""
 
     @property
     def data(self) -> bytes:
@@ -41,19 +41,19 @@ class Query(Protocol):
         ...
 
     def reply(self, answer: Answer) -> None:
-        """Send the answer; who asked may be gone, and will ask again."""
+        """Send the reply. It may be lost; the sender of the query then retries."""
         ...
 
     def drop(self) -> None:
-        """Give no answer; it will be asked again."""
+        """Send no reply; the sender retries."""
         ...
 
 
 class Declaration(Protocol):
-    """Something that was declared."""
+    """A declared queryable, subscriber or liveliness token."""
 
     def undeclare(self) -> None:
-        """Take it back."""
+        """Withdraw the declaration."""
         ...
 
 
@@ -61,11 +61,11 @@ class Transport(Protocol):
     """One service's access to the keys of a run (:mod:`udrl_proto.key_expressions`)."""
 
     def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
-        """Yield the answers to a question; none where nobody answers in time."""
+        """Yield the replies to a query that arrive within ``timeout_s`` seconds."""
         ...
 
     def answer(self, key: str, receive: Callable[[Query], None]) -> Declaration:
-        """Have the questions on a key received, on the transport's threads."""
+        """Call ``receive`` for each query on a key, on the transport's threads."""
         ...
 
     def publish(self, key: str, data: bytes) -> None:
@@ -73,22 +73,22 @@ class Transport(Protocol):
         ...
 
     def subscribe(self, key: str, receive: Callable[[bytes], None]) -> Declaration:
-        """Have what is published on a key received, on the transport's threads."""
+        """Call ``receive`` for each publication on a key, on the transport's threads."""
         ...
 
     def declare_presence(self, key: str) -> Declaration:
-        """Say that a service is here, until it is undeclared or the service is gone."""
+        """Announce a service, until this is undeclared or the process ends."""
         ...
 
     def present(self, key: str, timeout_s: float) -> list[str]:
-        """Return the keys of services that are here; ``$*`` stands for any end of a part."""
+        """Return the keys of the services that are present; ``$*`` matches the end of a part."""
         ...
 
     def watch(self, key: str, receive: Callable[[Presence], None]) -> Declaration:
-        """Have it received who comes and goes, those included that are here.
+        """Call ``receive`` for each service that is present, appears or disappears.
 
         Args:
-            key: of services; ``*`` stands for any part.
-            receive: is called on the transport's threads.
+            key: pattern for the keys of services; ``*`` matches any part.
+            receive: called on the transport's threads.
         """
         ...

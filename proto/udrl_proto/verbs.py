@@ -1,4 +1,4 @@
-"""What can be asked of a run's replay service: each verb with its messages, limits and askers."""
+"""The verbs of a run's replay service, each with its messages, limits and permitted roles."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -40,22 +40,22 @@ from udrl_proto.reports import (
 Request = TypeVar("Request", bound=Message)
 Reply = TypeVar("Reply", bound=Message)
 
-#: Bytes of a message that holds a few numbers and names.
+#: Largest message with only a few numbers and names, bytes.
 FEW = 4096
 
 
 @dataclass(frozen=True)
 class Verb(Generic[Request, Reply]):
-    """A kind of question.
+    """A kind of request.
 
     Attributes:
-        name: as it stands in keys.
-        request: its message.
-        reply: the answer's message; a :class:`udrl_proto.messages.Problem` says no instead.
-        askers: the roles that may ask it (:mod:`udrl_proto.access`).
-        limit: the most bytes that a request may have; of an episode the run knows better.
-        reply_limit: the most bytes that a reply may have.
-        is_bulk: its questions are many and large, and wait for all others.
+        name: the verb in keys.
+        request: message type of the request.
+        reply: message type of the reply; a refusal is a :class:`udrl_proto.messages.Problem`.
+        askers: roles that may send it (:mod:`udrl_proto.access`).
+        limit: largest request, bytes; for episodes each run computes a lower limit.
+        reply_limit: largest reply, bytes.
+        is_bulk: whether its requests are many and large, and have low priority.
     """
 
     name: str
@@ -95,5 +95,5 @@ BY_NAME = {verb.name: verb for verb in VERBS}
 
 
 def asked_by(role: str) -> Iterable[str]:
-    """Return the names of the verbs that a role may ask."""
+    """Return the names of the verbs that a role may send."""
     return [verb.name for verb in VERBS if role in verb.askers]

@@ -1,4 +1,4 @@
-"""Zenoh as a transport; ``session`` opens its sessions."""
+"""Zenoh as a transport; :mod:`udrl_proto.session` opens its sessions."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -10,22 +10,22 @@ from udrl_proto.transport import Answer, Declaration, Presence, Query
 
 log = logging.getLogger("udrl")
 
-#: How our own errors are told from Zenoh's, such as a timeout.
+#: Encoding of our own error replies, to distinguish them from Zenoh's, such as a timeout.
 _OURS = zenoh.Encoding.APPLICATION_OCTET_STREAM
 
 
 class ZenohTransport:
-    """A Zenoh session.
+    """A transport over a Zenoh session.
 
     Args:
-        session: whose; it is closed by whoever opened it.
+        session: an open session; the caller closes it.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
 
     def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
-        """Yield the answers to a question; Zenoh's own errors are none."""
+        """Yield the replies to a query; Zenoh's own errors are ignored."""
         for reply in self._session.get(
             key,
             payload=data,
@@ -47,7 +47,7 @@ class ZenohTransport:
         )
 
     def publish(self, key: str, data: bytes) -> None:
-        """Put; congestion drops it, which is Zenoh's default."""
+        """Put a sample; it is dropped under congestion, Zenoh's default."""
         self._session.put(key, data)
 
     def subscribe(self, key: str, receive: Callable[[bytes], None]) -> Declaration:
@@ -57,11 +57,11 @@ class ZenohTransport:
         )
 
     def declare_presence(self, key: str) -> Declaration:
-        """Declare a liveliness token, which goes with the process."""
+        """Declare a liveliness token, which ends with the process."""
         return self._session.liveliness().declare_token(key)
 
     def present(self, key: str, timeout_s: float) -> list[str]:
-        """Ask for liveliness tokens."""
+        """Query liveliness tokens."""
         replies = self._session.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
@@ -92,7 +92,7 @@ class _ZenohQuery:
                 else:
                     self._query.reply(self._key, answer.data)
         except zenoh.ZError as error:
-            log.debug("an answer on %s could not be sent: %s", self._key, error)
+            log.debug("a reply on %s could not be sent: %s", self._key, error)
 
     def drop(self) -> None:
         self._query.drop()

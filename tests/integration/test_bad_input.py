@@ -77,7 +77,7 @@ def test_endpoint_that_nobody_answers_is_reported(role: str, cli: Callable[..., 
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     code, error = refusal(cli(role, "--connect", endpoint))
     assert code == 6
-    assert f"nobody answers at '{endpoint}'" in error
+    assert f"no reply from '{endpoint}'" in error
 
 
 def test_run_directory_with_a_run_is_not_overwritten(

@@ -201,7 +201,7 @@ def test_replay_service_that_does_not_come_is_told() -> None:
         "learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3", image=LEARNER_IMAGE
     )
     assert code == 6
-    assert "nobody answers at 'tcp/127.0.0.1:7447' after 3 s; start `udrl replay" in log
+    assert "no reply from 'tcp/127.0.0.1:7447' after 3 s; start `udrl replay" in log
 
 
 def test_learner_without_torch_is_told() -> None:

@@ -162,7 +162,7 @@ def test_service_that_starts_later_is_found(
 
 def test_patience_ends(client: zenoh.Session) -> None:
     asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
-    with pytest.raises(Unreachable, match=r"^learner l asked .* of run for 'state' and got no"):
+    with pytest.raises(Unreachable, match=r"^learner l got no reply to 'state' from .* of run in"):
         asker.ask(verbs.STATE, REQUEST)
 
 
@@ -191,7 +191,7 @@ def test_asking_can_be_stopped(client: zenoh.Session) -> None:
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(lambda: asker.ask(verbs.STATE, REQUEST))
         stop.set()
-        with pytest.raises(Interrupted, match="learner l was stopped while asking for 'state'"):
+        with pytest.raises(Interrupted, match="learner l was stopped while waiting for 'state'"):
             future.result(WAIT_S)
 
 

@@ -145,7 +145,7 @@ def packed(**fields: Any) -> bytes:
         (packed(actor="a", wanted=1, running=[-1]), CommandsRequest, "`$.running[0]`"),
         (b"\x81\x01\x02", HelloRequest, "not MessagePack"),  # a key that is a number
         (b"\x81\xc4\x07version\x02", WeightsRequest, "Expected `str`"),  # a key that is bytes
-        (b"\x82\xa7version\x02\xa7version\x03", WeightsRequest, "a key twice"),
+        (b"\x82\xa7version\x02\xa7version\x03", WeightsRequest, "duplicate key"),
         (b"\x81\xa7version\xa1\xff", WeightsRequest, "not MessagePack"),  # not UTF-8
         (b"\x81\xa7version\xd4\x01\x00", WeightsRequest, "max_ext_len"),
         (b"\x81\xa7version\xc7\x00\x01", WeightsRequest, "`$.version`"),  # an empty extension

@@ -73,7 +73,7 @@ def test_certificate_of_another_authority_is_named(folder: Path, foreign_keys_di
 
 
 def test_certificate_of_another_role_is_named(folder: Path) -> None:
-    with pytest.raises(ConfigError, match=r"for the role 'actor', 'learner' is needed.*folder"):
+    with pytest.raises(ConfigError, match=r"for the role 'actor', expected 'learner'.*folder"):
         load(folder, "learner")
 
 
@@ -90,8 +90,8 @@ def _from_tomorrow(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (_until_a_minute_ago, "expired at 20.*UTC; make new keys"),
-        (_from_tomorrow, "valid from 20.*clock here says 20.*set it right"),
+        (_until_a_minute_ago, "expired at 20.*UTC; create new keys"),
+        (_from_tomorrow, "valid from 20.*clock here says 20.*correct the clock"),
     ],
 )
 def test_certificate_that_is_not_valid_now_is_named(

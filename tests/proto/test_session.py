@@ -39,7 +39,7 @@ def test_endpoint_is_returned_as_it_came(endpoint: str) -> None:
 def test_endpoint_of_the_other_kind_is_refused_with_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"'tls/a:1' needs keys; add --keys DIR"):
         sessions.check_endpoint("tls/a:1")
-    with pytest.raises(ConfigError, match=r"'tcp/a:1' would not .* give it as tls/a:1$"):
+    with pytest.raises(ConfigError, match=r"'tcp/a:1' would ignore .* use tls/a:1$"):
         sessions.check_endpoint("tcp/a:1", secure=True)
 
 
@@ -116,7 +116,7 @@ def test_address_of_another_machine_is_named(host: str) -> None:
 
 def test_nobody_at_an_endpoint_is_said_in_time(endpoint: str) -> None:
     began = time.monotonic()
-    with pytest.raises(Unreachable, match=rf"nobody answers at '{endpoint}'.*--listen {endpoint}"):
+    with pytest.raises(Unreachable, match=rf"no reply from '{endpoint}'.*--listen {endpoint}"):
         sessions.connect(endpoint, patience_s=0.2)
     assert time.monotonic() - began < 3.0
 
@@ -199,7 +199,7 @@ def test_run_among_several_is_found_by_name(served: zenoh.Session, client: zenoh
 
 def test_several_runs_are_named_when_none_was(served: zenoh.Session, client: zenoh.Session) -> None:
     serve(served, "two", encode(hello("two")))
-    with pytest.raises(ConfigError, match=r"one, two; name one.*--run"):
+    with pytest.raises(ConfigError, match=r"one, two; choose one.*--run"):
         sessions.find_run(client, None, patience_s=5.0)
 
 
@@ -210,7 +210,7 @@ def test_missing_run_is_said_in_time(
     if run_id:
         serve(router, "one", encode(hello("one")))
     began = time.monotonic()
-    with pytest.raises(Unreachable, match=rf"^{named} answers after .*--run"):
+    with pytest.raises(Unreachable, match=rf"^{named} replied in .*--run"):
         sessions.find_run(client, run_id, patience_s=0.1)
     assert time.monotonic() - began < 3.0
 
