@@ -162,7 +162,7 @@ def plain(page: str) -> str:
         ),
         (
             "proto/README.md",
-            f"has up to {WORDS[outbox._LINES]} `episode` or `failure` requests in flight",
+            f"has up to {WORDS[outbox._THREADS]} `episode` or `failure` requests in flight",
         ),
         ("proto/README.md", f"sends nothing for {dealing.SILENCE_S:.0f} s"),
         ("proto/README.md", f"{dealing.MOST_ACTORS:,} actors have joined"),

@@ -82,18 +82,18 @@ def emptied(outbox: Outbox) -> Callable[[], bool]:
 
 def test_small_ones_go_together_and_all_arrive_once(replay: ReplayService, outbox: Outbox) -> None:
     outbox.put(episode(i) for i in range(20))
-    at_once = replay.next(outboxes._LINES)
-    assert at_once == set(range(outboxes._LINES))
+    at_once = replay.next(outboxes._THREADS)
+    assert at_once == set(range(outboxes._THREADS))
     assert replay.came.empty()
     assert len(outbox) == 20
     replay.may_answer.release(20)
-    assert replay.next(20 - outboxes._LINES) == set(range(20)) - at_once
+    assert replay.next(20 - outboxes._THREADS) == set(range(20)) - at_once
     wait_for(emptied(outbox), "the last acknowledgement")
     assert replay.came.empty()
 
 
 def test_large_ones_go_one_after_another(replay: ReplayService, outbox: Outbox) -> None:
-    large = outboxes._BYTES_UNDER_WAY + 1
+    large = outboxes._BYTES_IN_TRANSIT + 1
     outbox.put([episode(0, large), episode(1, large), episode(2)])
     for expected in range(3):
         assert replay.next(1) == {expected}
@@ -103,7 +103,7 @@ def test_large_ones_go_one_after_another(replay: ReplayService, outbox: Outbox) 
 
 
 def test_small_one_goes_beside_one_that_leaves_room(replay: ReplayService, outbox: Outbox) -> None:
-    outbox.put([episode(0, outboxes._BYTES_UNDER_WAY - 100), episode(1), episode(2)])
+    outbox.put([episode(0, outboxes._BYTES_IN_TRANSIT - 100), episode(1), episode(2)])
     assert replay.next(2) == {0, 1}
     assert replay.came.empty()
     replay.may_answer.release()
@@ -120,7 +120,7 @@ def test_what_a_delivery_raises_is_told(replay: ReplayService, outbox: Outbox) -
 
 
 def test_closed_one_begins_nothing(replay: ReplayService, outbox: Outbox) -> None:
-    outbox.put([episode(0, outboxes._BYTES_UNDER_WAY), episode(1)])
+    outbox.put([episode(0, outboxes._BYTES_IN_TRANSIT), episode(1)])
     assert replay.next(1) == {0}
     outbox.close()
     replay.may_answer.release()

@@ -1,1 +1,1 @@
-"""The actor: runs Algorithm 2 with the commands it is given; holds nothing worth saving."""
+"""The actor: runs Algorithm 2 with the commands it is given; has no persistent state."""

@@ -1,4 +1,4 @@
-"""The actor service: obey commands in many environments at once until the run ends."""
+"""The actor service: runs commands in many environments at once until the run ends."""
 
 import faulthandler
 import logging
@@ -24,10 +24,10 @@ from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
-#: How often the watchdog is told that all is well, as a part of its patience: it starts a thread
-#: each time, which at four times a second took 2 % of an actor's time.
+#: Interval at which the watchdog is re-armed, as a fraction of its timeout. Each time starts a
+#: thread; four times a second took 2 % of an actor's time.
 _REARM_PART = 0.05
-#: Seconds that making an environment, and the probe, may take at least.
+#: Least timeout for creating an environment, and for the probe, seconds.
 _MAKING_S = 300.0
 
 
@@ -36,13 +36,14 @@ class ActorService:
 
     Args:
         transport: reaches the run.
-        hello: the run's specification.
+        hello: the run specification.
         name: unique to this process.
-        environments: how many to step at once.
-        stop: ends everything.
-        hang_s: end the whole process, from outside Python, when a round of environment steps takes
-            so many seconds (five minutes at least for making an environment); None: do not.
-        first_index: of its environments (:data:`udrl.environments.making.INDEX`).
+        environments: number of environments to step at once.
+        stop: ends the service.
+        hang_s: watchdog timeout, seconds: the process is ended, from outside Python, if one step of
+            all environments takes longer (creating an environment has at least five minutes); None:
+            no watchdog.
+        first_index: index of its first environment (:data:`udrl.environments.making.INDEX`).
     """
 
     def __init__(
@@ -67,13 +68,13 @@ class ActorService:
         """Act until the run ends or ``stop`` is set.
 
         Raises:
-            UnsupportedEnvironment: this machine cannot make the run's environment.
-            Refused: the run does not want this actor.
-            Unreachable: the replay service has not answered for long.
+            UnsupportedEnvironment: this machine cannot create the run's environment.
+            Refused: the run does not accept this actor.
+            Unreachable: the replay service has not replied for too long.
         """
         config, run_id = self._hello.config, self._hello.run_id
         generator = EpisodeGenerator(config, self._environments, self._make, self._first_index)
-        self._arm(_MAKING_S)  # for the probe, which is many steps
+        self._arm(_MAKING_S)  # the probe is many steps
         asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
@@ -112,7 +113,7 @@ class ActorService:
             generator.close()
 
     def _act(self, generator: EpisodeGenerator, courier: Courier, outbox: Outbox) -> None:
-        """Step environments; rest while as many episodes as these wait for delivery."""
+        """Step environments; pause while as many episodes as environments await delivery."""
         self._arm()
         outcomes: list[Episode | Failure] = []
         steps = running = 0
@@ -140,7 +141,7 @@ class ActorService:
         courier.join(timeout=5.0)
 
     def _make(self, config: Config) -> Environment:
-        """Make an environment, which may take longer than a step: simulators have to start."""
+        """Create an environment, which may take longer than a step: simulators have to start."""
         self._arm(_MAKING_S)
         env = make_environment(config)
         self._arm()

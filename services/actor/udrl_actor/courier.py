@@ -1,6 +1,6 @@
-"""The actor's messenger: a thread that fetches commands and the weights that they name.
+"""A thread of the actor that fetches commands and the weights that they name.
 
-The loop that steps environments never waits for the network while it has something to do.
+The loop that steps environments never waits for the network while it has commands to run.
 """
 
 import logging
@@ -27,21 +27,21 @@ log = logging.getLogger("udrl")
 
 
 class Assignment(NamedTuple):
-    """A command and the behavior function to obey it with; None: act at random."""
+    """A command and the behavior function to run it with; None: random actions."""
 
     command: Command
     behavior: ActingFunction | None
 
 
 class Courier(threading.Thread):
-    """Asks the replay service for work for one actor.
+    """Fetches one actor's commands from the replay service.
 
     Args:
         transport: reaches the run.
-        hello: the run's specification.
-        join: who the actor is.
-        asker: its line to the replay service.
-        stop: ends everything.
+        hello: the run specification.
+        join: the actor's request to join.
+        asker: sends the actor's requests to the replay service.
+        stop: ends the thread.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class Courier(threading.Thread):
     # Called by the loop that steps environments.
 
     def take(self, free: int, steps: int, *, wait_s: float) -> list[Assignment]:
-        """Take assignments for environments that have nothing to do.
+        """Return and remove assignments for idle environments.
 
         Args:
-            free: how many have nothing to do.
+            free: number of idle environments.
             steps: env steps made since the last call.
-            wait_s: seconds to wait for news when there are no assignments.
+            wait_s: seconds to wait if there are no assignments.
         """
         with self._changed:
             self._free = free
@@ -95,17 +95,17 @@ class Courier(threading.Thread):
         """Whether :meth:`take` would return assignments at once."""
         return bool(self._assignments)
 
-    # Called by the lines of the outbox.
+    # Called by the threads of the outbox.
 
     def note_acknowledged(self, command_id: int) -> None:
-        """Note that a command's outcome is acknowledged, so that there may be new ones."""
+        """Note that a command's outcome is acknowledged; there may be new commands."""
         with self._changed:
             self._held.discard(command_id)
             self._acknowledged = True
             self._changed.notify_all()
 
     def fail(self, error: Exception) -> None:
-        """Have the loop that steps environments raise an error."""
+        """Make the loop that steps environments raise an error."""
         with self._changed:
             self.error = error
             self._changed.notify_all()
@@ -116,7 +116,7 @@ class Courier(threading.Thread):
     # The courier's own thread.
 
     def run(self) -> None:
-        """Fetch until the run ends, ``stop`` is set, or the replay service says no."""
+        """Fetch until the run ends, ``stop`` is set, or the replay service refuses."""
         key = key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS)
         subscriber = self._transport.subscribe(key, self._behaviors.note)
         try:
@@ -150,12 +150,12 @@ class Courier(threading.Thread):
 
     @property
     def _has_news(self) -> bool:
-        """Whether there may be commands that were not there when it was asked last."""
+        """Whether there may be new commands since the last request."""
         return self._behaviors.is_announced or self._acknowledged
 
     def _fetch(self, wanted: int, rate: float) -> float:
-        """Ask for commands; return when to ask again at the earliest."""
-        self._behaviors.learn_announced()
+        """Request commands; return the earliest time of the next request."""
+        self._behaviors.decode_announced()
         with self._changed:
             running = tuple(sorted(self._held))
         request = CommandsRequest(
@@ -180,13 +180,13 @@ class Courier(threading.Thread):
         return time.monotonic() + (reply.wait.retry_after_s if reply.wait else 0.0)
 
     def _assignment(self, command: Command) -> Assignment | None:
-        """Return a command with its weights; None when they are gone, and the command with them."""
+        """Return a command with its weights; None if they are gone, so it is no longer needed."""
         try:
             return Assignment(command, self._behaviors.of(command.weights_version))
         except Refused as refusal:
             if refusal.code != "unknown_version":
                 raise
-            log.info("command %d is dropped: %s", command.id, refusal)
+            log.info("command %d is discarded: %s", command.id, refusal)
             with self._changed:
                 self._held.discard(command.id)
             return None

@@ -1,8 +1,8 @@
-"""What an actor has made and the replay service has not acknowledged, on several lines at once.
+"""Delivers an actor's outcomes with several threads until the replay service acknowledges them.
 
-With one line the next episode would wait for the answer to the last: on a way of 20 ms, there and
-back, fifty a second. Large episodes go one after another all the same, since they fill a slow
-link, and an answer that is late is asked for again.
+A single thread would wait for each reply before the next episode: with a round-trip time of 20 ms,
+fifty episodes a second. Large episodes are still sent one at a time, since in parallel they would
+delay each other's replies on a slow link until requests time out and are sent again.
 """
 
 import logging
@@ -20,24 +20,24 @@ from udrl_proto.messages import FailureMessage, JoinRequest
 
 log = logging.getLogger("udrl")
 
-_LINES = 8
-#: Bytes of observations that may be under way together; a larger episode is under way alone.
-_BYTES_UNDER_WAY = 256 * 1024
-#: Seconds after which a line looks whether it was closed meanwhile.
+_THREADS = 8
+#: Most bytes of observations in transit at once; a larger episode is sent alone.
+_BYTES_IN_TRANSIT = 256 * 1024
+#: Interval at which a waiting thread checks whether the outbox is closed, seconds.
 _LOOK_S = 0.5
 
 
 def deliver(asker: Asker, join: JoinRequest, outcome: Episode | Failure) -> int:
-    """Deliver what came of a command; return the command's id when that is acknowledged.
+    """Deliver the outcome of a command; return the command's id when that is acknowledged.
 
     Args:
-        asker: the actor's line to the replay service.
-        join: who the actor is.
-        outcome: of the command.
+        asker: sends the actor's requests to the replay service.
+        join: the actor's request to join.
+        outcome: the command's episode or failure.
 
     Raises:
-        Refused: the replay service cannot read it, so it could not read the next one either.
-        Unreachable: nobody has answered for long.
+        Refused: the replay service refuses the actor or cannot read its messages.
+        Unreachable: the replay service has not replied for too long.
     """
     if isinstance(outcome, Failure):
         command_id = outcome.command.id
@@ -56,12 +56,12 @@ def deliver(asker: Asker, join: JoinRequest, outcome: Episode | Failure) -> int:
 
 
 class Outbox:
-    """Delivers in threads of its own, in no certain order.
+    """Delivers outcomes in its own threads, in no particular order.
 
     Args:
-        name: whose it is.
+        name: prefix of the threads' names.
         deliver: returns when an outcome is acknowledged.
-        failed: is told of what ``deliver`` raises, which ends that line.
+        failed: called with an exception of ``deliver``, which ends that thread.
     """
 
     def __init__(
@@ -74,25 +74,25 @@ class Outbox:
         self._failed = failed
         self._changed = threading.Condition()
         self._waiting: deque[Episode | Failure] = deque()
-        self._under_way = 0
+        self._in_transit = 0
         self._bytes = 0
         self._closed = False
-        for line in range(_LINES):
-            threading.Thread(target=self._work, name=f"{name}, line {line}", daemon=True).start()
+        for i in range(_THREADS):
+            threading.Thread(target=self._work, name=f"{name}, {i}", daemon=True).start()
 
     def __len__(self) -> int:
-        """Return how many are not acknowledged."""
-        return len(self._waiting) + self._under_way
+        """Return the number of outcomes that are not acknowledged."""
+        return len(self._waiting) + self._in_transit
 
     def put(self, outcomes: Iterable[Episode | Failure]) -> None:
-        """Have outcomes delivered."""
+        """Queue outcomes for delivery."""
         with self._changed:
             before = len(self._waiting)
             self._waiting.extend(outcomes)
             self._changed.notify(len(self._waiting) - before)
 
     def close(self) -> None:
-        """Begin no more deliveries; what is under way is not waited for."""
+        """Start no more deliveries; those in transit are not waited for."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -105,19 +105,19 @@ class Outbox:
                 self._failed(error)
                 return
             with self._changed:
-                self._under_way -= 1
+                self._in_transit -= 1
                 self._bytes -= _size(outcome)
                 self._changed.notify(len(self._waiting))
 
     def _next(self) -> Episode | Failure | None:
-        """Return the next to deliver when there is room on the way; None: closed."""
+        """Wait for the next outcome that may be sent and return it; None: closed."""
         with self._changed:
             while not self._closed:
                 if self._waiting:
                     together = self._bytes + _size(self._waiting[0])
-                    if not self._under_way or together <= _BYTES_UNDER_WAY:
+                    if not self._in_transit or together <= _BYTES_IN_TRANSIT:
                         outcome = self._waiting.popleft()
-                        self._under_way += 1
+                        self._in_transit += 1
                         self._bytes = together
                         return outcome
                 self._changed.wait(_LOOK_S)

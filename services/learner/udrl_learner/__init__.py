@@ -1,1 +1,1 @@
-"""The learner: trains the behavior function on the replay's episodes, broadcasts the weights."""
+"""The learner: trains the behavior function on the replay buffer and publishes the weights."""

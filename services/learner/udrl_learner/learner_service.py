@@ -1,10 +1,10 @@
-"""The learner service: take the buffer, train a version, deliver it, announce it; again.
+"""The learner service: fetch the buffer, train a version, deliver it, publish it; repeat.
 
-While a version is trained, the one before is delivered, and the buffer for the one after is
+While a version is trained, the previous one is delivered, and the buffer for the next one is
 fetched as soon as its iteration is complete.
 
-It keeps no files. A learner that starts, or that finds itself out of step with the replay service,
-takes the latest version from there and goes on; what it trains is the same either way.
+The learner keeps no files. When it starts, or is out of step with the replay service, it continues
+from the latest version there; the trained weights are the same either way.
 """
 
 import logging
@@ -41,13 +41,13 @@ from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
-#: Episodes that are asked for at once; a page holds fewer, usually.
+#: Episodes in one request; the reply usually has fewer.
 _ASK_FOR = 10_000
 
-#: Pauses before a learner that did not get on begins again, seconds; after the last it ends.
+#: Pauses before the restarts of a learner without progress, seconds; after the last it gives up.
 _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 
-#: Seconds after which a wait for the replay service looks whether it is still of use.
+#: Interval at which a wait for the buffer checks the delivery and ``stop``, seconds.
 _LOOK_S = 0.5
 
 
@@ -55,8 +55,8 @@ class Buffer(NamedTuple):
     """The replay buffer after an iteration.
 
     Attributes:
-        ids: of its episodes, by rank.
-        new: those that were not held before.
+        ids: ids of its episodes, by rank.
+        new: the episodes that the learner did not have yet.
     """
 
     ids: tuple[int, ...]
@@ -68,9 +68,9 @@ class LearnerService:
 
     Args:
         transport: reaches the run.
-        hello: the run's specification.
+        hello: the run specification.
         name: unique to this learner.
-        stop: ends everything.
+        stop: ends the service.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class LearnerService:
         """Train until the run ends or ``stop`` is set.
 
         Raises:
-            Refused: the run does not want this learner, or has it start over without end.
-            Unreachable: the replay service has not answered for long.
+            Refused: the run does not accept this learner, or restarts bring no progress.
+            Unreachable: the replay service has not replied for too long.
         """
         run_id = self._hello.run_id
         declared: list[Any] = []
@@ -117,7 +117,7 @@ class LearnerService:
 
     @cached_property
     def _join(self) -> JoinRequest:
-        """Who this learner is."""
+        """The request to join."""
         return JoinRequest(
             role="learner",
             id=self._name,
@@ -128,10 +128,10 @@ class LearnerService:
         )
 
     def _train_until_ended(self) -> None:
-        """Train from the latest version that there is, and again whenever that is another one.
+        """Train from the latest version; start over whenever the replay service expects another.
 
         Raises:
-            Refused: as often as there are pauses, the run had not got on when it began again.
+            Refused: there was no progress in as many restarts as there are pauses.
         """
         began_with, in_vain = -1, 0
         while True:
@@ -147,26 +147,26 @@ class LearnerService:
             if in_vain > len(_PAUSES_S):
                 raise Refused(
                     refusal.code,
-                    f"learner {self._name} began again {in_vain} times with weights version "
-                    f"{began_with} and got no further: {refusal}; the replay service contradicts "
-                    f"itself: stop it, and start it again with --resume",
+                    f"learner {self._name} restarted {in_vain} times from weights version "
+                    f"{began_with} without progress: {refusal}; the replay service is "
+                    f"inconsistent: stop it and restart it with --resume",
                 )
             if in_vain:
                 self._stop.wait(_PAUSES_S[in_vain - 1])
 
     def _latest(self) -> TrainingState:
-        """Return the state to go on from: the replay service's latest version."""
+        """Return the state of the replay service's latest version."""
         request = StateRequest(learner=self._name)
         reply = self._asker.ask(verbs.STATE, request)
         if reply.version == 0:
             return untrained(self._config, self._spec)
-        log.info("learner %s goes on from weights version %d", self._name, reply.version)
+        log.info("learner %s continues from weights version %d", self._name, reply.version)
         return decode_state(reply.version, reply.weights, reply.optimizer, self._config, self._spec)
 
     def _train_from(self, state: TrainingState) -> Refused | None:
         """Train version after version until the run has ended.
 
-        Returns what the replay service said if it expects another version than the next one here.
+        Returns the refusal if the replay service expects a version other than the next one here.
         """
         experience = Experience(self._config, self._spec)
         useless = threading.Event()
@@ -198,7 +198,7 @@ class LearnerService:
     def _result(
         self, fetched: "Future[Buffer | None]", delivered: "Future[None] | None"
     ) -> Buffer | None:
-        """Return what was fetched, unless the delivery before it fails."""
+        """Wait for the buffer; raise earlier if the delivery fails meanwhile."""
         pending: list[Future[Any]] = [fetched] if delivered is None else [fetched, delivered]
         while not fetched.done() and not self._stop.is_set():
             wait(pending, _LOOK_S, FIRST_COMPLETED)
@@ -208,7 +208,7 @@ class LearnerService:
         return fetched.result()
 
     def _take(self, experience: Experience, buffer: Buffer) -> None:
-        """Make ``experience`` hold exactly the episodes of the buffer."""
+        """Update ``experience`` to the episodes of the buffer."""
         for gone in experience.ids() - set(buffer.ids):
             experience.remove(gone)
         for episode in buffer.new:
@@ -224,15 +224,15 @@ class LearnerService:
             train_s=train_s,
         )
 
-    # In threads beside the training.
+    # Called in threads, in parallel with training.
 
     def _fetch(self, version: int, held: set[int], useless: threading.Event) -> Buffer | None:
-        """Return the buffer that a version is trained on, once it is there; None: never.
+        """Wait for the buffer that a version is trained on; None: the run or the wait has ended.
 
         Args:
-            version: to be trained.
+            version: the version to train.
             held: ids of episodes that need not be fetched.
-            useless: nobody waits for it any more.
+            useless: ends the wait.
         """
         while not useless.is_set():
             self._progress.clear()
@@ -259,8 +259,8 @@ class LearnerService:
     def _deliver(self, message: VersionMessage) -> None:
         self._asker.ask_joined(verbs.VERSION, message, self._join)
         self._delivered = True
-        # Not acknowledged: one stopped actor must not stall training, and whoever misses
-        # this asks the replay service.
+        # Without acknowledgement, so that a stopped actor cannot stall training. An actor that
+        # misses this requests the weights from the replay service.
         announcement = encode(Weights(version=message.version, weights=message.weights))
         self._transport.publish(
             key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS), announcement
