@@ -246,12 +246,12 @@ def _measure(run: DisturbedRun, fault: Fault, start: float, end: float) -> Injec
     found = Injection()
     gone = "actor|learner" if "replay" in fault.lose else "|".join(fault.lose)
     waits = "has been waiting|waiting for a replay service"
-    pattern = waits if "replay" in fault.lose else rf"^({gone}) \S+ left"
+    pattern = waits if "replay" in fault.lose else rf"^({gone}) \S+ disconnected"
     lines = [x for x in run.lines(pattern, start) if x.at < end + _NOTICED_S]
     if fault.lose and lines:
         found.detected, found.reported_by = lines[0].at - start, lines[0].service.split("-")[0]
     peers = 1 if fault.name in ("kill actor", "stop actor") else len(run.children(*gone.split("|")))
-    back = run.lines(rf"^({gone}) \S+ is here", end) if gone else []
+    back = run.lines(rf"^({gone}) \S+ connected", end) if gone else []
     if back:
         found.reconnected = back[min(peers, len(back)) - 1].at - end
     after = [m for m in run.moments if m.at > end]

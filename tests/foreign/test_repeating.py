@@ -66,7 +66,7 @@ def test_run_of_an_unseeded_environment_goes_on_with_other_actors(tmp_path: Path
 @pytest.mark.parametrize(
     ("kind", "says"),
     [
-        (Changing, "its first steps are others"),
+        (Changing, "its first steps differ"),
         (ChangingLate, r"in episode \d+ the reward of step 7\d is 10, it was 1"),
     ],
 )

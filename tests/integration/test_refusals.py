@@ -123,12 +123,12 @@ def test_first_that_delivers_says_how_all_must_round(hosted: Hosted) -> None:
     hosted.join("actor", "one", "of one")
     assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
     of_two = msgspec.structs.replace(EPISODE, actor="two", command_id=4)
-    with pytest.raises(Refused, match=r"class of one, this machine like of two,") as no:
+    with pytest.raises(Refused, match=r"class of one, this machine has of two,") as no:
         hosted.asker.ask(verbs.EPISODE, of_two)
     assert no.value.code == "other_numerics"
     with pytest.raises(Refused, match="actor two has not joined"):
         hosted.asker.ask(verbs.EPISODE, of_two)
-    with pytest.raises(Refused, match=r"class of one, this machine like [0-9a-f]{16},"):
+    with pytest.raises(Refused, match=r"class of one, this machine has [0-9a-f]{16},"):
         ActorService(hosted.transport, hosted.hello, "three", 1, hosted.stop).run()
     assert hosted.status().exact
     assert_conserved(hosted.status())

@@ -51,17 +51,19 @@ def test_there_is_no_advice_without_need(run: StoredRun, best: float | None) -> 
     ("network", "warm_up", "expected"),
     [
         ({}, {}, "too little data: give it more env steps"),
-        ({"return_scale": 0.001}, {}, "return_scale = 0.001: it makes 0.022 of returns of 22, "
-         "usual in the warm-up, and the network needs the order of 1; try return_scale = auto"),
-        ({"return_scale": 1.0}, {}, "return_scale = 1: it makes 22 of returns of 22"),
-        ({"horizon_scale": 0.5}, {}, "horizon_scale = 0.5: it makes 50 of lengths of 100"),
+        ({"return_scale": 0.001}, {}, "return_scale = 0.001: it scales the warm-up's typical "
+         "returns of 22 to 0.022, but the network needs values around 1; try return_scale = auto"),
+        ({"return_scale": 1.0}, {},
+         "return_scale = 1: it scales the warm-up's typical returns of 22 to 22"),
+        ({"horizon_scale": 0.5}, {},
+         "horizon_scale = 0.5: it scales the warm-up's typical lengths of 100 to 50"),
         # Returns that cancel out are not small.
         ({}, {"explored_return": 0.0}, "too little data: give it more env steps"),
         ({}, {"return_min": 0.0, "return_max": 0.0, "explored_return": 0.0},
-         "too little data: all of the warm-up returned the same"),
+         "too little data: all warm-up episodes have the same return"),
         # Of a thousand the buffer may hold the best only, which are alike.
         ({}, {"return_min": 1.0, "return_max": 1.0, "explored_return": 0.1},
-         "return_scale = 0.05: it makes 0.005 of returns of 0.1"),
+         "return_scale = 0.05: it scales the warm-up's typical returns of 0.1 to 0.005"),
     ],
 )  # fmt: skip
 def test_the_most_likely_cause(

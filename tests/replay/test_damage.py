@@ -104,7 +104,7 @@ def test_changed_weights_are_noticed(blob: str, written: Path) -> None:
     edit(written, f"UPDATE versions SET {blob} = ? WHERE version = 1000", changed)
     with closing(Store(written.parent)) as store:
         assert store.version(1) is not None
-        with pytest.raises(DamagedStore, match=f"{written}: weights version 1000 is not what was"):
+        with pytest.raises(DamagedStore, match=f"{written}: weights version 1000 does not match"):
             store.version(1000)
 
 
@@ -124,7 +124,7 @@ def test_changed_episode_is_noticed(written: Path) -> None:
     edit(written, "UPDATE bodies SET body = x'00' WHERE id = ?", 10**9)
     with (
         closing(Store(written.parent)) as store,
-        pytest.raises(DamagedStore, match=f"{written}: episode {10**9} is not what was written"),
+        pytest.raises(DamagedStore, match=f"{written}: episode {10**9} does not match"),
     ):
         store.episode_bodies([10**9], LARGEST)
 
@@ -132,14 +132,14 @@ def test_changed_episode_is_noticed(written: Path) -> None:
 @pytest.mark.parametrize(
     ("statement", "complaint"),
     [
-        ("DELETE FROM facts WHERE name = 'hello'", "table facts has 3 rows, not the 4 that were"),
+        ("DELETE FROM facts WHERE name = 'hello'", "table facts has 3 rows that do not match"),
         ("DELETE FROM facts WHERE name = 'tallies'", "fact 'tallies' is missing in table facts"),
         ("UPDATE versions SET weights = NULL WHERE version = 1000", "table versions has "),
         ("UPDATE versions SET optimizer = NULL WHERE version = 1000", "table versions has "),
-        ("UPDATE facts SET value = '{' WHERE name = 'progress'", "name 'progress' of facts is not"),
-        ("INSERT INTO commands VALUES (7, 0, x'c1', x'')", "id 7 of commands is not what was"),
-        ("UPDATE commands SET cancelled = 1 - cancelled", " of commands is not what was written"),
-        ("UPDATE episodes SET admitted = admitted + 1", " of episodes is not what was"),
+        ("UPDATE facts SET value = '{' WHERE name = 'progress'", "name 'progress' of facts does"),
+        ("INSERT INTO commands VALUES (7, 0, x'c1', x'')", "id 7 of commands does not match"),
+        ("UPDATE commands SET cancelled = 1 - cancelled", " of commands does not match its seal"),
+        ("UPDATE episodes SET admitted = admitted + 1", " of episodes does not match"),
         ("DROP TABLE episodes", "no such table: episodes"),
     ],
 )
@@ -162,7 +162,7 @@ def test_value_that_became_another_one_is_noticed(table: str, column: str, writt
         f"WHEN 'blob' THEN x'00' ELSE ifnull({column}, 0) + 77777 END "
         f"WHERE {key} = (SELECT min({key}) FROM {table})",
     )
-    with pytest.raises(DamagedStore, match=f"{key} .* of {table} is not what was written; restore"):
+    with pytest.raises(DamagedStore, match=f"{key} .* of {table} does not match its seal; restore"):
         read_everything(written.parent)
 
 
@@ -229,7 +229,7 @@ def test_table_that_is_as_it_was_before_is_noticed(tmp_path: Path) -> None:
         work_on(store)
     edit(file, "DELETE FROM commands")
     edit(file, "INSERT INTO commands SELECT * FROM before")
-    with pytest.raises(DamagedStore, match="table commands has 3 rows, not the 3 that were writt"):
+    with pytest.raises(DamagedStore, match="table commands has 3 rows that do not match the 3"):
         Store(tmp_path)
 
 

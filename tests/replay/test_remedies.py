@@ -45,7 +45,7 @@ def test_too_many_open_files_are_named_and_not_the_disk(tmp_path: Path) -> None:
 
 def test_full_disk_is_named(tmp_path: Path) -> None:
     error = unwritable(tmp_path / "file", OSError(28, "No space left on device"))
-    assert "No space left on device; free some disk space, and start again with" in str(error)
+    assert "No space left on device; free some disk space, and restart with" in str(error)
 
 
 def test_service_that_runs_needs_no_more_files(tmp_path: Path) -> None:

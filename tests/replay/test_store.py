@@ -37,7 +37,7 @@ def test_creation_that_fails_leaves_no_run(tmp_path: Path, monkeypatch: pytest.M
         raise OSError("no space left")
 
     monkeypatch.setattr(Path, "rename", rename)
-    with pytest.raises(StoreError, match=r"no space left; name one you may write"):
+    with pytest.raises(StoreError, match=r"no space left; use a writable directory"):
         Store.create(tmp_path)
     with pytest.raises(StoreError, match="holds no run"):
         Store(tmp_path)
@@ -55,7 +55,7 @@ def test_existing_run_is_not_overwritten(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StoreError, match=r"run directory .*file/run: .*name one you may write"):
+    with pytest.raises(StoreError, match=r"run directory .*file/run: .*use a writable directory"):
         create(tmp_path / "file" / "run")
 
 
@@ -219,7 +219,7 @@ def test_what_was_never_there_is_none(ask: Callable[[Store], object], store: Sto
 
 
 def test_learner_never_goes_on_from_a_part_of_the_latest_version(store: Store) -> None:
-    with pytest.raises(DamagedStore, match="weights version 3, the latest, is gone"):
+    with pytest.raises(DamagedStore, match="weights version 3, the latest, is missing"):
         store.state(3)
     whole = Version(3, b"digest", 0.25, b"w", b"o")
     with store.transaction():

@@ -1,1 +1,1 @@
-"""The replay service: keeps the top-k episodes, deals commands, paces the run; the only store."""
+"""The replay service: keeps the top-k episodes, deals commands, paces the run; has the store."""

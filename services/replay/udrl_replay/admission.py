@@ -1,9 +1,9 @@
-"""Who may take part in a run: those who have its environment and compute its numbers.
+"""Admission of services: they need the run's environment and its numerics class.
 
 The first actor whose episode is accepted sets the numerics class of the run's actors, the first
-learner whose version is accepted that of its learners. Who merely joins sets nothing, so that a
-service which never delivers keeps nobody away. Whoever delivers must have joined, since only
-then its class is known.
+learner whose version is accepted that of its learners. Joining alone sets nothing, so a service
+that never delivers excludes no other. A service must join before it delivers, since only then its
+class is known.
 """
 
 import msgspec
@@ -13,15 +13,15 @@ from udrl_proto.messages import JoinRequest, Role
 from udrl_replay.dealing import MOST_ACTORS
 from udrl_replay.run import StoredRun
 
-#: Learners that are remembered; the one that has not joined for the longest time goes first.
+#: Most learners remembered; the one whose last join is oldest is forgotten first.
 _MOST_LEARNERS = 1000
 
 
 class Admission:
-    """Lets services take part, or not.
+    """Admits services to a run or refuses them.
 
     Args:
-        run: in what; its dealer knows the actors.
+        run: the run; its dealer knows the actors.
     """
 
     def __init__(self, run: StoredRun) -> None:
@@ -29,11 +29,11 @@ class Admission:
         self._learners: dict[str, str] = {}  # numerics classes by name
 
     def join(self, request: JoinRequest, now: float) -> None:
-        """Let a service take part.
+        """Admit a service.
 
         Raises:
-            Refused: its environment or its numbers are others, it is shut out, or there are too
-                many.
+            Refused: its environment or numerics class differs from the run's, it is quarantined, or
+                there are too many actors.
         """
         run, hello = self._run, self._run.hello
         if request.environment is not None and request.environment != hello.environment:
@@ -56,16 +56,16 @@ class Admission:
         if len(run.dealer.actors) >= MOST_ACTORS:
             raise Refused(
                 "too_many_actors",
-                f"{MOST_ACTORS} actors have joined, which is the most; give fewer actors more "
-                f"environments (--envs)",
+                f"{MOST_ACTORS} actors have joined, the maximum; use fewer actors with more "
+                f"environments each (--envs)",
             )
         run.dealer.join(request, now)
 
     def check(self, role: Role, name: str) -> None:
-        """Make sure that a service takes part, before it is given or brings something.
+        """Check that a service has joined, before it is given or delivers something.
 
         Raises:
-            Refused: it is not known, or another class than its own was set since it joined.
+            Refused: it has not joined, or another numerics class was set since it joined.
         """
         numerics_class = self._class_of(role, name)
         if numerics_class is None:
@@ -77,7 +77,7 @@ class Admission:
             raise
 
     def note_accepted(self, role: Role, name: str) -> None:
-        """Note that something was accepted from a service that was checked."""
+        """Note that a delivery was accepted from a service that was checked."""
         run, field = self._run, _FIELDS[role]
         known, numerics_class = getattr(run.hello, field), self._class_of(role, name)
         if not known:
@@ -87,7 +87,7 @@ class Admission:
             run.mark_inexact(f"{role} {name} is of another numerics class")
 
     def remove_service(self, role: str, name: str) -> None:
-        """Remove a service, and give what an actor held to others."""
+        """Remove a service; an actor's commands are dealt again."""
         if role == "actor":
             self._run.remove_actor(name)
         elif role == "learner":
@@ -100,7 +100,7 @@ class Admission:
         return actor.join.numerics_class if actor else None
 
     def _compare_environments(self, request: JoinRequest) -> None:
-        """Compare what the environments do, where that is more than chance."""
+        """Compare the behavior of the environments, if it is deterministic."""
         hello, found = self._run.hello, request.environment_digest
         if not hello.environment_digest or found == hello.environment_digest:
             return
@@ -108,12 +108,12 @@ class Admission:
             raise Refused(
                 "other_environment",
                 f"the environment {hello.config.environment} gives other observations or rewards "
-                f"on {request.host} than where the run was created (a short episode has the "
-                f"digest {found or 'of nothing'}, not {hello.environment_digest}); install the "
-                f"same version of its package and of what it computes with, or create the run "
-                f"with --allow-inexact",
+                f"on {request.host} than where the run was created (digest of a short episode: "
+                f"{found or 'none'}, expected {hello.environment_digest}); install the same "
+                f"versions of its package and its dependencies, or create the run with "
+                f"--allow-inexact",
             )
-        self._run.mark_inexact(f"the environment of actor {request.id} does something else")
+        self._run.mark_inexact(f"the environment of actor {request.id} behaves differently")
 
     def _compare(self, role: Role, numerics_class: str) -> None:
         hello = self._run.hello
@@ -123,12 +123,11 @@ class Admission:
         library = "onnxruntime" if role == "actor" else "torch"
         raise Refused(
             "other_numerics",
-            f"the run's {role}s round like class {known}, this machine like {numerics_class}, so "
-            f"results would depend on who computes them; use a machine with the same kind of "
-            f"processor and the same versions of {library} and numpy, or create the run with "
-            f"--allow-inexact",
+            f"the run's {role}s have numerics class {known}, this machine has {numerics_class}, so "
+            f"results would depend on the machine; use one with the same kind of processor and the "
+            f"same versions of {library} and numpy, or create the run with --allow-inexact",
         )
 
 
-#: Where the run specification has the class of each role.
+#: Field of the run specification with the numerics class of each role.
 _FIELDS: dict[Role, str] = {"actor": "acting_class", "learner": "training_class"}

@@ -1,4 +1,4 @@
-"""What to look at when a run does not learn."""
+"""Advice for a run that does not learn."""
 
 import math
 
@@ -8,15 +8,15 @@ from udrl.setting_groups import NetworkSettings
 from udrl_proto.reports import IterationStatus
 from udrl_replay.run_state import RunState
 
-#: Share of the budget after which a run should obtain more than random actions do.
+#: Fraction of the budget after which a run should obtain more than random actions do.
 _PATIENCE = 1 / 3
 
 
 def advice(run: RunState) -> str:
-    """Return what most likely keeps a run from learning; empty: it learns, or it is too early.
+    """Return the most likely reason why a run does not learn, and the remedy; else an empty string.
 
-    It does not learn if no evaluation obtains more than the warm-up did, after a third of the
-    budget.
+    A run does not learn if after a third of the budget no evaluation has a higher mean return than
+    the warm-up.
     """
     best = run.progress.best_mean
     if best is None or run.progress.env_steps < _PATIENCE * run.budget.max_env_steps:
@@ -34,14 +34,15 @@ def advice(run: RunState) -> str:
 
 def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
     """Return the most likely reason why a run does not learn, and the remedy."""
-    # The mean size of a return is not stored; this is it where all have one sign, and near it else.
+    # The mean absolute return is not stored. This equals it if all returns have the same sign, and
+    # approximates it otherwise.
     spread = warm_up.return_max - warm_up.return_min
     size = max(abs(warm_up.explored_return), spread / 4)
     length = warm_up.env_steps / warm_up.commands
     if spread == 0 and math.isclose(warm_up.explored_return, warm_up.return_max):
         return (
-            "too little data: all of the warm-up returned the same, so there is nothing to tell "
-            "apart; raise n_warm_up_episodes or warm_up_hold, or begin with a dataset"
+            "too little data: all warm-up episodes have the same return, so there are no better "
+            "ones to learn from; raise n_warm_up_episodes or warm_up_hold, or start with a dataset"
         )
     for name, scale, what, usual in (
         ("return_scale", network.return_scale, "returns", size),
@@ -49,8 +50,8 @@ def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
     ):
         if not fits(scale, usual):
             return (
-                f"{name} = {scale:g}: it makes {scale * usual:.2g} of {what} of {usual:.3g}, usual "
-                f"in the warm-up, and the network needs the order of 1; try {name} = auto"
+                f"{name} = {scale:g}: it scales the warm-up's typical {what} of {usual:.3g} to "
+                f"{scale * usual:.2g}, but the network needs values around 1; try {name} = auto"
             )
     return (
         "too little data: give it more env steps (--max-env-steps), more warm-up episodes "

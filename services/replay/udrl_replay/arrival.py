@@ -1,4 +1,4 @@
-"""Checking an episode that arrives, before the run sees it."""
+"""Checks of a delivered episode, before the run handles it."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from udrl_proto.messages import EpisodeMessage
 
 
 class Arrival(msgspec.Struct, frozen=True, kw_only=True):
-    """An episode that is well formed; whether it is wanted is for the run to say.
+    """A delivered episode that is well formed. The run decides whether to accept it.
 
     Attributes:
-        actor: who sent it.
-        entry: its place in the buffer; the return is computed here, from its rewards.
-        digest: of its content.
-        body: the message, as the store keeps it and the learner gets it.
+        actor: name of the actor that delivered it.
+        entry: its entry in the buffer, with the return computed here from the rewards.
+        digest: digest of its content.
+        body: the encoded message, as stored and sent to the learner.
     """
 
     actor: str
@@ -30,14 +30,14 @@ class Arrival(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Malformed(NamedTuple):
-    """An episode that is not well formed, and who sent it."""
+    """A delivered episode that is not well formed, and the actor that sent it."""
 
     actor: str
     error: InvalidMessage
 
 
 def inspect(message: EpisodeMessage, spec: EnvironmentSpec) -> Arrival:
-    """Return what the run needs to know of an episode.
+    """Check an episode and return what the run needs of it.
 
     Raises:
         InvalidMessage: a shape, dtype, length or value is impossible in this environment.

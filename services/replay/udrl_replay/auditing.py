@@ -1,9 +1,9 @@
-"""Whom to believe: spot checks of what actors deliver.
+"""Audits: spot checks of the episodes that actors deliver.
 
 An episode is a pure function of its command, so another actor of the same numerics class must
-deliver the same bytes. A random share of commands is carried out again by a second actor; where the
-two differ, a third decides. Which commands these are is drawn from the machine's entropy, not from
-the run's streams: who lies must not be able to tell when it is safe. Nothing here changes a result.
+deliver the same bytes. A random share of commands is run again by a second actor; if the two
+episodes differ, a third actor decides. The commands are chosen with the machine's entropy, not the
+run's streams, so that a lying actor cannot predict them. Audits never change a result.
 """
 
 import random
@@ -14,18 +14,18 @@ from typing import NamedTuple
 
 from udrl.commands import Command
 
-#: Audits that are open at once; while there are so many no new ones begin.
+#: Most audits open at once.
 MOST_OPEN = 256
 
 
 @dataclass
 class Audit:
-    """A command that several actors carry out.
+    """A command that is run by several actors.
 
     Attributes:
-        numerics_class: of the actor that delivered it first; the others are of the same.
-        digests: what actors delivered.
-        at: the actor that carries it out now; empty: nobody does.
+        numerics_class: numerics class of the first actor; the others must have the same.
+        digests: digests of the delivered episodes, by actor.
+        at: name of the actor that runs the command now; empty: none.
     """
 
     command: Command
@@ -40,10 +40,10 @@ class Audit:
 
 
 class Verdict(NamedTuple):
-    """What three actors' episodes of one command say.
+    """The result of an audit with three actors.
 
     Attributes:
-        liar: the one that differs from two that agree; None: all three differ.
+        liar: the actor whose episode differs from the two that agree; None: all three differ.
     """
 
     liar: str | None
@@ -51,14 +51,14 @@ class Verdict(NamedTuple):
 
 @dataclass
 class Auditor:
-    """Chooses commands to be carried out again, hands them out, and compares.
+    """Chooses commands to be run again, assigns them to actors, and compares the episodes.
 
-    All of this is memory: audits that are open when the replay service ends are given up.
+    Open audits are only kept in memory, and dropped when the replay service ends.
 
     Attributes:
-        rate: share of the accepted episodes that are checked, 0 to 1.
+        rate: share of the accepted episodes that are audited, 0 to 1.
         draw: returns uniform numbers in [0, 1).
-        open: those that are not decided, by command id.
+        open: undecided audits, by command id.
     """
 
     rate: float = 0.0
@@ -66,20 +66,20 @@ class Auditor:
     open: dict[int, Audit] = field(default_factory=dict)
 
     def maybe_audit(self, command: Command, actor: str, numerics_class: str, digest: bytes) -> None:
-        """Audit an accepted episode, with the probability ``rate``."""
+        """Audit an accepted episode with probability ``rate``."""
         if len(self.open) < MOST_OPEN and self.draw() < self.rate:
             self.open[command.id] = Audit(command, numerics_class, {actor: digest})
 
     def assign(
         self, actor: str, numerics_class: str, running: Container[int], wanted: int
     ) -> list[Command]:
-        """Return commands for an actor to carry out again, at most ``wanted``.
+        """Return commands for an actor to run again, at most ``wanted``.
 
         Args:
-            actor: who asks.
-            numerics_class: its own.
-            running: ids of the commands that it holds.
-            wanted: how many it could start.
+            actor: name of the actor.
+            numerics_class: the actor's numerics class.
+            running: ids of the commands that the actor holds.
+            wanted: number of commands that it can start.
         """
         assigned: list[Command] = []
         for audit in self.open.values():
@@ -92,19 +92,19 @@ class Auditor:
         return assigned
 
     def remove_actor(self, actor: str) -> None:
-        """Give to others what an actor that is gone was to carry out."""
+        """Take back the commands assigned to an actor that is gone."""
         for audit in self.open.values():
             if audit.at == actor:
                 audit.at = ""
 
     def is_assigned(self, actor: str, command_id: int) -> bool:
-        """Say whether an actor is to carry out a command again."""
+        """Return whether an actor was assigned a command to run again."""
         return command_id in self.open and self.open[command_id].at == actor
 
     def compare(self, actor: str, command_id: int, digest: bytes) -> Verdict | None:
-        """Take in what an actor delivered that it was assigned; return the verdict if three differ.
+        """Compare an assigned actor's episode; return a verdict when there are three episodes.
 
-        An audit in which the first two agree is over: it is no longer open.
+        An audit whose first two episodes agree is closed.
         """
         audit = self.open[command_id]
         audit.at = ""
@@ -119,7 +119,7 @@ class Auditor:
         return Verdict(odd[0] if len(odd) == 1 else None)
 
     def stop(self) -> None:
-        """Audit no more."""
+        """Stop auditing."""
         self.rate = 0.0
         self.open.clear()
 

@@ -1,4 +1,4 @@
-"""Creating a run: settle once what every service of it will be told."""
+"""Creating a run: determine all that its services need to know, once."""
 
 import logging
 import os
@@ -36,7 +36,7 @@ from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 
-#: Who brings the episodes of a dataset.
+#: Name of the actor of a dataset's episodes.
 OFFLINE = "dataset"
 
 
@@ -47,7 +47,7 @@ def directory_name(config: Config) -> str:
 
 
 def _run_id(run_dir: Path) -> str:
-    """Return a name that no other run has, on whatever router: the directory's, and some chance."""
+    """Return a globally unique name: the directory's with a random suffix."""
     return f"{_slug(Path(os.path.realpath(run_dir)).name)}-{uuid.uuid4().hex[:8]}"
 
 
@@ -62,23 +62,23 @@ def create(
     left_open: Collection[str] = (),
     allow_inexact: bool = False,
 ) -> Store:
-    """Make a new run.
+    """Create a new run.
 
-    What the settings leave to the machine or to the environment is chosen. The environment is made
-    once and asked to replay an episode after another one; if it cannot, the run is marked inexact,
-    and goes on.
+    Settings that depend on the machine or the environment are chosen. The environment is checked
+    for determinism: it must repeat an episode after another one. If it does not, the run is marked
+    inexact.
 
     Args:
         run_dir: its directory.
         config: its settings.
-        left_open: those to choose by what the environment is like (:mod:`udrl.fitting`).
+        left_open: settings to choose by properties of the environment (:mod:`udrl.fitting`).
         allow_inexact: accept services of other numerics classes.
 
     Raises:
-        ConfigError: the command strategy cannot be made, or the dataset cannot be used.
+        ConfigError: the command strategy cannot be created, or the dataset cannot be used.
         UnsupportedEnvironment: the environment does not exist or is not supported.
-        EnvironmentFault: it raises, or returns what it may not.
-        StoreError: the directory holds a run already, or cannot be written.
+        EnvironmentFault: the environment raises, or returns an invalid value.
+        StoreError: the directory already holds a run, or cannot be written.
     """
     with no_empty_folder_left(run_dir):
         return _create(run_dir.absolute(), config, left_open, allow_inexact=allow_inexact)
@@ -86,7 +86,7 @@ def create(
 
 @contextmanager
 def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
-    """Remove a folder that was made for a run if the run is not made and nothing is in it."""
+    """Remove the folder made for a run if creating the run fails and the folder is empty."""
     try:
         yield
     except BaseException:
@@ -103,7 +103,7 @@ def _create(
         log.info("choosing settings by random episodes of %s", config.environment)
     config = settle(fit(config, left_open))
     with closing(EpisodeGenerator(config, 1)) as generator:
-        # First, as an actor does it: in an instance that has seen nothing else.
+        # First and in a fresh instance, as actors do.
         digest = repeated_digest(generator)
         config, offline = settle_dataset(config, generator.spec)
     exact = digest != ""
@@ -134,7 +134,7 @@ def _create(
 
 
 def _begin_with(store: Store, episodes: list[Episode]) -> None:
-    """Let episodes of others answer the commands of the warm-up."""
+    """Use a dataset's episodes as those of the warm-up commands."""
     spec = store.fact("hello", Hello).environment
     run = StoredRun(store, Budget(max_env_steps=2**53))
     with store.transaction():
@@ -145,20 +145,20 @@ def _begin_with(store: Store, episodes: list[Episode]) -> None:
 
 
 def config_of(store: Store) -> Config:
-    """Return the settings of a run, with nothing left to the machine."""
+    """Return the settings of a run, all of them chosen."""
     return store.fact("hello", Hello).config
 
 
 def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
-    """Write the effective configuration, as TOML that ``--config`` reads.
+    """Write the effective configuration as TOML, for ``--config``.
 
     Args:
-        run_dir: where to.
-        config: the run's.
-        budget: when it ends.
+        run_dir: directory of the run.
+        config: settings of the run.
+        budget: budget of the run.
 
     Raises:
-        StoreError: it cannot be written; a file that was there before is still there.
+        StoreError: the file cannot be written; an existing file is unchanged.
     """
     lines = []
     for settings in (config, budget):
@@ -168,11 +168,11 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
     path = run_dir / "config.toml"
     unfinished = path.with_suffix(".new")
     try:
-        # Aside and renamed: it holds the budget, which a full disk must not take.
+        # Written to another file and renamed: a full disk must not destroy the old budget.
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
         unfinished.replace(path)
     except OSError as error:
-        what_to_do = remedy(error, "free some disk space, or name a directory that you may write")
+        what_to_do = remedy(error, "free some disk space, or use a writable directory")
         raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error
 
 
@@ -186,5 +186,5 @@ def _toml(value: object) -> str:
 
 
 def exists(run_dir: Path) -> bool:
-    """Say whether a directory holds a run."""
+    """Return whether a directory holds a run."""
     return (run_dir / FILE).exists()

@@ -1,7 +1,7 @@
-"""A SQLite file of sealed rows, which one process writes and others may look at.
+"""A SQLite file of sealed rows, with one writing process and any number of readers.
 
-Every change is one transaction, synced before anything is acknowledged; what is on disk is
-consistent at every moment, and a row that is not what was written, or is gone, is noticed.
+Every change is one transaction, synced before it is acknowledged, so the file is consistent at
+every moment. Changed and missing rows are detected.
 """
 
 import fcntl
@@ -22,29 +22,29 @@ from udrl_replay.tallies import TALLIES, Tallies, Tally
 
 FILE = "run.sqlite"
 LOCK = "lock"
-#: Seconds in which somebody who only asks for the lock has given it back.
+#: Seconds to retry for the lock; :func:`is_locked` holds it only briefly.
 _LOOK_S = 0.2
 
-#: Tables whose rows may be written again.
+#: Tables whose rows may be replaced.
 _REPLACED = {"facts", "evaluations", "versions"}
 
 Fact = TypeVar("Fact")
 
-#: SQLite's codes for a file that is not what was written: malformed, no database, no such table.
+#: SQLite's codes for a damaged file: malformed, not a database, no such table.
 _DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR}
 
 
 class Database:
-    """A run's file and what is true of all its tables.
+    """A run's file: locking, integrity checks, transactions and facts.
 
     Args:
-        run_dir: its directory.
-        read_only: look at it as it is now, beside a service that goes on writing.
+        run_dir: directory of the run.
+        read_only: read a snapshot; another service may write meanwhile.
 
     Raises:
         StoreError: there is no run, or its file cannot be read.
-        RunInUse: another service writes it.
-        DamagedStore: the file is not what was written.
+        RunInUse: another replay service has the lock.
+        DamagedStore: the file is damaged.
     """
 
     def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
@@ -67,9 +67,9 @@ class Database:
                 self._db = self._connect("mode=rw")
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("PRAGMA synchronous = FULL")
-                # Some builds overwrite what is deleted: thirteen times the time for a megabyte.
+                # Some builds overwrite deleted content, which takes 13 times as long for 1 MB.
                 self._db.execute("PRAGMA secure_delete = OFF")
-                # What a statement may have to take back is small, and needs no file.
+                # Statement journals are small and need no file.
                 self._db.execute("PRAGMA temp_store = MEMORY")
         except sqlite3.Error as error:
             raise self._fault(error) from error
@@ -77,7 +77,7 @@ class Database:
         if not self.read_only:
             ((verdict,),) = self._rows("PRAGMA integrity_check(1)")
             if verdict != "ok":
-                raise self._damaged(" ".join(verdict.split()))  # SQLite's may have several lines
+                raise self._damaged(" ".join(verdict.split()))  # it may have several lines
         schema = self.fact("schema", int)
         if schema != SCHEMA:
             raise OtherConfiguration(
@@ -88,20 +88,20 @@ class Database:
         self._check_tallies()
 
     def _connect(self, how: str) -> sqlite3.Connection:
-        # As a URI, so that a mode can be named and the path may hold any character.
+        # A URI allows a mode, and any character in the path.
         uri = f"{self._path.resolve().as_uri()}?{how}"
         return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
 
     def _connect_to_read(self) -> sqlite3.Connection:
-        """Connect so that all that is read belongs to one moment."""
+        """Connect and start a transaction, so that all reads see one snapshot."""
         wal = self._path.with_name(f"{FILE}-wal")
-        # SQLite keeps an index beside the file while somebody reads. Where it may not write one,
-        # and nobody can change the file, it can do without.
+        # While a file is read, SQLite keeps an index beside it. In a read-only directory it can do
+        # without (immutable) if no process can change the file.
         may_write = os.access(self._path.parent, os.W_OK)
         is_still = not (wal.exists() and wal.stat().st_size) and not is_locked(self._path.parent)
         db = self._connect("mode=ro" if may_write or not is_still else "mode=ro&immutable=1")
         db.execute("BEGIN")
-        db.execute("SELECT 1 FROM facts").fetchone()  # opens it
+        db.execute("SELECT 1 FROM facts").fetchone()  # takes the snapshot
         return db
 
     def _check_seals(self) -> None:
@@ -111,7 +111,7 @@ class Database:
                 f"SELECT {key} FROM {table} WHERE seal IS NOT seal({columns}) LIMIT 1"  # noqa: S608
             )
             if broken:
-                raise self._damaged(f"{key} {broken[0][0]!r} of {table} is not what was written")
+                raise self._damaged(f"{key} {broken[0][0]!r} of {table} does not match its seal")
 
     def _check_tallies(self) -> None:
         try:
@@ -124,18 +124,18 @@ class Database:
             if tally != expected:
                 rows = expected.rows if expected else 0
                 raise self._damaged(
-                    f"table {table} has {tally.rows} rows, not the {rows} that were written"
+                    f"table {table} has {tally.rows} rows that do not match the {rows} written"
                 )
         if not self.read_only:
             self._tallies.follow(self._db)
 
     @classmethod
     def create(cls, run_dir: Path, **facts: object) -> Self:
-        """Make a new run's file, which holds some facts from the beginning.
+        """Create a new run's file with some facts.
 
         Raises:
-            StoreError: there is a run already, or the directory cannot be written.
-            RunInUse: another service works in it.
+            StoreError: the directory already holds a run, or cannot be written.
+            RunInUse: another replay service has the lock.
         """
         path = run_dir / FILE
         try:
@@ -144,9 +144,9 @@ class Database:
                 if path.exists():
                     raise StoreError(
                         f"{run_dir} holds a run already; add --resume (in Python: "
-                        f"resume=True) to resume it, or name another --run-dir"
+                        f"resume=True) to resume it, or use another --run-dir"
                     )
-                # Written aside and renamed, so that a run's file is there as a whole or not at all.
+                # Written to another file and renamed, so that a run's file is always complete.
                 unfinished = path.with_suffix(".new")
                 unfinished.unlink(missing_ok=True)
                 with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
@@ -158,7 +158,7 @@ class Database:
         return cls(run_dir)
 
     def close(self) -> None:
-        """Close the file and let others have it."""
+        """Close the file and release the lock."""
         if hasattr(self, "_db"):
             self._db.close()
         if self._lock is not None:
@@ -166,10 +166,10 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Make all changes within durable together, or none of them.
+        """Make all changes in the block durable, or none of them.
 
         Raises:
-            StoreError: they could not be written, e.g. because the disk is full.
+            StoreError: the changes cannot be written, e.g. because the disk is full.
         """
         try:
             self._db.execute("BEGIN IMMEDIATE")
@@ -184,14 +184,14 @@ class Database:
                 self._tallies.put_back(before)
                 raise
             finally:
-                # After some errors SQLite has rolled back by itself.
+                # After some errors SQLite has already rolled back.
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
         except sqlite3.Error as error:
             raise self._fault(error) from error
 
     def _insert(self, table: str, *values: Value, unsealed: Sequence[bytes] = ()) -> None:
-        """Add a row, within a transaction: what its seal covers, the seal, and the rest."""
+        """Add a row, within a transaction: the sealed columns, the seal, and the unsealed ones."""
         insert = "INSERT OR REPLACE" if table in _REPLACED else "INSERT"
         row = *values, seal(*values), *unsealed
         self._db.execute(f"{insert} INTO {table} VALUES ({marks(row)})", row)
@@ -208,7 +208,7 @@ class Database:
         what_to_do = remedy(error, "free some disk space or repair the disk")
         return StoreError(
             f"{self._path} cannot be used: {error}; nothing acknowledged is lost: {what_to_do}, "
-            f"and start again with --resume"
+            f"and restart with --resume"
         )
 
     def _damaged(self, what: object) -> DamagedStore:
@@ -220,7 +220,7 @@ class Database:
         """Return a named value; the default if it was never set.
 
         Raises:
-            DamagedStore: it is missing and there is no default, or it is of another kind.
+            DamagedStore: the value is missing and there is no default, or it is of another type.
         """
         rows = self._rows("SELECT value FROM facts WHERE name = ?", (name,))
         if not rows:
@@ -238,7 +238,7 @@ class Database:
 
 
 def _begin(db: sqlite3.Connection, facts: dict[str, object]) -> None:
-    """Make the tables of a new run, with some facts."""
+    """Create the tables of a new run, with some facts."""
 
     def add(name: str, value: object) -> None:
         encoded = msgspec.json.encode(value)
@@ -256,12 +256,12 @@ def _make(run_dir: Path) -> None:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        run_dir.stat()  # tells what a link in a loop, or to nowhere, really is
+        run_dir.stat()  # raises the actual error of a broken or circular link
         raise
 
 
 def _sync(folder: Path) -> None:
-    """Make a renamed file's new name durable."""
+    """Make the renaming of a file durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -270,14 +270,14 @@ def _sync(folder: Path) -> None:
 
 
 def _unusable(run_dir: Path, error: OSError | sqlite3.Error) -> StoreError:
-    what_to_do = remedy(error, "name one you may write")
+    what_to_do = remedy(error, "use a writable directory")
     return StoreError(f"run directory {run_dir}: {error}; {what_to_do}")
 
 
 def is_locked(run_dir: Path) -> bool:
-    """Say whether a service works on a run, on this machine or another that shares its disk.
+    """Return whether a service has the lock, on this machine or another that shares its disk.
 
-    Where the lock may not even be read, the answer is yes.
+    Also true if the lock file cannot be read.
     """
     try:
         with (run_dir / LOCK).open("rb") as file:
@@ -290,7 +290,7 @@ def is_locked(run_dir: Path) -> bool:
 
 
 def _lock(run_dir: Path) -> Any:
-    """Return the open lock file of a run directory; it is free again when it is closed."""
+    """Lock a run directory; return the open lock file, which is released when it is closed."""
     try:
         file = (run_dir / LOCK).open("a")
     except OSError as error:
@@ -300,11 +300,11 @@ def _lock(run_dir: Path) -> Any:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if time.monotonic() < deadline:  # whoever asks is_locked() has it for a moment
+            if time.monotonic() < deadline:  # is_locked() in another process may hold it briefly
                 time.sleep(_LOOK_S / 10)
                 continue
             file.close()
             raise RunInUse(
-                f"{run_dir} is in use by another replay service; stop it, or name another --run-dir"
+                f"{run_dir} is in use by another replay service; stop it, or use another --run-dir"
             ) from error
         return file

@@ -1,11 +1,11 @@
-"""Who carries out which command: dealt evenly, dealt again when an actor is gone or too slow.
+"""Dealing commands: evenly among actors, and again if an actor is gone or too slow.
 
-All of this is memory. An actor says with every request what it holds, so that a replay service that
-was restarted knows after one round.
+This state is only in memory. Every request of an actor lists the commands that it holds, so a
+restarted replay service knows them again after one request of each actor.
 
-An environment that hangs or crashes takes its actor along, and nobody reports which of the actor's
-commands did it. So a command that several actors held when they vanished is carried out alone: an
-actor that vanishes then has told which one it was, and that counts as a failure.
+An environment that hangs or crashes ends its actor without a report of the command that caused it.
+So a command that several actors held when they vanished is run alone; an actor that vanishes then
+identifies the command, which counts as a failure.
 """
 
 import heapq
@@ -19,15 +19,15 @@ from udrl.acting import MAX_FAILURES
 from udrl.commands import Command
 from udrl_proto.messages import CommandsRequest, JoinRequest
 
-#: A command is a straggler after so many times the expected duration of an episode.
+#: Multiple of the expected duration after which a command is a straggler.
 STRAGGLER = 3.0
-#: Commands in one answer: so many are a small message.
+#: Most commands in one reply, to keep the message small.
 MAX_DEALT = 4096
-#: Seconds after which an actor without a liveliness token that says nothing is forgotten.
+#: Seconds of silence after which an actor without a liveliness token is forgotten.
 SILENCE_S = 30.0
-#: Actors that may have joined at once; each costs a little memory.
+#: Most actors that may have joined at once; each costs a little memory.
 MOST_ACTORS = 10_000
-#: Actors that vanished while they held a command, after which it is carried out alone.
+#: Number of actors that vanished while they held a command, after which it is run alone.
 SUSPICIOUS = 3
 
 
@@ -36,11 +36,11 @@ class Outstanding:
     """A command without an episode.
 
     Attributes:
-        holders: actors that it was dealt to, and when.
-        was_dealt: whether it was ever dealt to one.
-        failures: the actors that could not carry it out, one entry a failure.
-        vanished: actors that were gone while they held it, and whether that was while it was
-            carried out alone.
+        holders: names of the actors that hold it, and the time it was dealt to each, seconds.
+        was_dealt: whether it was ever dealt to an actor.
+        failures: names of the actors that reported a failure, one entry per failure.
+        vanished: names of the actors that vanished while they held it, and whether it was run
+            alone then.
     """
 
     command: Command
@@ -51,18 +51,19 @@ class Outstanding:
 
     @property
     def is_suspect(self) -> bool:
-        """Whether it must be carried out alone, because too many actors vanished with it."""
+        """Whether it must be run alone, because too many actors vanished with it."""
         return len(self.vanished) >= SUSPICIOUS
 
 
 @dataclass
 class Actor:
-    """An actor as its last request described it.
+    """An actor that has joined, with its last request.
 
     Attributes:
-        holds: ids of the commands that were dealt to it.
-        reruns: commands dealt to it that had been dealt before, to it or another.
-        failures: commands that it could not carry out.
+        last_seen: time of its last message, seconds.
+        holds: ids of the commands that it holds.
+        reruns: number of commands dealt to it that had been dealt before, to any actor.
+        failures: number of commands that failed in its environments.
     """
 
     join: JoinRequest
@@ -74,7 +75,7 @@ class Actor:
 
 
 class Dealer:
-    """Outstanding commands and the actors that carry them out."""
+    """Deals outstanding commands to the actors that have joined."""
 
     def __init__(self) -> None:
         self.outstanding: dict[int, Outstanding] = {}
@@ -85,7 +86,7 @@ class Dealer:
         self._duration_s = 0.0
 
     def add(self, commands: Iterable[Command]) -> None:
-        """Take in commands to be carried out."""
+        """Add outstanding commands."""
         for command in commands:
             self.outstanding[command.id] = Outstanding(command)
             self._of_iteration[command.iteration] += 1
@@ -93,7 +94,7 @@ class Dealer:
             heapq.heappush(self._undealt, command.id)
 
     def remove_command(self, command_id: int, now: float | None = None) -> None:
-        """Remove an outstanding command; with a time: because it is done."""
+        """Remove an outstanding command; if it is done, ``now`` serves to measure its duration."""
         item = self.outstanding.pop(command_id)
         command = item.command
         for counter, key in (
@@ -111,17 +112,17 @@ class Dealer:
             self._duration_s += (took - self._duration_s) * (0.05 if self._duration_s else 1.0)
 
     def outstanding_in(self, iteration: int) -> int:
-        """Return how many commands of an iteration are outstanding."""
+        """Return the number of outstanding commands of an iteration."""
         return self._of_iteration[iteration]
 
     def join(self, request: JoinRequest, now: float) -> None:
-        """Note a new actor; one of the same id that came back loses what it held."""
+        """Add an actor; one that rejoins loses the commands that it held."""
         self.remove_actor(request.id)
         asked = CommandsRequest(actor=request.id, wanted=0)
         self.actors[request.id] = Actor(request, now, asked)
 
     def remove_actor(self, name: str) -> list[Outstanding]:
-        """Remove an actor and return what it held, which goes to others."""
+        """Remove an actor and return the commands that it held, which are dealt again."""
         actor = self.actors.pop(name, None)
         held = [] if actor is None else [self.outstanding[i] for i in sorted(actor.holds)]
         for item in held:
@@ -130,12 +131,12 @@ class Dealer:
         return held
 
     def silent_actors(self, here: Container[str], now: float) -> list[str]:
-        """Return actors that have said nothing for long, except those that are ``here``."""
+        """Return the actors that have been silent for too long, except those that are ``here``."""
         quiet = [n for n, a in self.actors.items() if now - a.last_seen > SILENCE_S]
         return [name for name in quiet if name not in here]
 
     def is_hopeless(self, command_id: int) -> bool:
-        """Say whether a command failed so often that nobody can carry it out: the run must stop."""
+        """Return whether a command failed so often that the run must stop."""
         item = self.outstanding[command_id]
         failures = [*item.failures, *(name for name, alone in item.vanished.items() if alone)]
         on_two = len(set(failures)) >= min(2, len(self.actors))
@@ -147,7 +148,7 @@ class Dealer:
             heapq.heappush(self._undealt, command_id)
 
     def deal(self, request: CommandsRequest, latest_version: int, now: float) -> list[Command]:
-        """Return commands for an actor that has joined: no more than it wants or its fair share."""
+        """Deal commands to an actor that has joined, at most what it wants and its fair share."""
         actor = self.actors[request.actor]
         actor.last_seen, actor.request = now, request
         running = {i for i in request.running if i in self.outstanding}
@@ -180,7 +181,7 @@ class Dealer:
         return dealt
 
     def _suspect(self, latest_version: int) -> Outstanding | None:
-        """Return a command to be carried out alone."""
+        """Return a command that must be run alone; None: there is none."""
         suspects = (i for i in self.outstanding.values() if i.is_suspect and not i.holders)
         ready = (i for i in suspects if i.command.weights_version <= latest_version)
         return next(ready, None)
@@ -193,7 +194,7 @@ class Dealer:
         return item.command
 
     def _straggler(self, actor: Actor, latest_version: int, now: float) -> Iterable[Command]:
-        """Yield the command that is most overdue elsewhere, for an actor that is idle."""
+        """Yield the most overdue command of another actor, for an idle actor."""
         overdue = [
             (min(item.holders.values()), i)
             for i, item in self.outstanding.items()
@@ -205,7 +206,7 @@ class Dealer:
                 yield self._give(self.outstanding[command_id], actor, now)
 
     def holds(self, name: str, command_id: int) -> bool:
-        """Say whether a command was dealt to an actor, and is still its to carry out."""
+        """Return whether an actor holds a command."""
         item = self.outstanding.get(command_id)
         return item is not None and name in item.holders
 
@@ -215,7 +216,7 @@ class Dealer:
             self.actors[name].last_seen = now
 
     def note_failure(self, command_id: int, name: str) -> None:
-        """Note that an actor could not carry out a command."""
+        """Note that a command failed in an actor's environment."""
         item = self.outstanding[command_id]
         item.failures.append(name)
         if name in self.actors:
@@ -224,5 +225,5 @@ class Dealer:
         self._put_back(command_id, name)
 
     def retry_after_s(self) -> float:
-        """Return when to ask again: later in a larger fleet, and not all at once."""
+        """Return the pause before an actor's next request: longer in a large fleet, with jitter."""
         return (0.25 + 0.02 * len(self.actors)) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -1,4 +1,4 @@
-"""Where a run stands, apart from its episodes, commands and weights."""
+"""The state and counters of a run, apart from its episodes, commands and weights."""
 
 from typing import Literal
 
@@ -6,32 +6,35 @@ import msgspec
 
 State = Literal["running", "closing", "ended", "failed"]
 
-#: Why nobody works on a run: its service was told to end, or could not say that it would.
+#: Reasons why no process is running a run that has not ended.
 STOPPED = "stopped on request"
 KILLED = "stopped without notice: its replay service was killed, or its machine went down"
 
 
 class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """What the store keeps as one fact, written at the end of every transaction that changed it.
+    """One fact of the store, written at the end of every transaction that changes it.
 
     Attributes:
-        state: ``running`` up to the last iteration N; ``closing`` while N's final weights are
-            awaited and evaluated; then ``ended``. ``failed``: a command cannot be carried out.
-        iteration: the last one completed; -1 before the warm-up is.
-        env_steps: of warm-up and exploratory episodes of completed iterations.
-        eval_env_steps: of evaluation episodes of completed iterations, closing ones included.
-        issued, accepted, cancelled: the ledger of commands, except what is outstanding.
-        delivered, duplicate, rejected: the ledger of episodes, with ``accepted``.
-        env_failures: commands that actors could not carry out.
-        wall_s: seconds that the run was being worked on, until this was written.
-        latest_version: the newest weights version; 0: none yet.
-        best_version: the version with the best evaluation; 0: none yet.
-        exact: whether the result is still a function of the configuration alone.
+        state: ``running`` up to the last iteration N; ``closing`` while the weights of version N
+            are trained and evaluated; then ``ended``. ``failed``: a command always fails, or an
+            actor lied.
+        iteration: last completed iteration; -1: the warm-up is not complete.
+        env_steps: steps of the warm-up and exploratory episodes of completed iterations.
+        eval_env_steps: steps of the evaluation episodes, those of the final evaluation included.
+        issued, accepted, cancelled: the ledger of commands, without the outstanding ones.
+        delivered, duplicate, rejected: the ledger of episodes, together with ``accepted``.
+        env_failures: number of failures that actors reported.
+        wall_s: running time until this was written, seconds; pauses are not counted.
+        latest_version: newest weights version; 0: none yet.
+        best_version: version with the best evaluation; 0: none yet.
+        best_mean: mean return of that evaluation; None: none yet.
+        exact: whether the result still depends only on the configuration.
+        inexact_reason: why it does not; empty if it does.
         problem: why the run failed.
-        ended_because: why there is no iteration after the last one, or :data:`STOPPED`.
-        deceived: the run failed because episodes of an actor that lied have entered it.
-        audit: share of the episodes that a second actor makes again.
-        agreed: those that it made alike.
+        ended_because: why the run ended, or :data:`STOPPED`.
+        deceived: whether the run failed because it learned from episodes of an actor that lied.
+        audit: share of the episodes that are audited.
+        agreed: number of audits in which both episodes were equal.
     """
 
     state: State = "running"
@@ -58,9 +61,9 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     agreed: int = 0
 
     def why_ended(self) -> str:
-        """Return why the run ended, in words; empty: it has not."""
+        """Return why the run ended; empty: it has not."""
         return f"failed: {self.problem}"[:4000] if self.state == "failed" else self.ended_because
 
     def why_stopped(self) -> str:
-        """Return why nobody works on the run, though it has not ended."""
+        """Return why no process is running the run, although it has not ended."""
         return STOPPED if self.ended_because == STOPPED else KILLED

@@ -1,4 +1,4 @@
-"""Actors from which nothing is taken any more, and what they did."""
+"""Quarantine: actors excluded from a run, and the reasons."""
 
 import logging
 from collections import Counter
@@ -11,17 +11,17 @@ log = logging.getLogger("udrl")
 
 #: Invalid deliveries after which an actor is quarantined.
 OFFENCES = 10
-#: Actors whose offences are counted at once.
+#: Most actors whose offences are counted at once.
 _MOST_COUNTED = 1000
-#: Quarantined actors that are remembered; the oldest goes first.
+#: Most quarantined actors remembered; the oldest is forgotten first.
 _MOST_REMEMBERED = 1000
 
 
 class Quarantine:
-    """Who is shut out of a run, kept in its store; offences that do not yet lead there are memory.
+    """The quarantined actors of a run, kept in its store; counts of offences are only in memory.
 
     Attributes:
-        reasons: by actor, why it is shut out.
+        reasons: reason for the quarantine, by actor.
     """
 
     def __init__(self, store: Store) -> None:
@@ -33,7 +33,7 @@ class Quarantine:
         return actor in self.reasons
 
     def add(self, actor: str, why: str) -> None:
-        """Shut an actor out."""
+        """Quarantine an actor."""
         why = printable(why)
         log.warning("actor %s is quarantined: %s", actor, why)
         self.reasons[actor] = why[:1000]
@@ -42,7 +42,7 @@ class Quarantine:
         self._store.set_fact("quarantined", self.reasons)
 
     def count(self, actor: str) -> bool:
-        """Count an offence and say whether it is one too many."""
+        """Count an offence; return whether the actor must be quarantined."""
         if actor in self.reasons:
             return False
         counts = self._offences
@@ -52,9 +52,9 @@ class Quarantine:
         return counts[actor] >= OFFENCES
 
     def refusal(self, actor: str) -> Refused:
-        """Return what a quarantined actor is told."""
+        """Return the refusal for a quarantined actor."""
         return Refused(
             "quarantined",
             f"actor {actor} is quarantined: {self.reasons[actor]}; repair or remove it, then "
-            f"start it again",
+            f"restart it",
         )

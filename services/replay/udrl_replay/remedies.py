@@ -1,4 +1,4 @@
-"""What to do when a file of a run cannot be written."""
+"""Remedies if a file of a run cannot be written."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ _OUT_OF_FILES = {errno.EMFILE, errno.ENFILE}
 
 
 def remedy(error: OSError | sqlite3.Error, otherwise: str) -> str:
-    """Return what to do about an error: ``otherwise``, unless there are too many open files."""
+    """Return the remedy for an error: ``otherwise``, unless there are too many open files."""
     if _is_out_of_files(error):
         return "raise the limit of open files, e.g. ulimit -n 4096"
     return otherwise
@@ -31,6 +31,6 @@ def unwritable(path: Path, error: OSError) -> StoreError:
     """Return the error for a file beside the store."""
     what_to_do = remedy(error, "free some disk space")
     return StoreError(
-        f"{path} cannot be written: {error}; {what_to_do}, and start again with --resume; nothing "
-        f"is lost"
+        f"{path} cannot be written: {error}; {what_to_do}, and restart with --resume; nothing is "
+        f"lost"
     )

@@ -1,8 +1,8 @@
-"""The replay service: questions in, answers out, one thread that owns the run.
+"""The replay service: replies to requests in one thread, which owns the run.
 
-Questions are taken from the inbox in groups. A group is handled inside one transaction, and its
-answers are sent when that is on disk: under load a sync is shared by many episodes, without load an
-episode waits for none but its own.
+Requests are taken from the inbox in groups. A group is handled inside one transaction, and its
+replies are sent after the sync: under load many episodes share a sync; without load an episode
+waits only for its own.
 """
 
 import logging
@@ -69,13 +69,13 @@ from udrl_replay.store import Store, Version
 
 log = logging.getLogger("udrl")
 
-#: Questions that may wait, and their bytes; more are dropped and asked again.
+#: Most requests that may wait, and their bytes; others are dropped, and their senders retry.
 _INBOX, _INBOX_BYTES = 4096, 512 << 20
-#: Questions handled in one transaction, and bytes after which no more are.
+#: Most requests in one transaction, and bytes after which no more are added.
 _GROUP, _GROUP_BYTES = 64, 8 << 20
-#: Seconds that the service of an ended run stays, so that all its peers learn of the end.
+#: Seconds that the service stays after the end of the run, so that all its peers learn of it.
 _LINGER_S = 10.0
-#: Seconds that it stays when nobody is left.
+#: Seconds that it stays if no peers are left.
 _FAREWELL_S = 0.3
 
 
@@ -87,14 +87,14 @@ class _Delivery(NamedTuple):
 
 
 class ReplayService:
-    """Serves one run over one Zenoh session.
+    """Serves one run over one transport.
 
     Args:
-        transport: where it is reached.
-        store: the run.
-        budget: when it ends.
-        run_dir: where ``metrics.csv`` and, at the end, the weights go.
-        audit: share of the episodes that a second actor makes again, 0 to 1.
+        transport: receives the requests.
+        store: the run's file.
+        budget: the run's stopping criteria.
+        run_dir: directory for ``metrics.csv`` and, at the end, the weights.
+        audit: share of the episodes that are audited, 0 to 1.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ReplayService:
         }
 
     def serve(self, stop: threading.Event) -> None:
-        """Answer until the run has ended and its peers know, or ``stop`` is set.
+        """Reply until the run has ended and its peers know, or ``stop`` is set.
 
         Raises:
             StoreError: the run's file cannot be written.
@@ -145,10 +145,10 @@ class ReplayService:
         declared = self.open()
         log.info("replay serves run %s", run_id)
         if self.run.progress.state == "ended":
-            log.info("the run has ended; with a greater --max-env-steps it goes on")
+            log.info("the run has ended; increase --max-env-steps to continue it")
         try:
             self._answer_until_ended(stop)
-            # Only here: after an error, what is in memory may be ahead of what is on disk.
+            # Not after an error: then memory may be ahead of the disk.
             with self._store.transaction():
                 self.run.stop()
             if self.run.progress.state == "ended":
@@ -160,7 +160,7 @@ class ReplayService:
     def _answer_until_ended(self, stop: threading.Event) -> None:
         ended_at: float | None = None
         while not stop.is_set():
-            # Waits for a quarter of a second at most: time passes also when nobody asks.
+            # With a short timeout: silent actors and the end must be noticed without requests.
             self.answer_waiting(0.25)
             now = time.monotonic()
             if self.run.progress.state in ("ended", "failed"):
@@ -169,11 +169,11 @@ class ReplayService:
                     return
 
     def close(self) -> None:
-        """Close the files that it keeps open, apart from the store."""
+        """Close the files that the service keeps open, except the store."""
         self._metrics.close()
 
     def open(self) -> list[Declaration]:
-        """Begin to receive questions, which are checked on the thread that receives them."""
+        """Start to receive requests, which are checked on the thread that receives them."""
         spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
         with_critic = optimizer_shapes(shapes, critic_shapes(self.run.config.network, spec))
@@ -207,7 +207,7 @@ class ReplayService:
         ]
 
     def answer_waiting(self, timeout_s: float) -> None:
-        """Answer what waits, or comes within so many seconds."""
+        """Reply to the waiting requests; wait up to ``timeout_s`` seconds for the first."""
         self._answer(self._inbox.take(_GROUP, _GROUP_BYTES, timeout_s))
 
     def _answer(self, group: list[Question | Presence]) -> None:
@@ -262,18 +262,18 @@ class ReplayService:
         peer = role, name
         if presence.here:
             self._here.add(peer)
-            log.info("%s is here", printable(f"{role} {name}"))
+            log.info("%s connected", printable(f"{role} {name}"))
         else:
             self._here.discard(peer)
             self._waits.end(f"{role} {name}")
             self._admission.remove_service(role, name)
-            log.info("%s left", printable(f"{role} {name}"))
+            log.info("%s disconnected", printable(f"{role} {name}"))
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
         self._waits.begin(who, on, why, now)
         return Wait(on=f"{on}: {why}", retry_after_s=self.run.dealer.retry_after_s())
 
-    # One method per verb. Each returns the answer, or raises Refused.
+    # One method per verb. Each returns the reply, or raises Refused.
 
     def _hello(self, request: HelloRequest, now: float) -> Hello:
         return msgspec.structs.replace(self.run.hello, exact=self.run.progress.exact)
@@ -310,9 +310,9 @@ class ReplayService:
         if version is not None:
             trains = any(role == "learner" for role, _ in self._here)
             return "learner", f"weights version {version}" + (
-                "" if trains else ": no learner is here"
+                "" if trains else ": no learner is connected"
             )
-        return "actors", f"the others' episodes of iteration {run.progress.iteration + 1}"
+        return "actors", f"other actors' episodes of iteration {run.progress.iteration + 1}"
 
     def _episode(self, arrival: Arrival, now: float) -> EpisodeReply:
         if arrival.actor not in self.run.quarantined:
@@ -335,14 +335,15 @@ class ReplayService:
         following = run.progress.latest_version + 1
         if request.version < following:
             raise Refused(
-                "rewind", f"version {following} is next, not {request.version}; ask for the state"
+                "rewind",
+                f"version {following} is next, not {request.version}; request the state again",
             )
         if not run.is_trainable(request.version):
-            if request.version > following:  # it still trains or delivers the version before
+            if request.version > following:  # the learner prefetches; the previous one is not here
                 retry_after_s = run.dealer.retry_after_s()
                 return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
             here = [n for r, n in self._here if r == "actor"]
-            why = f"iteration {request.version - 1}" + ("" if here else ": no actor is here")
+            why = f"iteration {request.version - 1}" + ("" if here else ": no actor is connected")
             if run.progress.state == "closing":
                 why = "the final evaluation"
             return ChangesReply(wait=self._wait(who, "actors", why, now))
@@ -356,7 +357,8 @@ class ReplayService:
         bodies = self._store.episode_bodies(request.ids, PAGE)
         if not bodies:
             raise Refused(
-                "unknown_episode", f"episode {request.ids[0]} is not kept; ask for changes"
+                "unknown_episode",
+                f"episode {request.ids[0]} is not kept; request the changes again",
             )
         return EpisodesReply(episodes=tuple(bodies))
 
@@ -385,7 +387,8 @@ class ReplayService:
         if version is None or not version.weights:
             kept = self._store.versions_kept()
             raise Refused(
-                "unknown_version", f"weights version {wanted} is not kept; kept are {kept}"
+                "unknown_version",
+                f"weights version {wanted} is not kept; request one of {kept}",
             )
         return Weights(version=version.version, weights=version.weights)
 

@@ -1,4 +1,4 @@
-"""What a run tells about itself: its status, ``metrics.csv``, ``weights.safetensors``."""
+"""Reports of a run: its status, ``metrics.csv``, ``weights.safetensors``."""
 
 import csv
 import logging
@@ -34,12 +34,12 @@ from udrl_replay.store import COLUMNS, EvaluationRow, Store
 log = logging.getLogger("udrl")
 
 _WINDOW_S = 10.0
-#: Waits that are remembered; who waits need not have joined.
+#: Most waits remembered; services that wait need not have joined.
 _MOST_WAITS = 10_000
 
 
 class MetricsFile:
-    """``metrics.csv``: one line per iteration, made anew from the store at every start."""
+    """``metrics.csv``: one line per iteration, rewritten from the store at every start."""
 
     def __init__(self, run_dir: Path, store: Store) -> None:
         self._path = run_dir / "metrics.csv"
@@ -48,13 +48,13 @@ class MetricsFile:
         try:
             with self._path.open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file, lineterminator="\n").writerow(COLUMNS)
-            # Kept open, so that no iteration needs another file.
+            # Kept open, so that later iterations do not depend on the limit of open files.
             self._file = self._path.open("a", newline="", encoding="utf-8")
         except OSError as error:
             raise unwritable(self._path, error) from error
 
     def update(self, iteration: int) -> None:
-        """Append the lines of all iterations up to one."""
+        """Append the lines of all iterations up to ``iteration``."""
         if iteration <= self._written:
             return
         try:
@@ -67,15 +67,15 @@ class MetricsFile:
 
     def close(self) -> None:
         """Close the file."""
-        with suppress(OSError):  # what a full disk did not take was told by update()
+        with suppress(OSError):  # update() has already reported a full disk
             self._file.close()
 
 
 def write_weights(run_dir: Path, store: Store, version: int) -> None:
-    """Write the weights that a run ended with beside its store; version 0 has none.
+    """Write the final weights to a file beside the store; version 0 has none.
 
     Raises:
-        StoreError: they cannot be written.
+        StoreError: the file cannot be written.
     """
     found = store.version(version)
     if found is None:
@@ -97,7 +97,7 @@ class Throughput:
         self._arrivals: deque[tuple[float, int]] = deque()
 
     def add(self, now: float, steps: int) -> None:
-        """Note steps that arrived."""
+        """Count the steps of an accepted episode."""
         self._arrivals.append((now, steps))
 
     def per_second(self, now: float) -> float:
@@ -111,13 +111,13 @@ class Throughput:
 
 
 class Waits:
-    """Who waits for whom, since when, and why."""
+    """The services that wait: for what, why, and since when."""
 
     def __init__(self) -> None:
         self._waits: dict[str, tuple[str, str, float]] = {}
 
     def begin(self, who: str, on: str, why: str, now: float) -> None:
-        """Note that somebody waits; it goes on waiting if it did so for the same."""
+        """Note that a service waits; its wait continues if it is for the same reason."""
         held = self._waits.get(who)
         if held is None or held[:2] != (on, why):
             self._waits[who] = on, why, now
@@ -125,7 +125,7 @@ class Waits:
                 del self._waits[next(iter(self._waits))]
 
     def end(self, who: str) -> None:
-        """Note that somebody no longer waits."""
+        """Note that a service no longer waits."""
         self._waits.pop(who, None)
 
     def list(self, now: float) -> tuple[Waiting, ...]:
@@ -231,7 +231,7 @@ def _evaluated(row: EvaluationRow) -> EvaluationStatus:
 
 
 def history(store: Store, after: int) -> History:
-    """Return what came of the iterations after one, a page of them."""
+    """Return a page of the iterations after ``after``, with their evaluations."""
     rows = store.iterations(after, HISTORY_PAGE + 1)
     page = tuple(rows[:HISTORY_PAGE])
     evaluations = store.evaluations(after, page[-1].iteration) if page else []
@@ -243,21 +243,21 @@ def history(store: Store, after: int) -> History:
 
 
 def contents(run: RunState) -> Contents:
-    """Return what the replay buffer holds, and what its next commands ask for."""
+    """Return the content of the replay buffer and the commands drawn from it."""
     config = run.config
     entries = list(run.buffer)
-    # The best are always among those that are shown.
+    # The best episode is always shown.
     shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
     best = Best.of(run.buffer.best(config.commands.last_few)) if entries else None
-    told = best and ReturnInTime(config.network).settle(best.mean, best.horizon)
+    evaluated = best and ReturnInTime(config.network).settle(best.mean, best.horizon)
     commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
     return Contents(
         iteration=max(run.progress.iteration, 0),
         returns=tuple(e.episode_return for e in shown),
         lengths=tuple(e.length for e in shown),
         iterations=tuple(e.iteration for e in shown),
-        desired_return=told[0] if told else None,
-        desired_horizon=told[1] if told else None,
+        desired_return=evaluated[0] if evaluated else None,
+        desired_horizon=evaluated[1] if evaluated else None,
         return_std=best.deviation if best else None,
         desired_returns=tuple(c.desired_return for c in commands[:MOST_SHOWN]),
         desired_horizons=tuple(c.desired_horizon for c in commands[:MOST_SHOWN]),

@@ -1,4 +1,4 @@
-"""Going on with a run: its configuration and its environment must be what they were."""
+"""Resuming a run, after checking that its configuration and environment are unchanged."""
 
 import logging
 import time
@@ -21,7 +21,7 @@ from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 
-#: Stored episodes that are played again, and seconds after which no other one is begun.
+#: Number of stored episodes to repeat, and seconds after which no further one is started.
 _EPISODES = 3
 _PATIENCE_S = 10.0
 
@@ -29,18 +29,17 @@ _PATIENCE_S = 10.0
 def resume(
     run_dir: Path, config: Config, *, allow_inexact: bool = False, check_environment: bool = True
 ) -> Store:
-    """Open a run to go on with it.
+    """Open a run to continue it.
 
     Args:
         run_dir: its directory.
         config: must be the run's own.
-        allow_inexact: from now on, if it was not before.
-        check_environment: play some stored episodes again; a service that is started again by
-            another program leaves that to the program.
+        allow_inexact: accept services of other numerics classes from now on.
+        check_environment: repeat some stored episodes to check the environment.
 
     Raises:
-        StoreError: there is none, it is in use, its configuration is another one, or its
-            environment does something else than before.
+        StoreError: there is no run, it is in use, its configuration differs, or its environment
+            behaves differently than before.
     """
     store = Store(run_dir)
     with closed_on_error(store):
@@ -50,7 +49,7 @@ def resume(
         if different:
             raise OtherConfiguration(
                 f"{run_dir} belongs to a run with {'; '.join(different)}; use its "
-                f"configuration, or name another --run-dir"
+                f"configuration, or use another --run-dir"
             )
         if allow_inexact and not hello.allow_inexact:
             hello = msgspec.structs.replace(hello, allow_inexact=True)
@@ -64,7 +63,7 @@ def resume(
 
 
 def _check_environment(store: Store, hello: Hello, *, allow_inexact: bool) -> None:
-    """Compare what the environment does with what it did when the run was created and since."""
+    """Check that the environment behaves as in the stored episodes."""
     found = _changed(store, hello)
     if found is None:
         return
@@ -72,20 +71,20 @@ def _check_environment(store: Store, hello: Hello, *, allow_inexact: bool) -> No
     if not allow_inexact:
         raise OtherConfiguration(
             f"environment {environment} has changed since the run was created: {found}; restore "
-            f"its package and what it computes with, or resume with --allow-inexact"
+            f"the versions of its package and dependencies, or resume with --allow-inexact"
         )
     progress = store.fact("progress", RunProgress)
     progress.exact = False
     progress.inexact_reason = f"environment {environment} has changed: {found}"
     log.warning("the run is no longer exact: %s", progress.inexact_reason)
     with store.transaction():
-        # Its actors do what it does now, and are compared with nothing.
+        # Without a digest, actors with the changed environment can join.
         store.set_fact("hello", msgspec.structs.replace(hello, environment_digest="", exact=False))
         store.set_fact("progress", progress)
 
 
 def _changed(store: Store, hello: Hello) -> str | None:
-    """Say in what way the environment has changed; None: in none that was found."""
+    """Return a description of how the environment has changed; None: no change was found."""
     config, began = hello.config, time.monotonic()
     generator = EpisodeGenerator(config, 1)
     spec = generator.spec
@@ -93,11 +92,11 @@ def _changed(store: Store, hello: Hello) -> str | None:
         if spec != hello.environment:
             return f"it is {spec}, it was {hello.environment}"
         if environment_digest(generator) != hello.environment_digest:
-            return "its first steps are others"
+            return "its first steps differ"
     finally:
         generator.close()
     sampler = CommandSampler(config, spec)
-    for episode_id in _telling(store, config):
+    for episode_id in _episodes_to_repeat(store, config):
         if time.monotonic() - began > _PATIENCE_S:
             break
         (body,) = store.episode_bodies([episode_id], 1)
@@ -112,8 +111,8 @@ def _changed(store: Store, hello: Hello) -> str | None:
     return None
 
 
-def _telling(store: Store, config: Config) -> Iterator[int]:
-    """Yield ids of stored episodes: the longest, for late steps, then the newest."""
+def _episodes_to_repeat(store: Store, config: Config) -> Iterator[int]:
+    """Yield ids of stored episodes: the longest, to check late steps, then the newest."""
     held = [p.entry for p in store.buffer(store.fact("progress", RunProgress).iteration)]
     if config.commands.dataset is not None:  # its episodes have no seeds
         held = [e for e in held if e.id >= COMMANDS_PER_ITERATION]
@@ -124,7 +123,7 @@ def _telling(store: Store, config: Config) -> Iterator[int]:
 
 @contextmanager
 def closed_on_error(store: Store) -> Iterator[None]:
-    """Close a store when what is done with it fails."""
+    """Close a store if the block raises."""
     try:
         yield
     except BaseException:

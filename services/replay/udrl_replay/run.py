@@ -1,8 +1,8 @@
-"""The run itself: issue commands, accept episodes, complete iterations, evaluate.
+"""The run: issue commands, accept episodes, complete iterations, evaluate.
 
-It is a state machine over a :class:`~udrl_replay.store.Store`, driven by one thread inside the
-store's transactions; it knows nothing of messaging. Everything that it must remember is in the
-store when the transaction ends; everything else it can find out again.
+A state machine over a :class:`~udrl_replay.store.Store`, driven by one thread inside the store's
+transactions; it imports no messaging. All persistent state is in the store when a transaction ends;
+the rest can be derived from it.
 """
 
 import logging
@@ -30,15 +30,15 @@ log = logging.getLogger("udrl")
 
 
 class StoredRun(RunState):
-    """A run that is worked on, new or resumed.
+    """A run in progress, new or resumed.
 
     Args:
-        store: its file.
-        budget: when it ends; may differ from the one it was started with.
-        audit: share of the episodes that a second actor makes again, 0 to 1.
+        store: the run's file.
+        budget: the run's stopping criteria; may differ from those it was started with.
+        audit: share of the episodes that are audited, 0 to 1.
 
     Raises:
-        Deceived: it was stopped because an actor had lied.
+        Deceived: the run has failed because an actor lied.
     """
 
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
@@ -56,7 +56,7 @@ class StoredRun(RunState):
             if self.progress.issued == 0:
                 self._issue(self.sampler.warm_up())
             if self.progress.state == "failed":
-                self._try_again()
+                self._clear_failure()
             why = self._spent()
             if self.progress.state != "running" and not why:
                 self._reopen()
@@ -65,7 +65,7 @@ class StoredRun(RunState):
             self.save()
 
     def save(self) -> None:
-        """Write the progress; belongs at the end of every transaction that changed something."""
+        """Write the progress; call it at the end of every transaction that changes it."""
         if self.progress.state in ("running", "closing"):
             self.progress.wall_s = self.wall_s
         self.store.set_fact("progress", self.progress)
@@ -79,10 +79,11 @@ class StoredRun(RunState):
     # Episodes.
 
     def accept(self, arrival: Arrival, now: float) -> Literal["accepted", "duplicate"]:
-        """Take in an episode once.
+        """Accept an episode once.
 
         Raises:
-            Refused: it is not the answer to a command of this run, or to none that is still wanted.
+            Refused: its actor is quarantined, its command was never issued or is cancelled, or it
+                is too long.
         """
         self.progress.delivered += 1
         self.dealer.note_seen(arrival.actor, now)
@@ -135,14 +136,14 @@ class StoredRun(RunState):
         raise self.reject(f"command {command_id} was never issued; drop the episode")
 
     def _is_done(self, iteration: int, index: int) -> bool:
-        """Say whether a command's episode has come and had its effect."""
+        """Return whether a command's episode was accepted earlier, even if it is no longer kept."""
         if index < FINAL_EVALUATION:
             return iteration <= self.progress.iteration and index < self.store.issued_in(iteration)
         closed = self.progress.state == "ended" and iteration == self.progress.iteration > 0
         return closed and index < FINAL_EVALUATION + self.config.evaluation.eval_episodes
 
     def deal(self, request: CommandsRequest, now: float) -> list[Command]:
-        """Return commands for an actor that has joined; those to be checked come first."""
+        """Deal commands to an actor that has joined, audits first."""
         again, rest = self.trust.assign(request)
         return again + self.dealer.deal(rest, self.progress.latest_version, now)
 
@@ -152,9 +153,9 @@ class StoredRun(RunState):
         return Refused("rejected", why)
 
     def fail(self, failure: FailureMessage) -> None:
-        """Note that an actor could not carry out a command that it holds."""
+        """Note that a command failed in an actor's environment."""
         if not self.dealer.holds(failure.actor, failure.command_id):
-            return  # said again, or by an actor whose commands have gone to others
+            return  # a repetition, or the command has been dealt to another actor
         self.progress.env_failures += 1
         error = printable(failure.error)
         log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, error)
@@ -166,7 +167,7 @@ class StoredRun(RunState):
             )
 
     def remove_actor(self, actor: str) -> None:
-        """Remove an actor that is gone, perhaps through a command that it held."""
+        """Remove an actor that is gone; a command that it held may be the cause."""
         self.auditor.remove_actor(actor)
         for item in self.dealer.remove_actor(actor):
             command_id = item.command.id
@@ -192,7 +193,7 @@ class StoredRun(RunState):
     # Iterations.
 
     def _advance(self) -> None:
-        """Complete every iteration whose turn it is and whose episodes are all there."""
+        """Complete iterations in order, as far as all their episodes have arrived."""
         while self.progress.state == "running":
             following = self.progress.iteration + 1
             if self.dealer.outstanding_in(following):
@@ -200,7 +201,7 @@ class StoredRun(RunState):
             self._complete(following)
 
     def _complete(self, iteration: int) -> None:
-        """Admit an iteration's episodes, in the order of their ids, and issue what that opens."""
+        """Admit an iteration's episodes in the order of their ids and issue the next commands."""
         progress = self.progress
         arrived = self.store.pending(iteration)
         ids = [p.entry.id for p in arrived]
@@ -258,7 +259,7 @@ class StoredRun(RunState):
             self._begin_final_evaluation(why)
 
     def _note_evaluation(self, command: Command, entries: list[Entry], *, closing: bool) -> None:
-        """Summarise what an evaluation's episodes obtained; ``command`` is one of theirs."""
+        """Record the returns of an evaluation's episodes; ``command`` is one of its commands."""
         result = summarise([e.episode_return for e in entries])
         iteration, version = command.iteration, command.weights_version
         source = self.progress.env_steps if closing else self.store.env_steps_after(version - 1)
@@ -283,10 +284,10 @@ class StoredRun(RunState):
         self.dealer.add(commands)
         self.progress.issued += len(commands)
 
-    # The end, and going on after it.
+    # The end, and resuming after it.
 
     def _spent(self) -> str:
-        """Return what of the budget is reached, in words; empty: nothing."""
+        """Return which limit of the budget is reached; empty: none."""
         most, wanted = self.budget.max_env_steps, self.budget.stop_return
         last = self.store.last_evaluation(closing=False)
         if (
@@ -301,7 +302,7 @@ class StoredRun(RunState):
         return ""
 
     def _begin_final_evaluation(self, why: str) -> None:
-        """Iteration N is complete: cancel what was issued beyond and wait for version N."""
+        """End at iteration N, now complete: cancel later commands and wait for version N."""
         self.progress.state, self.progress.ended_because = "closing", why
         self._cancel(list(self.dealer.outstanding))
         self.store.remove_versions(self.progress.iteration)
@@ -310,7 +311,7 @@ class StoredRun(RunState):
         self._issue_final_evaluation()
 
     def _issue_final_evaluation(self) -> None:
-        """Issue the final evaluation once version N is there; version 0 cannot act."""
+        """Issue the final evaluation if version N has arrived; version 0 is not evaluated."""
         final = self.progress.iteration
         if final == 0:
             self.progress.state = "ended"
@@ -340,7 +341,7 @@ class StoredRun(RunState):
         self.progress.cancelled += len(ids)
 
     def _reopen(self) -> None:
-        """Go on after the end with a larger budget, as if it had not come."""
+        """Undo the end of the run, to continue with a larger budget."""
         final = self.progress.iteration
         final_ids = [c.id for c in self._final_commands()]
         unfinished = [i for i in final_ids if i in self.dealer.outstanding]
@@ -355,18 +356,18 @@ class StoredRun(RunState):
         self.dealer.add(again)
         self.progress.state = "running"
 
-    def _try_again(self) -> None:
-        """Go on with the command that could not be carried out."""
+    def _clear_failure(self) -> None:
+        """Continue after a failure; the command that failed is retried."""
         self.progress.state = "closing" if self._final_commands() else "running"
         self.progress.problem = ""
 
     # Weights.
 
     def add_version(self, version: Version, train_s: float) -> Literal["accepted", "duplicate"]:
-        """Take in a weights version once.
+        """Accept a weights version once.
 
         Raises:
-            Refused: it is not the next one, or differs from the one of that number.
+            Refused: it is not the next version, diverged, or differs from the stored one.
         """
         if is_known(self, version):
             return "duplicate"
@@ -378,13 +379,13 @@ class StoredRun(RunState):
         return "accepted"
 
     def _keep_needed_weights(self) -> None:
-        """Forget what nobody can ask for any more: weights, optimizers and evicted episodes."""
+        """Delete weights, optimizer states and evicted episodes that are no longer needed."""
         latest = self.progress.latest_version
-        # A run that is resumed after its end takes its cancelled commands up again.
+        # A run that is resumed after its end restores its cancelled commands.
         wanted = self.open_commands() + self.store.commands(cancelled=True)
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
         needed |= self.auditor.versions
-        needed |= self._evaluated  # for whoever wants to look at them later
+        needed |= self._evaluated  # for later use by `udrl play` and the like
         self.store.drop_weights(v for v in self.store.versions_kept() if v not in needed)
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.

@@ -1,4 +1,4 @@
-"""The state of a run as read from its store: to be inspected, or to be resumed."""
+"""The state of a run as read from its store, for inspection or to resume it."""
 
 import logging
 import time
@@ -17,21 +17,21 @@ log = logging.getLogger("udrl")
 
 
 class RunState:
-    """The state of a run. Making one changes nothing.
+    """The state of a run. Creating it does not change the store.
 
     Args:
         store: the run's file.
-        budget: when it ends.
-        audit: share of the episodes that a second actor makes again, 0 to 1.
+        budget: the run's stopping criteria.
+        audit: share of the episodes that are audited, 0 to 1.
 
     Attributes:
         hello: the run specification.
         progress: counters and state.
         buffer: the replay buffer after the last completed iteration.
-        digests: of its episodes, by id.
-        dealer: commands without an episode, and who carries them out.
-        auditor: episodes that are made again, to check who made them.
-        quarantined: actors that are shut out.
+        digests: digests of the buffer's episodes, by id.
+        dealer: the outstanding commands and the actors.
+        auditor: the open audits.
+        quarantined: the quarantined actors.
     """
 
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
@@ -56,21 +56,21 @@ class RunState:
 
     @property
     def wall_s(self) -> float:
-        """Seconds that the run was being worked on."""
+        """Running time, seconds; pauses between processes are not counted."""
         return time.monotonic() - self._began
 
     def awaits_version(self) -> int | None:
-        """Return the version that can be trained now, or None: its buffer is not there yet."""
+        """Return the version that can be trained now; None: its buffer is not complete."""
         version = self.progress.latest_version + 1
         return version if self.is_trainable(version) else None
 
     def is_trainable(self, version: int) -> bool:
-        """Whether the buffer that a version is trained on is there, and the run needs it."""
+        """Return whether the run needs a version and the buffer to train it on is complete."""
         needed = self.progress.state == "running" or version <= self.progress.iteration
         return needed and version <= self.progress.iteration + 1
 
     def mark_inexact(self, reason: str) -> None:
-        """Say that the result no longer depends on the configuration alone."""
+        """Note that the result no longer depends only on the configuration."""
         if self.progress.exact:
             log.warning("the run is no longer exact: %s", reason)
             self.progress.exact = False

@@ -1,8 +1,8 @@
-"""The tables of a run's file, and the seal that every row carries.
+"""The tables of a run's file, and the seals of their rows.
 
-SQLite notices a file that is torn or out of order, not a number that has become another one. So
-each row has a seal: a digest of its columns, those aside that have a checksum of their own. All
-columns are documented in ``docs/operations-reference.md``.
+SQLite detects a malformed file, but not a changed value. So each row has a seal: a digest of its
+columns, except those with their own checksum. All columns are documented in
+``docs/operations-reference.md``.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ SCHEMA = 5
 
 
 def _declared(kind: type[msgspec.Struct]) -> str:
-    """Return the columns of a table whose rows are messages of integers and floats."""
+    """Return the SQL columns for the fields of a message of integers and floats."""
     columns = []
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
@@ -28,9 +28,9 @@ def _declared(kind: type[msgspec.Struct]) -> str:
     return ", ".join(columns)
 
 
-#: SQLite writes a whole row anew when a column changes its size; so an episode's body, which may
-#: be a megabyte and never changes, has a table of its own. Elsewhere large columns stand last:
-#: whoever reads what stands before them does not read them.
+#: SQLite rewrites a whole row when a column changes its size, so an episode's body, which may have
+#: a megabyte and never changes, has its own table. Elsewhere large columns are last, so that
+#: reading the others does not read them.
 TABLES = f"""
 CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL, seal BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE commands (
@@ -55,7 +55,7 @@ CREATE INDEX weights_kept ON versions (version) WHERE weights IS NOT NULL;
 CREATE INDEX optimizers_kept ON versions (version) WHERE optimizer IS NOT NULL;
 """
 
-#: What the seal of each table's rows covers, the row's key first.
+#: The sealed columns of each table, the row's key first.
 SEALED = {
     "facts": "name, value",
     "commands": "id, cancelled, body",
@@ -70,16 +70,16 @@ Value = int | float | str | bytes | None
 
 
 def seal(*values: Value) -> bytes:
-    """Return the seal of a row's values; SQLite may have made floats of integers."""
+    """Return the seal of a row's values. SQLite may convert integers to floats, so all are."""
     plain = [float(v) if isinstance(v, int) else v for v in values]
     return sha256(repr(plain).encode())[:16]
 
 
 def sha256(blob: bytes) -> bytes:
-    """Return the SHA-256 of a large value."""
+    """Return the SHA-256 digest of a large value."""
     return hashlib.sha256(blob).digest()
 
 
 def marks(values: Iterable[object]) -> str:
-    """Return the placeholders of an SQL statement for some values."""
+    """Return SQL placeholders for values."""
     return ", ".join("?" for _ in values)

@@ -1,7 +1,7 @@
-"""One SQLite file per run, the only thing in the system that is worth saving.
+"""The store: one SQLite file per run, with all its persistent state.
 
-What it holds is described in :mod:`udrl_replay.schema`, and how it is kept in
-:mod:`udrl_replay.database`.
+The tables are defined in :mod:`udrl_replay.schema`; :mod:`udrl_replay.database` handles locking,
+transactions and integrity checks.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,12 +28,12 @@ EVALUATION_COLUMNS = {
     "eval_ci95_low": "ci95_low",
     "eval_ci95_high": "ci95_high",
 }
-#: Of ``metrics.csv``.
+#: All columns of ``metrics.csv``.
 COLUMNS = (*_FIELDS, *EVALUATION_COLUMNS)
 
 
 class StoredEpisode(NamedTuple):
-    """An episode in the store, without its steps."""
+    """A stored episode, without its steps."""
 
     entry: Entry
     digest: bytes
@@ -63,10 +63,10 @@ class EvaluationRow(NamedTuple):
 class Store(Database):
     """Commands, episodes, iterations, evaluations and weights versions of one run.
 
-    Reading raises :class:`~udrl.errors.DamagedStore` where the file is not what was written.
+    Methods that read raise :class:`~udrl.errors.DamagedStore` if the file is damaged.
     """
 
-    # Commands: those that are outstanding or cancelled.
+    # Commands of iterations that are not complete, and cancelled ones.
 
     def add_commands(self, commands: Iterable[Command]) -> None:
         """Add outstanding commands."""
@@ -74,7 +74,7 @@ class Store(Database):
             self._insert("commands", command.id, 0, msgspec.msgpack.encode(command))
 
     def commands(self, *, cancelled: bool) -> list[Command]:
-        """Return the outstanding or the cancelled commands, by id."""
+        """Return the cancelled commands, or those of incomplete iterations, by id."""
         rows = self._rows(
             "SELECT body FROM commands WHERE cancelled = ? ORDER BY id", (int(cancelled),)
         )
@@ -84,26 +84,26 @@ class Store(Database):
             raise self._damaged(f"a command: {error}") from error
 
     def mark_commands(self, ids: Iterable[int], *, cancelled: bool) -> None:
-        """Cancel commands, or take that back."""
+        """Cancel commands, or undo that."""
         self._db.executemany(
             "UPDATE commands SET cancelled = ?1, seal = seal(id, ?1, body) WHERE id = ?2",
             ((int(cancelled), i) for i in ids),
         )
 
     def remove_commands(self, ids: Iterable[int]) -> None:
-        """Forget commands, whose episodes were accepted."""
+        """Delete commands."""
         self._db.executemany("DELETE FROM commands WHERE id = ?", ((i,) for i in ids))
 
     # Episodes: pending, in the buffer, or needed for an earlier buffer.
 
     def add_episode(self, entry: Entry, digest: bytes, body: bytes) -> None:
-        """Add an episode that arrived."""
+        """Add an accepted episode, not admitted yet."""
         row = entry.id, entry.episode_return, entry.length, digest, None, None, sha256(body)
         self._insert("episodes", *row)
         self._db.execute("INSERT INTO bodies VALUES (?, ?)", (entry.id, body))
 
     def episode_digest(self, episode_id: int) -> bytes | None:
-        """Return an episode's digest if its row is still there."""
+        """Return the digest of an episode; None if it is not kept."""
         rows = self._rows("SELECT digest FROM episodes WHERE id = ?", (episode_id,))
         return bytes(rows[0][0]) if rows else None
 
@@ -123,7 +123,7 @@ class Store(Database):
         return {i for (i,) in rows}
 
     def admit(self, iteration: int, ids: Iterable[int], evicted: Iterable[int]) -> None:
-        """Note which episodes entered and left the buffer with an iteration."""
+        """Record the episodes that an iteration added to the buffer and evicted from it."""
         columns = SEALED["episodes"]
         for column, changed in (("admitted", ids), ("evicted", evicted)):
             self._db.executemany(
@@ -133,13 +133,13 @@ class Store(Database):
             )
 
     def remove_episodes(self, ids: Iterable[int]) -> None:
-        """Forget episodes."""
+        """Delete episodes."""
         rows = [(i,) for i in ids]
         self._db.executemany("DELETE FROM episodes WHERE id = ?", rows)
         self._db.executemany("DELETE FROM bodies WHERE id = ?", rows)
 
     def remove_evicted(self, until: int) -> None:
-        """Forget episodes that no buffer after iteration ``until`` or later holds."""
+        """Delete episodes that are not in the buffer after iteration ``until`` or any later one."""
         rows = self._rows("SELECT id FROM episodes WHERE evicted <= ? ORDER BY id", (until,))
         self.remove_episodes(i for (i,) in rows)
 
@@ -153,10 +153,12 @@ class Store(Database):
         return [StoredEpisode(Entry(*entry), digest) for *entry, digest in rows]
 
     def episode_bodies(self, ids: Sequence[int], limit: int) -> list[bytes]:
-        """Return the first of the episodes asked for, up to ``limit`` bytes but at least one.
+        """Return the first requested episodes, up to ``limit`` bytes but at least one.
+
+        Stops before the first episode that is not kept.
 
         Raises:
-            DamagedStore: one is not what was written.
+            DamagedStore: a body does not match its checksum.
         """
         bodies: list[bytes] = []
         for episode_id in ids:
@@ -171,18 +173,18 @@ class Store(Database):
             if bodies and limit < 0:
                 break
             if body is None or sha256(body) != checksum:
-                raise self._damaged(f"episode {episode_id} is not what was written")
+                raise self._damaged(f"episode {episode_id} does not match its checksum")
             bodies.append(body)
         return bodies
 
-    # Iterations and evaluations: one row each, kept for good.
+    # Iterations and evaluations: one row each, never deleted.
 
     def add_iteration(self, done: IterationStatus) -> None:
         """Add a completed iteration."""
         self._insert("iterations", *msgspec.structs.astuple(done))
 
     def iterations(self, after: int, limit: int) -> list[IterationStatus]:
-        """Return the first completed iterations after one."""
+        """Return up to ``limit`` completed iterations after ``after``."""
         rows = self._rows(
             f"SELECT {SEALED['iterations']} FROM iterations "  # noqa: S608
             "WHERE iteration > ? ORDER BY iteration LIMIT ?",
@@ -191,17 +193,17 @@ class Store(Database):
         return [IterationStatus(**dict(zip(_FIELDS, row, strict=True))) for row in rows]
 
     def issued_in(self, iteration: int) -> int:
-        """Return how many commands a completed iteration had."""
+        """Return the number of commands of a completed iteration."""
         rows = self._rows("SELECT commands FROM iterations WHERE iteration = ?", (iteration,))
         return int(rows[0][0]) if rows else 0
 
     def loss_of(self, version: int) -> float | None:
-        """Return the loss that a version was trained with; version 0 has none."""
+        """Return the training loss of a version; None for version 0."""
         rows = self._rows("SELECT loss FROM versions WHERE version = ?", (version,))
         return float(rows[0][0]) if rows else None
 
     def env_steps_after(self, iteration: int) -> int:
-        """Return the env steps that a completed iteration ended with."""
+        """Return the run's env steps after a completed iteration."""
         rows = self._rows("SELECT env_steps FROM iterations WHERE iteration = ?", (iteration,))
         return int(rows[0][0]) if rows else 0
 
@@ -210,7 +212,7 @@ class Store(Database):
         self._insert("evaluations", *row[:-1], *row.evaluation)
 
     def last_evaluation(self, *, closing: bool) -> EvaluationRow | None:
-        """Return the newest evaluation, of those that close a run or of the others."""
+        """Return the newest final evaluation, or the newest of the others."""
         rows = self._rows(
             "SELECT * FROM evaluations WHERE closing = ? ORDER BY iteration DESC LIMIT 1",
             (int(closing),),
@@ -226,12 +228,12 @@ class Store(Database):
         return _evaluation(rows[0]) if rows else None
 
     def best_evaluation(self) -> float | None:
-        """Return the greatest mean return of an evaluation, closing ones included."""
+        """Return the greatest mean return of all evaluations, the final evaluation included."""
         ((best,),) = self._rows("SELECT max(mean) FROM evaluations")
         return None if best is None else float(best)
 
     def evaluations(self, after: int, until: int) -> list[EvaluationRow]:
-        """Return the evaluations of iterations after one, up to another; no closing ones."""
+        """Return the evaluations after ``after`` up to ``until``, without the final evaluation."""
         rows = self._rows(
             "SELECT * FROM evaluations WHERE closing = 0 AND iteration > ? AND iteration <= ? "
             "ORDER BY iteration",
@@ -240,7 +242,7 @@ class Store(Database):
         return [_evaluation(row) for row in rows]
 
     def metrics(self, after: int) -> list[tuple[Any, ...]]:
-        """Return the rows of ``metrics.csv`` of iterations after ``after``; -1: all of them."""
+        """Return the rows of ``metrics.csv`` of the iterations after ``after``; -1: all."""
         columns = [f"i.{c}" for c in _FIELDS] + [f"e.{c}" for c in EVALUATION_COLUMNS.values()]
         return self._rows(
             f"SELECT {', '.join(columns)} FROM iterations i "  # noqa: S608
@@ -249,10 +251,10 @@ class Store(Database):
             (after,),
         )
 
-    # Weights versions: digest and loss of all, blobs of those that somebody may need.
+    # Weights versions: digest and loss of all, blobs of those that may be needed.
 
     def add_version(self, version: Version, train_s: float) -> None:
-        """Add a version, or bring back one whose blobs had gone."""
+        """Add a version, or restore the blobs of one."""
         weights, optimizer = version.weights, version.optimizer
         self._insert(
             "versions", version.version, version.digest, version.loss, train_s,
@@ -260,10 +262,10 @@ class Store(Database):
         )  # fmt: skip
 
     def version(self, version: int) -> Version | None:
-        """Return a version; its optimizer is empty unless it is the newest.
+        """Return a version; its optimizer state is empty unless it is the latest.
 
         Raises:
-            DamagedStore: the blobs are not those that were written.
+            DamagedStore: a blob does not match its checksum.
         """
         rows = self._rows(
             "SELECT version, digest, loss, ifnull(weights, x''), ifnull(optimizer, x''), checksum "
@@ -276,41 +278,41 @@ class Store(Database):
         found = Version(*values)
         for blob, expected in ((found.weights, checksum[:32]), (found.optimizer, checksum[32:])):
             if blob and sha256(blob) != expected:
-                raise self._damaged(f"weights version {version} is not what was written")
+                raise self._damaged(f"weights version {version} does not match its checksum")
         return found
 
     def state(self, version: int) -> Version:
-        """Return the version that a learner goes on from, with its optimizer.
+        """Return a version with its optimizer state, for a learner to continue from.
 
         Raises:
-            DamagedStore: it is not there as a whole, or not what was written.
+            DamagedStore: a blob is missing or does not match its checksum.
         """
         found = self.version(version)
         if found is None or not (found.weights and found.optimizer):
-            raise self._damaged(f"weights version {version}, the latest, is gone")
+            raise self._damaged(f"weights version {version}, the latest, is missing")
         return found
 
     def versions_kept(self) -> list[int]:
-        """Return the versions whose weights are there."""
+        """Return the versions whose weights are kept."""
         rows = self._rows("SELECT version FROM versions WHERE weights IS NOT NULL ORDER BY version")
         return [v for (v,) in rows]
 
     def drop_weights(self, versions: Iterable[int]) -> None:
-        """Forget the blobs of some versions."""
+        """Delete the blobs of some versions."""
         self._db.executemany(
             "UPDATE versions SET weights = NULL, optimizer = NULL WHERE version = ?",
             ((v,) for v in versions),
         )
 
     def drop_optimizers(self, before: int) -> None:
-        """Forget the optimizer state of versions before one."""
+        """Delete the optimizer states of all versions before ``before``."""
         self._db.execute(
             "UPDATE versions SET optimizer = NULL WHERE version < ? AND optimizer IS NOT NULL",
             (before,),
         )
 
     def remove_versions(self, after: int) -> None:
-        """Forget versions that were trained beyond the end of the run."""
+        """Delete all versions after ``after``."""
         self._db.execute("DELETE FROM versions WHERE version > ?", (after,))
 
 

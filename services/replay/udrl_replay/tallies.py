@@ -1,9 +1,8 @@
-"""How many rows each table has and the sum of their seals: what shows that a row is gone.
+"""Tallies: the number of a table's rows and the sum of their seals, to detect missing rows.
 
-A seal shows that a row has become another one, not that one is missing or came from elsewhere. So
-each table has a tally, which is kept with the facts and checked when the file is opened. Triggers
-of the connection that writes keep it up to date, a row at a time; who else changes a table leaves
-its tally as it was.
+A seal detects a changed row, but not one that is missing or copied from elsewhere. So each table
+has a tally, which is stored as a fact and checked when the file is opened. Triggers of the writing
+connection keep it up to date; changes by other programs do not update it.
 """
 
 import sqlite3
@@ -11,11 +10,11 @@ from typing import NamedTuple
 
 from udrl_replay.schema import SEALED
 
-#: The fact that holds them; it is the only row that no tally counts.
+#: Name of the fact that holds the tallies, the only row that is not counted.
 TALLIES = "tallies"
 
-#: What stands for a row: its seal, and where that covers less, what else must be there.
-_STANDS_FOR_ROW = dict.fromkeys(SEALED, "{row}seal") | {
+#: SQL expression of a row's summand, by table: the seal, or a digest where that covers less.
+_SUMMANDS = dict.fromkeys(SEALED, "{row}seal") | {
     "facts": f"CASE {{row}}name WHEN '{TALLIES}' THEN NULL ELSE {{row}}seal END",
     "bodies": "seal({row}id)",
     "versions": "seal({row}seal, {row}weights IS NULL, {row}optimizer IS NULL)",
@@ -26,8 +25,8 @@ class Tally(NamedTuple):
     """The tally of a table.
 
     Attributes:
-        rows: how many it has.
-        total: the sum of what stands for them, as far as it fits 128 bits, in hexadecimal.
+        rows: number of its rows.
+        total: sum of the rows' summands modulo 2^128, in hexadecimal.
     """
 
     rows: int
@@ -35,30 +34,30 @@ class Tally(NamedTuple):
 
 
 class Tallies:
-    """The tallies of a file's tables, as one connection sees them.
+    """The tallies of a file's tables, as seen by one connection.
 
     Args:
-        db: the connection, with the function ``seal``.
+        db: the connection, with the SQL function ``seal``.
     """
 
     def __init__(self, db: sqlite3.Connection) -> None:
-        self._rows = dict.fromkeys(_STANDS_FOR_ROW, 0)
-        self._totals = dict.fromkeys(_STANDS_FOR_ROW, 0)
-        for table, expression in _STANDS_FOR_ROW.items():
-            stand_ins = db.execute(f"SELECT {expression.format(row='')} FROM {table}")  # noqa: S608
-            for (stand_in,) in stand_ins:
-                self._note(table, stand_in, 1)
+        self._rows = dict.fromkeys(_SUMMANDS, 0)
+        self._totals = dict.fromkeys(_SUMMANDS, 0)
+        for table, expression in _SUMMANDS.items():
+            summands = db.execute(f"SELECT {expression.format(row='')} FROM {table}")  # noqa: S608
+            for (summand,) in summands:
+                self._note(table, summand, 1)
 
-    def _note(self, table: str, stand_in: bytes | None, sign: int) -> None:
-        if stand_in is not None:
+    def _note(self, table: str, summand: bytes | None, sign: int) -> None:
+        if summand is not None:
             self._rows[table] += sign
-            self._totals[table] += sign * int.from_bytes(stand_in, "big")
+            self._totals[table] += sign * int.from_bytes(summand, "big")
 
     def follow(self, db: sqlite3.Connection) -> None:
-        """Note every row that a connection adds, changes or removes from now on."""
+        """Update the tallies on every change that a connection makes from now on."""
         db.create_function("note", 3, self._note)
-        db.execute("PRAGMA recursive_triggers = ON")  # else no trigger sees what REPLACE removes
-        for table, expression in _STANDS_FOR_ROW.items():
+        db.execute("PRAGMA recursive_triggers = ON")  # else REPLACE fires no delete triggers
+        for table, expression in _SUMMANDS.items():
             gone = f"SELECT note('{table}', {expression.format(row='OLD.')}, -1);"
             new = f"SELECT note('{table}', {expression.format(row='NEW.')}, 1);"
             for event, noted in (("INSERT", new), ("DELETE", gone), ("UPDATE", gone + new)):
@@ -68,13 +67,13 @@ class Tallies:
                 )
 
     def held(self) -> dict[str, Tally]:
-        """Return the tallies as they are now, by table."""
+        """Return the current tallies, by table."""
         return {
             table: Tally(rows, f"{self._totals[table] % 2**128:032x}")
             for table, rows in self._rows.items()
         }
 
     def put_back(self, tallies: dict[str, Tally]) -> None:
-        """Return to what was held before a transaction that changed nothing in the end."""
+        """Restore the tallies of before a transaction that was rolled back."""
         for table, tally in tallies.items():
             self._rows[table], self._totals[table] = tally.rows, int(tally.total, 16)

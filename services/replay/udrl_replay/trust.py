@@ -1,4 +1,4 @@
-"""Whom to believe: what follows from audits and offences."""
+"""Consequences of audits and offences: quarantine, and failure of the run."""
 
 import logging
 from collections.abc import Callable
@@ -17,21 +17,21 @@ log = logging.getLogger("udrl")
 
 
 class Trust:
-    """Judges the actors of a run.
+    """Audits and quarantines the actors of a run.
 
     Args:
-        run: whose auditor, quarantine and progress these are.
-        remove_actor: gives what an actor holds to others.
+        run: the run with its auditor and quarantine.
+        remove_actor: removes an actor, whose commands are dealt again.
     """
 
     def __init__(self, run: RunState, remove_actor: Callable[[str], None]) -> None:
         self._run = run
         self._remove_actor = remove_actor
-        # The iteration in which an actor's first episode entered the run.
+        # By actor, the first iteration that has an episode of it.
         self._entered = run.store.fact("entered", dict[str, int], {})
 
     def assign(self, request: CommandsRequest) -> tuple[list[Command], CommandsRequest]:
-        """Return commands to be carried out again, and the request for what else is wanted."""
+        """Return commands to audit, and the request reduced by their number."""
         actor = self._run.dealer.actors[request.actor]
         again = self._run.auditor.assign(
             actor.join.id, actor.join.numerics_class, request.running,
@@ -41,7 +41,7 @@ class Trust:
         return again, msgspec.structs.replace(request, wanted=request.wanted - len(again))
 
     def record_delivery(self, command: Command, arrival: Arrival) -> None:
-        """Record which actor delivered an episode, and perhaps audit it."""
+        """Record an actor's first delivery, and choose whether to audit the episode."""
         run, name = self._run, arrival.actor
         if name not in self._entered:
             self._entered[name] = command.iteration
@@ -51,7 +51,7 @@ class Trust:
             run.auditor.maybe_audit(command, name, numerics_class, arrival.digest)
 
     def compare(self, arrival: Arrival) -> Literal["duplicate"]:
-        """Take in an episode that was asked for to check another actor's."""
+        """Compare an audit's episode with those of the other actors, and act on the verdict."""
         run, command_id = self._run, arrival.entry.id
         run.progress.duplicate += 1
         verdict = run.auditor.compare(arrival.actor, command_id, arrival.digest)
@@ -65,14 +65,14 @@ class Trust:
             run.mark_inexact(
                 f"three actors carried out command {command_id} and all their episodes differ; the "
                 f"environment {run.config.environment} or their machines are not deterministic; "
-                f"nothing is audited any more"
+                f"audits are stopped"
             )
         else:
             self._quarantine_liar(verdict.liar, command_id)
         return "duplicate"
 
     def _quarantine_liar(self, liar: str, command_id: int) -> None:
-        why = f"its episode of command {command_id} differs from that of two others"
+        why = f"its episode of command {command_id} differs from those of two other actors"
         self.quarantine(liar, why)
         progress = self._run.progress
         if liar in self._entered and progress.state not in ("ended", "failed"):
@@ -90,6 +90,6 @@ class Trust:
             self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
 
     def quarantine(self, actor: str, why: str) -> None:
-        """Take nothing from an actor any more, and give what it holds to others."""
+        """Quarantine an actor; its commands are dealt again."""
         self._run.quarantined.add(actor, why)
         self._remove_actor(actor)

@@ -1,4 +1,4 @@
-"""Which weights versions a run takes in: the next one, once, with a finite loss."""
+"""Which weights versions a run accepts: the next one, once, with a finite loss."""
 
 import math
 
@@ -8,10 +8,10 @@ from udrl_replay.store import Version
 
 
 def is_known(run: RunState, version: Version) -> bool:
-    """Say whether a version that was delivered is here already.
+    """Return whether a delivered version is already stored.
 
     Raises:
-        Refused: it is another one of the same number, it diverged, or it is not the next.
+        Refused: it differs from the stored version, diverged, or is not the next version.
     """
     number = version.version
     known = run.store.version(number)
@@ -19,21 +19,21 @@ def is_known(run: RunState, version: Version) -> bool:
         if known.digest != version.digest:
             raise Refused(
                 "unequal_version",
-                f"weights version {number} was delivered before with other values: "
-                f"{known.digest.hex()[:16]}, now {version.digest.hex()[:16]}; the learner is "
-                f"not deterministic, or belongs to another run",
+                f"weights version {number} has the digest {version.digest.hex()[:16]}, but was "
+                f"delivered before with {known.digest.hex()[:16]}; the learner is not "
+                f"deterministic, or belongs to another run",
             )
         return True
     if not math.isfinite(version.loss):
         raise Refused(
             "invalid",
-            f"weights version {number} has the loss {version.loss}; training diverged, lower "
+            f"weights version {number} has the loss {version.loss}: training diverged; lower "
             f"learning_rate",
         )
     if number != run.awaits_version():
         raise Refused(
             "rewind",
             f"weights version {number} was delivered, {run.progress.latest_version + 1} is next; "
-            f"ask for the state and go on there",
+            f"request the state and continue from it",
         )
     return False

@@ -4,7 +4,7 @@ import { $, facts, lines, made, say } from "./page.js";
 
 export const STATES = { running: "Running", closing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
 
-// Shell commands for this run, with what the board knows of its place.
+// Shell commands for this run, with its directory and endpoint if the board knows them.
 export function commands({ place, status }) {
   const { run_dir, endpoint } = place;
   const keys = endpoint.startsWith("tls/") ? " --keys DIR" : "";
@@ -23,7 +23,7 @@ export function showRun(known) {
   say($("title"), status.environment);
   say($("run-name"), status.run_id);
   document.title = `${status.environment} · udrl board`;
-  // Why a run failed is said in the alert, with the command that helps.
+  // The reason of a failure is in the alert, with the command that helps.
   const cause = status.state === "failed" ? "" : status.ended_because;
   say($("state"), [STATES[status.state], cause].filter(Boolean).join(": "));
   $("state").className = `state ${status.state}`;
@@ -44,14 +44,14 @@ export function showRun(known) {
     ["results", status.exact ? "exact" : "not exact"],
     ["iteration", number(status.iteration)],
     ["weights", `version ${status.weights_version}`],
-    ["age of the weights", `${count(status.weights_lag, "version")}, ${number(status.weights_lag_s)} s`],
+    ["lag of the weights", `${count(status.weights_lag, "version")}, ${number(status.weights_lag_s)} s`],
     ["loss", number(status.loss, 3)],
-    ["env steps of evaluations", number(status.eval_env_steps)],
+    ["env steps in evaluations", number(status.eval_env_steps)],
     ["commands issued", number(c.issued)],
     ["accepted, cancelled, outstanding", `${number(c.accepted)}, ${number(c.cancelled)}, ${number(c.outstanding)}`],
     ["episodes delivered", number(e.delivered)],
     ["accepted, duplicate, rejected", `${number(e.accepted)}, ${number(e.duplicate)}, ${number(e.rejected)}`],
-    ["failures of environments", number(status.env_failures)],
+    ["environment failures", number(status.env_failures)],
   ]);
   showAlerts(known);
   showActors(status);
@@ -79,10 +79,10 @@ function showAlerts(known) {
   const hints = {
     stopped: `No process is running this run. Resume it: ${resume()}`,
     ended: `Continue training: ${resume(" --max-env-steps MORE")}`,
-    failed: `Resume the run when the cause is fixed: ${resume()}`,
+    failed: `Fix the cause, then resume the run: ${resume()}`,
   };
   const isActive = status.state === "running" || status.state === "closing";
-  const isMissing = status.waiting.some((w) => w.why.includes("no learner is here"));
+  const isMissing = status.waiting.some((w) => w.why.includes("no learner is connected"));
   const hint = hints[status.state] ?? "";
   $("next").hidden = !hint;
   say($("next"), hint);
