@@ -32,9 +32,9 @@ TOY = Config(environment="Figure2-v0", max_return=2.0)
 def go_on(run_dir: Path, *, allow_inexact: bool = False, **given: Any) -> Settings:
     """Resume a run with options of ``udrl train``; return the settings that they lead to."""
     nothing = {"preset_name": None, "file": None, "assignments": ()}
-    settings = gather_settings(TOY.environment, nothing | given, run_dir, go_on=True)
+    settings = gather_settings(TOY.environment, nothing | given, run_dir, resume=True)
     open_run(
-        run_dir, settings, go_on=True, allow_inexact=allow_inexact, listen=None,
+        run_dir, settings, resume=True, allow_inexact=allow_inexact, listen=None,
         insecure=False, secure=False,
     ).close()  # fmt: skip
     return settings
@@ -45,7 +45,7 @@ def run_dir(tmp_path: Path) -> Path:
     """The directory of a run with a budget of 5000 steps and a configuration file edited since."""
     settings = Settings(TOY, Budget(max_env_steps=5000), Fleet(actors=7))
     open_run(
-        tmp_path, settings, go_on=False, allow_inexact=False, listen=None,
+        tmp_path, settings, resume=False, allow_inexact=False, listen=None,
         insecure=False, secure=False,
     ).close()  # fmt: skip
     file = tmp_path / "config.toml"

@@ -73,7 +73,7 @@ def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
 def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
     if job.algorithm == "UDRL":
         settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
-        status = train(settings, folder / "run", stop, go_on=True)
+        status = train(settings, folder / "run", stop, resume=True)
         if status.problem:
             raise RunFailed(status.problem)
         table = folder / "evaluations.csv"

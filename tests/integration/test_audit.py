@@ -48,16 +48,16 @@ def test_liar_ends_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     monkeypatch.setattr(udrl_actor.outbox, "encode_episode", lie)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
-    def go(*, go_on: bool) -> None:
+    def go(*, resume: bool) -> None:
         train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
-              go_on=go_on)  # fmt: skip
+              resume=resume)  # fmt: skip
 
     with pytest.raises(UdrlError, match=r"lied|quarantined"):
-        go(go_on=False)
+        go(resume=False)
     status = status_of(tmp_path / "run")
     assert status.state == "failed"
     assert [actor.id for actor in status.quarantined] == liars
     assert f"actor {liars[0]} lied" in status.problem
     assert_conserved(status)
     with pytest.raises(Deceived, match=liars[0]):
-        go(go_on=True)
+        go(resume=True)

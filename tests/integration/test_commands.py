@@ -113,16 +113,16 @@ def test_health_of_each_service(cli: Callable[..., Cli], tmp_path: Path) -> None
 
     code, _, error = health("replay", "0.1")
     assert code == 6
-    assert f"nobody answers at '{endpoint}'" in error
+    assert f"no reply from '{endpoint}'" in error
     cli("replay", "Figure2-v0", "--listen", endpoint, "--config", str(config),
         "--max-env-steps", "10000000")  # fmt: skip
     code, out, error = health("replay")
     assert code == 0, error
-    assert f"answers at {endpoint}" in out
+    assert f"is served at {endpoint}" in out
     for role in ("learner", "actor"):
         code, _, error = health(role)
         assert code == 6
-        assert re.search(rf"no {role} of this machine \({role}-.*\) takes part in run", error)
+        assert re.search(rf"no {role} of this machine \({role}-.*\) has joined run", error)
         service = cli(role, "--connect", endpoint)
         wait_for(partial(has_health, role, 0), f"a healthy {role}")
         service.process.kill()

@@ -61,7 +61,7 @@ def test_resumed_run_equals_one_that_was_longer_from_the_start(
 
     config, run_dir = small(lead=lead), tmp_path / "short"
     first = run(config, 2000, run_dir=run_dir)
-    longer = run(config, 4000, run_dir=run_dir, go_on=True)
+    longer = run(config, 4000, run_dir=run_dir, resume=True)
     straight = run(config, 4000)
     assert first.iteration < longer.iteration
     assert digests(longer) == digests(straight)
@@ -74,7 +74,7 @@ def test_resuming_an_ended_run_with_the_same_budget_changes_nothing(
 
     run_dir = tmp_path / "run"
     first = run(toy(), 300, run_dir=run_dir)
-    again = run(toy(), 300, run_dir=run_dir, go_on=True)
+    again = run(toy(), 300, run_dir=run_dir, resume=True)
     assert digests(again) == digests(first)
     assert again.commands == first.commands
     assert again.closing_evaluation == first.closing_evaluation

@@ -88,5 +88,5 @@ def test_store_that_may_not_grow_keeps_its_ledgers(
     assert stopped is not None
     assert stopped.state == "stopped"
     assert_conserved(stopped)
-    resumed = run(small(), BUDGET, run_dir=run_dir, go_on=True)
+    resumed = run(small(), BUDGET, run_dir=run_dir, resume=True)
     assert digests(resumed) == digests(run(small(), BUDGET))

@@ -77,5 +77,5 @@ def test_kills_do_not_matter(
 def test_stops_do_not_matter(lead: int, run: Runner, same: Same, tmp_path: Path) -> None:
     config, run_dir = lander(lead=lead), tmp_path / "stopped"
     run(config, 6_000, run_dir=run_dir)
-    run(config, 12_000, run_dir=run_dir, go_on=True, actors=2)
-    same(lead, run(config, BUDGET, run_dir=run_dir, go_on=True))
+    run(config, 12_000, run_dir=run_dir, resume=True, actors=2)
+    same(lead, run(config, BUDGET, run_dir=run_dir, resume=True))

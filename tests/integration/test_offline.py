@@ -158,7 +158,7 @@ def test_it_goes_on_without_the_dataset(
     run(config, 2000, run_dir=tmp_path / "run")
     whole = digests(run(config, 4000))
     minari.delete_dataset(dataset)
-    status = run(config, 4000, run_dir=tmp_path / "run", go_on=True)
+    status = run(config, 4000, run_dir=tmp_path / "run", resume=True)
     assert digests(status) == whole
 
 
@@ -174,4 +174,4 @@ def test_a_run_with_another_beginning_is_another_run(
     run(offline(dataset), 1000, run_dir=tmp_path / "run")
     assert read_status(tmp_path / "run").exact
     with pytest.raises(OtherConfiguration, match="dataset = 'CartPole/elite-v0', not None"):
-        run(small(lead=0), 2000, run_dir=tmp_path / "run", go_on=True)
+        run(small(lead=0), 2000, run_dir=tmp_path / "run", resume=True)

@@ -91,5 +91,5 @@ def test_what_is_left_to_the_machine_is_settled_for_good(run: Runner, tmp_path: 
     written = (run_dir / "config.toml").read_text()
     assert "auto" not in written
     assert 'precision = "' in written
-    again = run(settings(), BUDGET, run_dir=run_dir, go_on=True)
+    again = run(settings(), BUDGET, run_dir=run_dir, resume=True)
     assert digests(again) == digests(run(settings(), BUDGET))

@@ -93,12 +93,12 @@ def test_empty_folders_may_be_there_and_keys_may_be_wanted_once(tmp_path: Path) 
 
 def test_keys_that_are_there_must_be_good_for_what_is_wanted(tmp_path: Path) -> None:
     authority.create(tmp_path / "keys", ["10.0.0.1"])
-    assert authority.are_there(tmp_path / "keys", ["localhost", "10.0.0.1"])
+    assert authority.has_keys(tmp_path / "keys", ["localhost", "10.0.0.1"])
     with pytest.raises(ConfigError, match=r"not valid for --host 10\.0\.0\.2; remove them"):
-        authority.are_there(tmp_path / "keys", ["10.0.0.1", "10.0.0.2"])
+        authority.has_keys(tmp_path / "keys", ["10.0.0.1", "10.0.0.2"])
     authority.create(tmp_path / "old", valid=timedelta(seconds=-1))
     with pytest.raises(ConfigError, match="expired"):
-        authority.are_there(tmp_path / "old")
+        authority.has_keys(tmp_path / "old")
 
 
 def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def pid(one: Supervisor) -> int:
 def test_child_that_ends_well_is_done(supervisor: Supervisor) -> None:
     start(supervisor, "child", "print('bye')")
     check_until(supervisor, lambda: supervisor.done)
-    assert supervisor.children[0].last_words() == "bye"
+    assert supervisor.children[0].log_tail() == "bye"
 
 
 def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
@@ -97,7 +97,7 @@ def test_log_that_somebody_removed_harms_nothing(supervisor: Supervisor) -> None
     (log_file,) = (child.log_file for child in supervisor.children)
     log_file.unlink()
     supervisor.check()
-    assert supervisor.children[0].last_words() == f"{log_file} is gone"
+    assert supervisor.children[0].log_tail() == f"{log_file} is missing"
 
 
 def test_log_without_end_is_shortened(
@@ -111,7 +111,7 @@ def test_log_without_end_is_shortened(
     log_file = supervisor.children[0].log_file
     assert log_file.stat().st_size <= 4000
     assert log_file.read_text().splitlines()[0] == "... earlier output was removed"
-    assert supervisor.children[0].last_words().splitlines()[-1] == "line 20000"
+    assert supervisor.children[0].log_tail().splitlines()[-1] == "line 20000"
 
 
 def test_end_kills_a_child_that_does_not_listen(

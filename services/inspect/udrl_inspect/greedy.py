@@ -1,4 +1,4 @@
-"""Warns if an agent does worse with greedy actions, as it often does after sampled training."""
+"""A warning for agents that do worse with greedy actions, as is common after sampled training."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from udrl_inspect.agents import Agent, evaluation_commands, stored_evaluation
 from udrl_replay.store import Store
 
 
-def caution(agent: Agent, run_dir: Path, told: Command, returns: Sequence[float]) -> str:
+def caution(agent: Agent, run_dir: Path, command: Command, returns: Sequence[float]) -> str:
     """Return a warning if greedy episodes obtained far less than the run's sampled evaluations.
 
     Far less means more than a standard deviation of the sampled returns, and significantly less.
@@ -19,21 +19,21 @@ def caution(agent: Agent, run_dir: Path, told: Command, returns: Sequence[float]
     Args:
         agent: the agent.
         run_dir: the run's directory.
-        told: its command. Only the run's own command can be compared.
-        returns: the returns that it obtained.
+        command: command of the episodes; nothing is compared unless it is that of evaluations.
+        returns: the obtained returns.
 
     Returns:
-        The finding and its remedy; empty if there is none, or nothing to compare with.
+        The finding and its remedy; empty if there is no finding, or nothing to compare with.
 
     Raises:
         StoreError: the run cannot be read.
     """
     usual = evaluation_commands(agent, episodes=1)[0]
-    is_asked_the_same = (told.desired_return, told.desired_horizon) == (
+    is_usual = (command.desired_return, command.desired_horizon) == (
         usual.desired_return,
         usual.desired_horizon,
     )
-    if not (returns and is_asked_the_same and told.temperature == 0 < usual.temperature):
+    if not (returns and is_usual and command.temperature == 0 < usual.temperature):
         return ""
     with closing(Store(run_dir, read_only=True)) as store:
         found = (

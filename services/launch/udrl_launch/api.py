@@ -101,22 +101,22 @@ def train(
     if resume and run_dir is None:
         raise ConfigError("resume needs run_dir, the directory of the run to resume")
     chosen = None if run_dir is None else Path(run_dir).absolute()
-    going_on = resume and chosen is not None and exists(chosen)
+    is_resumed = resume and chosen is not None and exists(chosen)
     gathered = gather(
         environment,
         preset_name=preset,
-        stored=settings_of(chosen) if going_on and chosen is not None else None,
+        stored=settings_of(chosen) if is_resumed and chosen is not None else None,
         options=settings,
     )
     folder = chosen or new_run_dir(directory_name(gathered.config))
     stop = threading.Event()
-    after = last_iteration(folder) if going_on else -1
+    after = last_iteration(folder) if is_resumed else -1
     watcher = _Callbacks(folder, after, gathered.config.evaluation.eval_episodes, stop)
     watcher.on_status += [callbacks] if callable(callbacks) else list(callbacks)
     watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation
     try:
         status = run_training(
-            gathered, folder, stop, go_on=resume, in_process=in_process, watcher=watcher
+            gathered, folder, stop, resume=resume, in_process=in_process, watcher=watcher
         )
     except Interrupted:
         status = read_status(folder)
@@ -137,8 +137,8 @@ class _Callbacks:
 
     Args:
         run_dir: the run's directory, whose metrics have the iterations.
-        after: the last iteration that was complete before; -1: none was.
-        eval_episodes: episodes of an evaluation.
+        after: the last iteration completed before; -1: none.
+        eval_episodes: number of episodes in an evaluation.
         stop: stops the run.
     """
 

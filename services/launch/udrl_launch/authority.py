@@ -27,7 +27,7 @@ AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
 _ALWAYS = ("localhost", "127.0.0.1", "::1")
 _LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(?:\.{_LABEL})*")
-#: Clocks differ between machines, so certificates are valid from a little earlier.
+#: Clocks differ between machines, so certificates are valid from slightly earlier.
 _CLOCKS_DIFFER = timedelta(hours=1)
 
 
@@ -38,7 +38,7 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
         folder: must not exist, or contain only folders, such as volumes.
         hosts: host names and IP addresses of the replay service. Those of the loopback interface
             are always included.
-        valid: validity of everything.
+        valid: validity of all certificates.
 
     Raises:
         ConfigError: a host is invalid, or the folder is not empty or cannot be written.
@@ -59,21 +59,21 @@ def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta
     try:
         if any(not path.is_dir() for path in folder.rglob("*")):
             raise ConfigError(
-                f"{folder} is not empty, and keys are never overwritten; name another folder, or "
+                f"{folder} is not empty, and keys are never overwritten; use another folder, or "
                 f"remove this one first"
             )
         _write(folder, files)
     except OSError as error:
         raise ConfigError(
-            f"cannot write keys to {folder}: {error.strerror}; name another folder"
+            f"cannot write keys to {folder}: {error.strerror}; use another folder"
         ) from error
 
 
-def are_there(folder: Path, hosts: Iterable[str] = ()) -> bool:
+def has_keys(folder: Path, hosts: Iterable[str] = ()) -> bool:
     """Return whether a folder has keys for every role, valid for these hosts.
 
     Raises:
-        ConfigError: its keys are expired, do not match or lack a host.
+        ConfigError: the keys are expired, do not match or lack a host.
     """
     files = [folder / role / name for role in ROLES for name in (CA, CERTIFICATE, KEY)]
     if not all(file.is_file() for file in files):
@@ -92,13 +92,13 @@ def are_there(folder: Path, hosts: Iterable[str] = ()) -> bool:
 
 
 class _Authority:
-    """Issues certificates. Holders of one trust no other authority."""
+    """A certificate authority. Holders of its certificates trust no other authority."""
 
     def __init__(self, valid: timedelta) -> None:
         self.key = ec.generate_private_key(ec.SECP256R1())
         now = datetime.now(UTC)
         self._valid = now - _CLOCKS_DIFFER, now + valid
-        # Names differ, so that no authority is mistaken for another of the same name.
+        # A unique name, so that authorities cannot be confused.
         self._name = _name(f"udrl authority {secrets.token_hex(4)}")
         self.certificate = self._signed(
             self._builder(self._name, self.key.public_key())
@@ -109,7 +109,7 @@ class _Authority:
     def issue(
         self, role: str, key: ec.EllipticCurvePublicKey, names: list[x509.GeneralName]
     ) -> bytes:
-        """Return a certificate, in PEM. Only one with names is valid for a server."""
+        """Return a certificate in PEM. It is valid for servers only if ``names`` are given."""
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = self._builder(_name(role), key)
         if names:

@@ -1,4 +1,4 @@
-"""What the shell completes: environments, presets, weights versions and settings."""
+"""Shell completion of environments, presets, weights versions and settings."""
 
 from contextlib import closing, suppress
 from pathlib import Path

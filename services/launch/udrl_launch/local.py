@@ -19,7 +19,7 @@ from udrl_proto.credentials import load
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 
-#: Seconds for which services look for the replay service after they start.
+#: Seconds for services to find the replay service after the start.
 _PATIENCE_S = "60"
 
 
@@ -36,7 +36,7 @@ class Local(Protocol):
         ...
 
     def note(self, status: Status) -> None:
-        """Take note of the run's progress."""
+        """Receive the run's status."""
         ...
 
     def end(self) -> None:
@@ -45,7 +45,7 @@ class Local(Protocol):
 
 
 class Processes:
-    """A process for each service, restarted when it dies."""
+    """A process for each service, restarted if it dies."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Processes:
         self._supervisor.check()
 
     def note(self, status: Status) -> None:
-        """Take note of the run's progress, to give up on services that die without progress."""
+        """Record the run's progress, to give up on services that die without progress."""
         self._supervisor.work = {
             "replay": status.episodes.delivered,
             "learner": status.weights_version,

@@ -1,4 +1,4 @@
-"""One service in one process: signals, death of the parent, memory, exit codes."""
+"""A service as a process: signals, death of the parent, memory, exit codes."""
 
 import ctypes
 import logging
@@ -26,7 +26,7 @@ _MOST_FILES = 65_536
 
 #: Parameters of the C library's ``mallopt``.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-#: The largest value of the second.
+#: Largest value of ``M_MMAP_THRESHOLD``.
 _MMAP_THRESHOLD = 32 * 2**20
 
 
@@ -39,7 +39,7 @@ def log_to_stderr(level: int = logging.INFO) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends, for whatever reason.
+    """Let the kernel kill this process when its parent ends (Linux).
 
     Nothing is lost: services may be killed at any time.
     """
@@ -52,8 +52,8 @@ def die_with_parent(parent: int) -> None:
 def allow_open_files() -> None:
     """Raise the limit of open files of this process; the default is often 1,024.
 
-    Each service that joins is a connection of the replay service. The limit is not raised further
-    than fleets need: some programs that environments start iterate over all possible files.
+    Each service that joins is a connection of the replay service. The limit is raised only as far
+    as fleets need: some programs that environments start iterate over all possible descriptors.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
@@ -66,9 +66,9 @@ def keep_freed_memory() -> None:
     """Let this process reuse freed memory, up to 1 GiB, instead of returning it to the kernel.
 
     Every update of a network for images allocates and frees some dozens of MB. By default that
-    memory is returned to the kernel, which fills it with zeros when it is allocated again: a
-    quarter of the update's time. Must be called before other threads start. Has no effect unless
-    the C library is glibc.
+    memory is returned to the kernel, which zeroes it when it is allocated again: a quarter of the
+    update's time. Must be called before other threads start. Has no effect unless the C library is
+    glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -96,8 +96,8 @@ def run_service(service: Callable[[threading.Event], None], grace_s: float = GRA
     files.
 
     Args:
-        service: must end soon after its argument is set.
-        grace_s: seconds that it has for that.
+        service: must return soon after its argument is set.
+        grace_s: seconds for that, after which the process exits.
     """
     allow_open_files()
     stop = threading.Event()

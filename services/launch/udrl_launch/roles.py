@@ -1,4 +1,4 @@
-"""The three services as functions, for a process or a thread of their own."""
+"""The three services as functions, each for its own process or thread."""
 
 import logging
 import threading
@@ -23,7 +23,8 @@ from udrl_replay.creation import (
     write_config,
 )
 from udrl_replay.replay_service import ReplayService
-from udrl_replay.resuming import closed_on_error, resume
+from udrl_replay.resuming import closed_on_error
+from udrl_replay.resuming import resume as resume_run
 from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
@@ -33,7 +34,7 @@ def open_run(
     run_dir: Path,
     settings: Settings,
     *,
-    go_on: bool,
+    resume: bool,
     allow_inexact: bool,
     listen: str | None,
     insecure: bool,
@@ -47,18 +48,18 @@ def open_run(
     Args:
         run_dir: its directory.
         settings: its settings and its budget.
-        go_on: resume the run in ``run_dir`` if there is one.
+        resume: resume the run in ``run_dir`` if there is one.
         allow_inexact: accept services of other numerics classes, and a changed environment.
         listen: the endpoint to listen on. None: a router's endpoint is used.
         insecure: allow it to be beyond loopback without keys.
         secure: whether keys were given.
-        check_environment: with ``go_on``, replay some stored episodes.
+        check_environment: when resuming, repeat some stored episodes to check the environment.
 
     Raises:
         UdrlError: the settings or the endpoint cannot be used, or the run exists already.
     """
-    if go_on and exists(run_dir):
-        store = resume(
+    if resume and exists(run_dir):
+        store = resume_run(
             run_dir, settings.config, allow_inexact=allow_inexact,
             check_environment=check_environment,
         )  # fmt: skip
@@ -86,14 +87,14 @@ def replay(
     credentials: Credentials | None = None,
     audit: float = 0.0,
 ) -> None:
-    """Serve a run until it has ended, at an endpoint of its own or through a router.
+    """Serve a run until it has ended, at its own endpoint or through a router.
 
     Raises:
         ConfigError: the endpoint cannot be used.
         StoreError: the run's file cannot be written.
         RunFailed: the run cannot continue, or an actor delivered false episodes (Deceived).
     """
-    run_dir = run_dir.absolute()  # environments may change the working directory for a moment
+    run_dir = run_dir.absolute()  # environments may change the working directory
     with closing(store):
         endpoint = listen or connect
         assert endpoint is not None
@@ -116,7 +117,7 @@ def replay(
 
 
 def require_torch() -> None:
-    """Require torch, which only a learner needs.
+    """Check that torch is installed, which only a learner needs.
 
     Raises:
         ConfigError: it is not installed.
@@ -126,7 +127,7 @@ def require_torch() -> None:
 
 
 def require_device(config: Config) -> None:
-    """Require the device that the run trains on.
+    """Check that this machine has the device on which the run trains.
 
     Raises:
         ConfigError: this machine does not have it.
@@ -165,7 +166,7 @@ def actor(
         address: where the run is.
         environments: how many to step at once.
         stop: ends the service.
-        hang_s: end the process if a round of environment steps takes longer. None: never.
+        hang_s: end the process if one step of all environments takes longer, seconds. None: never.
         first_index: index of its first environment.
     """
     with connected("actor", address, stop) as (transport, hello):

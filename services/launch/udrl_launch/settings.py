@@ -1,4 +1,4 @@
-"""Settings of a command: preset, then file, then command line; the last one is used."""
+"""Settings of a command: preset, then file, then command line; the last one wins."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -27,9 +27,9 @@ from udrl.errors import ConfigError
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 
-#: The name that stands for no preset.
+#: The name for no preset.
 NO_PRESET = "none"
-#: The preset of environments without their own.
+#: The preset for environments without their own.
 ANY_PRESET = "any"
 #: The value of a setting that is chosen automatically.
 _AUTO = "auto"
@@ -62,7 +62,7 @@ def _from_file(file: Path, environment: str) -> dict[str, Any]:
     return values
 
 
-#: Environments per actor, at most, if their number is not set: more rows per call gain little.
+#: Most environments per actor by default; more rows per call gain little.
 _MOST_ENVS = 16
 
 
@@ -103,7 +103,7 @@ class Settings(NamedTuple):
 
     @property
     def envs_per_actor(self) -> int:
-        """Environments that each actor steps at once; by default no more than are ever busy."""
+        """Number of environments per actor; by default no more than can be busy."""
         if self.fleet.envs_per_actor is not None:
             return self.fleet.envs_per_actor
         commands, evaluation = self.config.commands, self.config.evaluation
@@ -124,7 +124,7 @@ def gather(
     """Return the settings of a command.
 
     Args:
-        environment: its argument ENV, which overrides everything else.
+        environment: the argument ENV, which overrides everything else.
         preset_name: a preset, or :data:`NO_PRESET`. None: the one named after the environment, or
             :data:`ANY_PRESET` if there is none.
         file: a TOML file.
@@ -143,10 +143,10 @@ def gather(
     if file is not None:
         values |= _from_file(file, environment)
     values |= {name: value for name, value in options.items() if value is not None}
-    asked_for: list[str] = []
+    assigned: list[str] = []
     for text in assignments:
         name, value = parse_assignment(text)
-        asked_for.append(name)
+        assigned.append(name)
         if name == "environment":
             raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
         values[name] = value
@@ -167,7 +167,7 @@ def gather(
     values |= {name: OPEN[name] for name in left_open}
     if "baseline" in left_open and values.get("segments") == "all":
         values["baseline"] = "none"  # the only one that supports them
-    if stored is not None:  # they were chosen when the run was created
+    if stored is not None:  # these were chosen when the run was created
         values |= {name: stored[name] for name in left_open if name in stored}
         left_open.clear()
 
@@ -175,5 +175,5 @@ def gather(
         return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)
-    refuse_ineffective(config, asked_for)
+    refuse_ineffective(config, assigned)
     return Settings(config, part(Budget), part(Fleet), frozenset(left_open))

@@ -25,47 +25,48 @@ class Signals:
         received: the first signal that arrived, or None.
     """
 
-    _heard: "Signals | None" = None
+    _active: "Signals | None" = None
 
     def __init__(self, stop: threading.Event, grace_s: float) -> None:
         self.received: signal.Signals | None = None
         self._stop = stop
         self._grace_s = grace_s
         self._ended = threading.Event()
-        self._ear, self._mouth = socket.socketpair()
-        self._mouth.settimeout(0.0)
-        self._thread = threading.Thread(target=self._listen, name="signals", daemon=True)
+        self._receiver, self._sender = socket.socketpair()
+        self._sender.settimeout(0.0)
+        self._thread = threading.Thread(target=self._receive, name="signals", daemon=True)
 
     def __enter__(self) -> Self:
-        self._previous = {number: signal.signal(number, self._tell) for number in _STOPPING}
-        # The interpreter writes to it at once, and calls _tell once the main thread runs Python
-        # again. Some programs, such as event loops, replace it; _tell still works then.
-        self._wakeup_before = signal.set_wakeup_fd(self._mouth.fileno(), warn_on_full_buffer=False)
+        self._previous = {number: signal.signal(number, self._handle) for number in _STOPPING}
+        # The interpreter writes to this descriptor at once, but calls _handle only when the main
+        # thread runs Python again. Some programs, such as event loops, replace the descriptor;
+        # _handle still works then.
+        self._wakeup_before = signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
         self._thread.start()
-        Signals._heard = self
+        Signals._active = self
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        Signals._heard = None
+        Signals._active = None
         signal.set_wakeup_fd(self._wakeup_before)
         if self.received is None:  # else the process ends, and more signals may arrive
             self._restore()
-        self._say(0)
+        self._send(0)
         self._thread.join(1.0)
         self._close()
 
-    def _tell(self, number: int, frame: object) -> None:
+    def _handle(self, number: int, frame: object) -> None:
         # Must not take a lock: the next signal may arrive during this one.
-        self._say(number)
+        self._send(number)
 
-    def _say(self, number: int) -> None:
+    def _send(self, number: int) -> None:
         with contextlib.suppress(OSError):
-            self._mouth.send(bytes([number]))
+            self._sender.send(bytes([number]))
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         """Wait for SIGINT or SIGTERM; an environment may use other signals."""
-        while (number := self._ear.recv(1)[0]) not in _STOPPING:
+        while (number := self._receiver.recv(1)[0]) not in _STOPPING:
             if number == 0:  # the service has ended
                 return
         self.received = signal.Signals(number)
@@ -80,17 +81,17 @@ class Signals:
             signal.signal(number, handler)
 
     def _close(self) -> None:
-        self._mouth.close()
-        self._ear.close()
+        self._sender.close()
+        self._receiver.close()
 
     @classmethod
-    def forget(cls) -> None:
-        """Restore the signals in a forked child, whose signals would otherwise stop the parent."""
-        heard, cls._heard = cls._heard, None
-        if heard is not None:
+    def reset_in_child(cls) -> None:
+        """Restore the handlers in a forked child, whose signals would otherwise stop the parent."""
+        active, cls._active = cls._active, None
+        if active is not None:
             signal.set_wakeup_fd(-1)
-            heard._restore()
-            heard._close()
+            active._restore()
+            active._close()
 
 
-os.register_at_fork(after_in_child=Signals.forget)
+os.register_at_fork(after_in_child=Signals.reset_in_child)

@@ -17,9 +17,9 @@ log = logging.getLogger("udrl")
 #: Exit codes that a restart would only repeat (``docs/operations.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
-#: A child is given up after this many deaths without progress in between.
+#: Most deaths of a child without progress in between.
 _MOST_DEATHS = 6
-#: Bytes of a child's log after which only the last quarter is kept.
+#: Longest log of a child, bytes; when it is longer, only the last quarter is kept.
 _LONGEST_LOG = 1 << 20
 #: Seconds for services to end after the run has ended or after SIGTERM.
 END_S = 4.0
@@ -27,15 +27,16 @@ END_S = 4.0
 
 @dataclass
 class Child:
-    """A service in a process of its own.
+    """A service in a child process.
 
     Attributes:
-        name: for logs and for its log file.
+        name: name in log messages, and of the log file.
         arguments: arguments of the ``udrl`` command.
-        prefix: another program, with its arguments, that runs it, e.g. in a container.
-        starts: how often it was started.
-        deaths: how often it died since it last made progress.
-        work: its progress at its last death.
+        prefix: another program, with its arguments, that runs the command, e.g. in a container.
+        starts: number of starts.
+        deaths: number of deaths since the last progress.
+        work: progress at the last death.
+        done: whether it has ended and is not restarted.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Child:
                 [
                     *self.prefix,
                     sys.executable,
-                    "-P",  # a file of the user must not shadow a module of Python
+                    "-P",  # the user's files must not shadow Python's modules
                     "-m",
                     "udrl_launch",
                     *self.arguments,
@@ -71,17 +72,17 @@ class Child:
                 process_group=0,  # the parent handles Ctrl-C in the terminal
             )
 
-    def last_words(self) -> str:
-        """Return the end of its log, unless the log was removed."""
+    def log_tail(self) -> str:
+        """Return the last lines of the log, or a message if it was removed."""
         if not self.log_file.exists():
-            return f"{self.log_file} is gone"
+            return f"{self.log_file} is missing"
         return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
 
     def shorten_log(self) -> None:
-        """Shorten a log that has become long: environments may print without limit."""
+        """Shorten a long log: environments may print without limit."""
         if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
             end = _end_of(self.log_file, _LONGEST_LOG // 4)
-            # The child opened the file for appending, so it continues after this.
+            # The child has opened the file in append mode, so its output follows.
             with self.log_file.open("r+", encoding="utf-8") as log_file:
                 log_file.truncate(0)
                 log_file.write(f"... earlier output was removed\n{end}")
@@ -123,14 +124,14 @@ class Supervisor:
     """Keeps children running until they are done.
 
     When the first child has ended without an error, no child is restarted any more, and the others
-    get a few seconds to end too.
+    get a few seconds to end.
 
     Args:
-        log_dir: folder for their logs, one file each.
+        log_dir: folder for the logs, one file per child.
 
     Attributes:
-        work: progress of the children of each role (``actor``: episodes, ``learner``: versions). A
-            child that keeps dying without progress is given up, no matter how slowly it dies.
+        work: progress of the children of each role (``actor``: episodes, ``learner``: versions).
+            The run fails if a child dies repeatedly without progress, even at long intervals.
     """
 
     def __init__(self, log_dir: Path) -> None:
@@ -147,10 +148,11 @@ class Supervisor:
         self.children.append(child)
 
     def check(self) -> None:
-        """Restart children that died; to be called regularly.
+        """Restart children that died; call it regularly.
 
         Raises:
-            RunFailed: a child ended in a way that a restart would only repeat.
+            RunFailed: a child ended with an error that a restart would only repeat, or died too
+                often without progress.
         """
         for child in self.children:
             assert child.process is not None
@@ -172,7 +174,7 @@ class Supervisor:
             if code in FINAL_CODES or child.deaths >= _MOST_DEATHS:
                 often = "" if code in FINAL_CODES else f" {child.deaths} times without progress"
                 failure = RunFailed(
-                    f"{child.name} {how_it_ended(code)}{often}:\n{child.last_words()}"
+                    f"{child.name} {how_it_ended(code)}{often}:\n{child.log_tail()}"
                 )
                 failure.exit_code = code if code in FINAL_CODES else failure.exit_code
                 raise failure

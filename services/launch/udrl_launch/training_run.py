@@ -42,7 +42,7 @@ class Watchers:
     """Several watchers, and the last status that they received.
 
     Args:
-        clock: seconds.
+        clock: returns the time, seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -83,7 +83,7 @@ class Adviser:
 _STALE_S = 10.0
 #: Seconds between checks of the processes, and between status requests.
 _CHECK_S, _POLL_S = 0.1, 0.5
-#: Seconds for the replay service to answer after the start.
+#: Seconds for the replay service to reply after the start.
 _START_S = 60.0
 
 
@@ -92,7 +92,7 @@ def train(
     run_dir: Path,
     stop: threading.Event,
     *,
-    go_on: bool = False,
+    resume: bool = False,
     in_process: bool = False,
     allow_inexact: bool = False,
     listen: str | None = None,
@@ -107,13 +107,13 @@ def train(
         settings: the run's settings, budget and parallelism.
         run_dir: the run's directory.
         stop: ends the training early; the run can be resumed.
-        go_on: resume the run in ``run_dir`` if there is one.
+        resume: resume the run in ``run_dir`` if there is one.
         in_process: run all services as threads of this process, not as processes.
         allow_inexact: accept actors of other numerics classes.
         listen: the endpoint of the run. None: a free port of the loopback interface.
         insecure: allow ``listen`` to be beyond loopback without keys.
         keys: folder with the keys of all roles (``udrl keys create``). None: no authentication.
-        audit: share of the episodes that a second actor repeats, 0 to 1.
+        audit: share of the episodes that are audited, 0 to 1.
         watcher: receives the status.
 
     Raises:
@@ -128,17 +128,17 @@ def train(
         for role in ROLES:
             load(keys, role)
     store = open_run(
-        run_dir, settings, go_on=go_on, allow_inexact=allow_inexact, listen=endpoint,
+        run_dir, settings, resume=resume, allow_inexact=allow_inexact, listen=endpoint,
         insecure=insecure, secure=keys is not None,
     )  # fmt: skip
     settings = settings._replace(config=config_of(store), left_open=frozenset())
-    with ExitStack() as unless_it_goes_on:
-        unless_it_goes_on.callback(store.close)
+    with ExitStack() as closing_store:
+        closing_store.callback(store.close)
         progress = StoredRun(store, settings.budget).progress
         if progress.state == "ended":
             write_weights(run_dir, store, progress.latest_version)
             return read_status(run_dir)
-        unless_it_goes_on.pop_all()
+        closing_store.pop_all()  # the replay service continues with it
     kind = Threads if in_process else Processes
     services: Local = kind(
         run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
@@ -170,9 +170,9 @@ def _watch(
     services: Local, address: Address, stop: threading.Event, watcher: Watcher | None
 ) -> None:
     """Show the status until the services are done or ``stop`` is set."""
-    give_up = _GiveUp(services, stop)
-    with connected("observer", address, give_up) as (transport, hello):
-        asker = Asker(transport, hello.run_id, "the display", give_up)
+    stopped = _StoppedOrFailed(services, stop)
+    with connected("observer", address, stopped) as (transport, hello):
+        asker = Asker(transport, hello.run_id, "the display", stopped)
         asked = time.monotonic() - _POLL_S
         while not stop.wait(_CHECK_S):
             services.check()
@@ -191,8 +191,8 @@ def _watch(
                 watcher.show(status)
 
 
-class _GiveUp(threading.Event):
-    """Set when the user stops the run or a service fails, to end waits for an answer."""
+class _StoppedOrFailed(threading.Event):
+    """Is set when the user stops the run; raises when a service fails. Ends waits for a reply."""
 
     def __init__(self, services: Local, stop: threading.Event) -> None:
         super().__init__()

@@ -1,1 +1,1 @@
-"""The subcommands of ``udrl``, by what they are for."""
+"""The subcommands of ``udrl``."""

@@ -1,4 +1,4 @@
-"""``udrl health``: whether a service is alive, for process managers and container checks."""
+"""``udrl health``: health checks for process managers and containers."""
 
 from pathlib import Path
 
@@ -23,24 +23,24 @@ _ANSWER_S = 3.0
 def health(role: str, connect: str, keys: Path | None, patience: float, run_id: str | None) -> int:
     """Check whether a service is alive.
 
-    The replay service must answer; a learner or actor of this machine must take part in the run.
-    The exit code is 0 if so, else 6.
+    The replay service must reply; a learner or actor of this machine must have joined the run. The
+    exit code is 0 if so, else 6.
 
     Example: udrl health actor --connect tcp/127.0.0.1:7447
     """
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
-    # The replay service has no key as a client; an observer checks that its endpoint answers.
+    # The replay service's own certificate is not for clients, so connect as an observer.
     with connected("observer" if role == REPLAY else role, address) as (transport, hello):
         if role == REPLAY:
-            click.echo(f"run {hello.run_id} answers at {connect}")
+            click.echo(f"run {hello.run_id} is served at {connect}")
             return 0
         wanted = key_expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
         found = [key.rpartition("/")[2] for key in transport.present(wanted, _ANSWER_S)]
     there = [name for name in found if is_of_this_machine(name, role)]
     if not there:
         raise Unreachable(
-            f"no {role} of this machine ({host_name(role)}) takes part in run {hello.run_id}; "
-            f"see its log"
+            f"no {role} of this machine ({host_name(role)}) has joined run {hello.run_id}; see its "
+            f"log"
         )
-    click.echo(f"{there[0]} takes part in run {hello.run_id}")
+    click.echo(f"{there[0]} has joined run {hello.run_id}")
     return 0

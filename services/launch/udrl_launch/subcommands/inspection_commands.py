@@ -27,7 +27,7 @@ from udrl_launch.subcommands.options import (
 )
 from udrl_show.display import panel
 
-#: Characters of a line in a pipe or a file, so that none is wrapped.
+#: Width of output to a pipe or a file, characters; large, so that no line is wrapped.
 _WIDE = 1000
 
 
@@ -66,8 +66,8 @@ def evaluate(
         desired_return=desired_return, desired_horizon=desired_horizon,
     )  # fmt: skip
     result = agents.evaluate(agent, commands, envs)
-    if said := caution(agent, run_dir, commands[0], result.returns):
-        click.echo(said, err=True)
+    if warning := caution(agent, run_dir, commands[0], result.returns):
+        click.echo(warning, err=True)
     if as_json:
         report = {
             "run_dir": str(run_dir), "weights_version": agent.version,

@@ -40,7 +40,7 @@ def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool)
         raise ConfigError(
             'creating keys needs cryptography; install it with: pip install "udrl[secure]"'
         ) from error
-    if if_missing and authority.are_there(directory, hosts):
+    if if_missing and authority.has_keys(directory, hosts):
         click.echo(f"{directory} already has keys for every role")
         return 0
     authority.create(directory, hosts, timedelta(days))

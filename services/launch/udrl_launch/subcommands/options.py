@@ -15,7 +15,7 @@ from udrl_launch.settings import read_steps
 from udrl_proto.credentials import load
 from udrl_proto.session import check_endpoint
 
-#: The largest absolute return that is accepted.
+#: Largest accepted absolute value of a return.
 _MOST = 1e9
 
 
@@ -170,7 +170,7 @@ STEPS = _Steps()
 
 
 def version(text: str) -> int | Literal["latest", "best"]:
-    """Return what ``--weights`` says.
+    """Return the value of ``--weights``.
 
     Raises:
         ConfigError: it is neither ``latest`` nor ``best`` nor a number.
@@ -183,7 +183,7 @@ def version(text: str) -> int | Literal["latest", "best"]:
 
 
 def chosen_temperature(temperature: float | None, *, greedy: bool) -> float | None:
-    """Return what ``--temperature`` and ``--greedy`` say.
+    """Return the temperature that ``--temperature`` or ``--greedy`` gives; None: neither is given.
 
     Raises:
         ConfigError: both are given.

@@ -107,8 +107,8 @@ def play(
                 f"seed {rollout.command.environment_seed}: return "
                 f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
             )
-    if said := caution(agent, run_dir, command, obtained):
-        click.echo(said, err=True)
+    if warning := caution(agent, run_dir, command, obtained):
+        click.echo(warning, err=True)
     if video is not None and not as_json:
         click.echo(f"video: {shown(video)}")
     return 0

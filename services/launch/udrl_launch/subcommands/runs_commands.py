@@ -1,4 +1,4 @@
-"""``udrl runs`` and ``udrl plot``: several runs at once."""
+"""``udrl runs`` and ``udrl plot``: listing and comparing runs."""
 
 import shutil
 import sys
@@ -68,14 +68,14 @@ def _narrow(row: Sequence[str], width: int) -> list[str]:
 
 
 def _cells(summary: Summary) -> tuple[str, ...]:
-    """Return a line of the table; the directory, which may be long, stands last."""
+    """Return a row of the table; the directory, which may be long, is last."""
     ago = f"{duration(max(0.0, time.time() - summary.changed))} ago"
     if summary.state == "unreadable":
         return summary.state, "", "", "", "", ago, "", summary.run_dir
     best = "none yet" if summary.best_return is None else return_text(summary.best_return)
     steps = f"{summary.env_steps:,} of {summary.max_env_steps:,}"
     seed = str(summary.seed)
-    because = summary.ended_because.partition(":")[0]  # the rest stands below
+    because = summary.ended_because.partition(":")[0]  # the rest is printed below
     return summary.state, summary.environment, seed, steps, best, ago, because, summary.run_dir
 
 

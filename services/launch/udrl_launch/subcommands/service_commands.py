@@ -87,13 +87,13 @@ def replay(
         raise ConfigError("give either --listen ENDPOINT or --connect ENDPOINT")
     check_endpoint(listen or connect or "", secure=keys is not None)
     credentials = load(keys, REPLAY) if keys else None
-    settings = gather_settings(env, given, run_dir, go_on=resume)
+    settings = gather_settings(env, given, run_dir, resume=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
 
     def service(stop: threading.Event) -> None:
         log.info("run directory: %s", shown(run_dir))
         store = roles.open_run(
-            run_dir, settings, go_on=resume, allow_inexact=allow_inexact, listen=listen,
+            run_dir, settings, resume=resume, allow_inexact=allow_inexact, listen=listen,
             insecure=insecure, secure=keys is not None, check_environment=parent is None,
         )  # fmt: skip
         roles.replay(

@@ -1,4 +1,4 @@
-"""Options for settings, and the settings that result from them."""
+"""Command-line options for settings, and the settings that result from them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -46,16 +46,16 @@ def settings_options(command: Command) -> Command:
 
 
 def gather_settings(
-    env: str, given: dict[str, Any], run_dir: Path | None, *, go_on: bool
+    env: str, given: dict[str, Any], run_dir: Path | None, *, resume: bool
 ) -> Settings:
     """Return the settings of a command from its options."""
-    going_on = go_on and run_dir is not None and exists(run_dir)
+    is_resumed = resume and run_dir is not None and exists(run_dir)
     return gather(
         env,
         preset_name=given.pop("preset_name"),
         file=given.pop("file"),
         # As when the run was created, even if the presets have changed since.
-        stored=inspection.settings_of(run_dir) if going_on and run_dir is not None else None,
+        stored=inspection.settings_of(run_dir) if is_resumed and run_dir is not None else None,
         assignments=given.pop("assignments"),
         options=given,
     )

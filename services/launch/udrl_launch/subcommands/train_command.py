@@ -90,7 +90,7 @@ def train(
     """
     if resume and run_dir is None:
         raise ConfigError("--resume needs --run-dir, the directory of the run to resume")
-    settings = gather_settings(env, given, run_dir, go_on=resume)
+    settings = gather_settings(env, given, run_dir, resume=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
     log_to_stderr(logging.WARNING)
     warn_of_idle_environments(settings)
@@ -107,7 +107,7 @@ def train(
             watchers.add(stack.enter_context(Display()))
             watchers.add(Adviser())
             status = run_training(
-                settings, run_dir, stop, go_on=resume, in_process=in_process,
+                settings, run_dir, stop, resume=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
                 audit=audit, watcher=watchers,
             )  # fmt: skip
@@ -125,14 +125,14 @@ def warn_of_idle_environments(settings: Settings) -> None:
     """Warn if there are far more environments than exploration can keep busy."""
     config, fleet = settings.config, settings.fleet
     if config.commands.n_steps_per_iter is not None:
-        return  # the number of episodes is known once there are some
+        return  # the number of episodes depends on their lengths
     useful = config.commands.n_episodes_per_iter * (config.lead + 1)
-    asked_for = fleet.actors * (fleet.envs_per_actor or 1)
-    if asked_for > 2 * useful:
+    environments = fleet.actors * (fleet.envs_per_actor or 1)
+    if environments > 2 * useful:
         log.warning(
             "%d environments, but at most %d episodes can run at once (n_episodes_per_iter x "
             "(lead + 1)); the others are idle except during warm-up and evaluations",
-            asked_for, useful,
+            environments, useful,
         )  # fmt: skip
 
 
