@@ -63,7 +63,7 @@ def test_the_answer_where_an_agent_obeys_in_part() -> None:
 def test_the_answer_where_it_obeys_everywhere() -> None:
     assert answer(report(obeyed=(-20.0, 130.0), tolerance=4.0)) == (
         "Command returns between -20 and 130; mean absolute error 7.2, correlation 0.50. "
-        "These are all that were measured."
+        "No other returns were measured."
     )
 
 

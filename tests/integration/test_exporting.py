@@ -113,7 +113,7 @@ def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is the directory of a run"):
         export(ended_run, "--folder", ended_run)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="name a file that you can write to"):
+    with pytest.raises(ConfigError, match="choose a writable file"):
         export(ended_run, "--onnx", tmp_path / "file" / "agent.onnx")
     with pytest.raises(UdrlError, match="not kept"):
         export(ended_run, "--folder", tmp_path / "x", "--weights", "1")

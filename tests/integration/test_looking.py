@@ -146,7 +146,7 @@ def test_films_have_a_picture_for_every_moment(ended_run: Path, tmp_path: Path, 
     ("name", "says"),
     [
         ("film.avi", "ends with .mp4 or .gif"),
-        ("taken/film.gif", "name a file that you can write to"),
+        ("taken/film.gif", "choose a writable file"),
     ],
 )
 def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, says: str) -> None:
@@ -228,7 +228,7 @@ def test_runs_that_cannot_be_read_are_listed_too(ended_run: Path, tmp_path: Path
 def test_no_runs(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["runs", str(tmp_path)])
     assert "start one with: udrl train LunarLander-v3" in result.stderr
-    with pytest.raises(ConfigError, match=r"no such directory; name the folder"):
+    with pytest.raises(ConfigError, match=r"no such directory; give the folder"):
         call("runs", tmp_path / "nowhere")
 
 
@@ -245,7 +245,7 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
     assert drawn.tag.endswith("svg")
     with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
         compare([ended_run], tmp_path / "picture.bmp")
-    with pytest.raises(StoreError, match="name the directory of a run"):
+    with pytest.raises(StoreError, match="give the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")
 
 
@@ -295,7 +295,7 @@ def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path
 def test_metrics_that_no_run_wrote(ended_run: Path, tmp_path: Path, damaged: bytes) -> None:
     head = (ended_run / "metrics.csv").read_bytes().splitlines()[0]
     (tmp_path / "metrics.csv").write_bytes(damaged.replace(b"HEAD", head))
-    with pytest.raises(StoreError, match=r"metrics\.csv is not what a run writes"):
+    with pytest.raises(StoreError, match=r"metrics\.csv is damaged"):
         compare([tmp_path], tmp_path / "picture.png")
 
 

@@ -1,1 +1,1 @@
-"""Looking at runs and their agents from outside."""
+"""Inspecting runs and running their agents."""

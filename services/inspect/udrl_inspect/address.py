@@ -27,10 +27,10 @@ from udrl_replay.remedies import unwritable
 
 log = logging.getLogger("udrl")
 
-#: The file in a run directory that has the endpoint, while the run is served.
+#: File in a run directory with the endpoint, while the run is served.
 ENDPOINT_FILE = "endpoint.json"
 
-#: Characters of a machine's name in the names of its services, which are keys.
+#: Most characters of a machine's name in the names of its services, which are used in keys.
 _LONGEST_HOST = 30
 
 
@@ -38,9 +38,9 @@ class Address(NamedTuple):
     """Address of a run.
 
     Attributes:
-        endpoint: of its replay service or router.
+        endpoint: endpoint of the replay service or router.
         run_id: id of the run, if a router carries several.
-        patience_s: seconds to wait for the first answer.
+        patience_s: seconds to wait for the first reply.
         keys: folder with keys. None: no authentication.
     """
 
@@ -58,7 +58,7 @@ def connected(
 
     Raises:
         ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
-        Unreachable: no service, or no such run, answered in time.
+        Unreachable: no service, or no such run, replied in time.
         Interrupted: ``stop`` was set.
     """
     endpoint, run_id, patience_s, keys = address
@@ -90,8 +90,8 @@ def announced(run_dir: Path, endpoint: str) -> Iterator[None]:
 def served_at(run_dir: Path) -> str | None:
     """Return the endpoint at which this machine reaches a run; None if no service serves it.
 
-    The service holds the lock of the run directory. Its process id would not help: it means nothing
-    on other machines and in containers.
+    A service is recognised by the lock of the run directory, not by its process id, which means
+    nothing on other machines and in containers.
     """
     try:
         where = json.loads((run_dir / ENDPOINT_FILE).read_text(encoding="utf-8"))

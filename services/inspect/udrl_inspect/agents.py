@@ -32,7 +32,14 @@ _SHOW_S = 60.0
 
 
 class Agent(NamedTuple):
-    """A trained behavior function and its run."""
+    """A trained behavior function and the state of its run.
+
+    Attributes:
+        version: weights version.
+        buffer: replay buffer after ``iteration``.
+        iteration: last completed iteration of the run.
+        weights: the version's weights, safetensors.
+    """
 
     run_id: str
     config: Config
@@ -78,7 +85,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             )
         if found is None or not found.weights:
             raise StoreError(
-                f"weights {version!r} are not kept in {run_dir}; kept are versions "
+                f"weights {version!r} are not kept in {run_dir}; choose one of "
                 f"{store.versions_kept()}"
             )
         held = store.buffer(progress.iteration)
@@ -157,9 +164,9 @@ class Result(NamedTuple):
     """The command of an evaluation, and its results.
 
     Attributes:
-        desired_return: of every episode's command.
-        desired_horizon: of every episode's command, in steps.
-        temperature: of every episode's command.
+        desired_return: desired return of all commands.
+        desired_horizon: desired horizon of all commands, steps.
+        temperature: sampling temperature of all commands.
         evaluation: statistics of the returns.
         returns: the episodes' returns, in the order of their commands.
         lengths: the episodes' lengths in steps.
@@ -233,18 +240,18 @@ def evaluate_all(
 ) -> list[Result]:
     """Run several evaluations together, so that all environments stay busy.
 
-    Each result is that of :func:`evaluate`: an episode depends on its command alone.
+    Each result equals that of :func:`evaluate`: an episode depends only on its command.
 
     Args:
         agent: the agent.
-        evaluations: the commands of each, at least one.
-        environments: maximum number of episodes at the same time.
+        evaluations: the commands of each evaluation, at least one.
+        environments: most episodes at the same time.
         ended: called at the end of each episode.
 
     Raises:
         EnvironmentFault: the environment failed three times under the same command.
     """
-    # Evaluations of the same run have the same ids, and episodes are identified by them.
+    # Evaluations of the same run use the same command ids, so make them unique.
     first = evaluations[0][0].id if evaluations else 0
     numbered = [
         msgspec.structs.replace(command, id=first + k)

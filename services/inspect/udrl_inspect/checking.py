@@ -23,7 +23,7 @@ from udrl.episode import Episode
 from udrl.fitting import choose, fits
 from udrl.repeating import environment_digest, repeated_digest
 
-#: Random episodes, and seconds after which no further one is started.
+#: Number of random episodes, and seconds after which no further one is started.
 _EPISODES = 20
 _PATIENCE_S = 20.0
 _MIB = 2**20
@@ -39,7 +39,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
         observations: the observation space as the algorithm reads it.
         actions: the action space as the algorithm reads it.
         max_episode_steps: its step limit.
-        max_return: the highest possible return that it declares. None: it declares none.
+        max_return: the declared highest possible return. None: none is declared.
         repeats: whether an episode can be repeated from its seed, in the same instance and in
             another. Only then are runs exact.
         episodes: number of random episodes.
@@ -168,8 +168,9 @@ def _of_gymnasium(env: Any) -> list[str]:
             return [f"Gymnasium's checker reports: {_line(error)}"]
         finally:
             logger.setLevel(level)
-    said = [_line(w.message) for w in found]
-    return [f"Gymnasium's checker warns: {s}" for s in said if "infinity" not in s]  # true of most
+    lines = [_line(w.message) for w in found]
+    # Most environments have infinite bounds.
+    return [f"Gymnasium's checker warns: {text}" for text in lines if "infinity" not in text]
 
 
 def _line(message: object) -> str:

@@ -1,4 +1,4 @@
-"""Tidy tables: CSV files whose rows are typed and checked when they are read."""
+"""CSV files with typed rows, which are checked when they are read."""
 
 import csv
 import io
@@ -23,7 +23,7 @@ def put(path: Path, content: bytes) -> None:
 
 
 def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
-    """Write rows below a line with the field names; the file is written atomically."""
+    """Write rows below a header with the field names; the file is written atomically."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(kind.__struct_fields__)
@@ -63,6 +63,6 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
     except (OSError, ValueError, csv.Error, msgspec.ValidationError) as error:
         raise InvalidData(
             f"{path}: {error}; expected a CSV file with {', '.join(kind.__struct_fields__)}; "
-            f"delete it, and it is written again"
+            f"delete it, and it will be written again"
         ) from error
     return read

@@ -96,7 +96,7 @@ while not over:
 def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     """Write an agent, its settings and a model card with the results of its evaluation.
 
-    The card includes the report of ``udrl obedience`` if it is about these weights.
+    The card includes the report of ``udrl obedience`` if it was measured with these weights.
 
     Raises:
         ConfigError: the folder cannot be written, or it is a run directory.
@@ -104,7 +104,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
         StoreError: the run cannot be read.
     """
     if (folder / FILE).exists():
-        raise ConfigError(f"{folder} is the directory of a run; name another folder")
+        raise ConfigError(f"{folder} is the directory of a run; use another folder")
     with closing(Store(run_dir, read_only=True)) as store:
         progress = store.fact("progress", RunProgress)
         found = stored_evaluation(store, agent)
@@ -126,7 +126,7 @@ def export_model(agent: Agent, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(agent.behavior.model)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a file that you can write to") from error
+        raise ConfigError(f"{path}: {error.strerror}; choose a writable file") from error
 
 
 def export_buffer(run_dir: Path, name: str) -> int:
@@ -157,21 +157,21 @@ def _again(agent: Agent, progress: RunProgress) -> str:
     """Return a sentence about the weights that the card's command trains."""
     config = agent.config
     if progress.inexact_reason:
-        said = (
-            f"The run was not exact ({progress.inexact_reason}), so this command trains other "
+        text = (
+            f"The run was not exact ({progress.inexact_reason}), so this command trains different "
             f"weights."
         )
     elif progress.state == "ended" and agent.version == progress.latest_version:
-        said = "On the same kind of hardware this command trains bit-identical weights."
+        text = "On the same kind of hardware this command trains bit-identical weights."
     else:
-        said = (
+        text = (
             f"On the same kind of hardware, version {agent.version} of this command's run has "
             f"bit-identical weights. The run continues after it, and keeps the versions that it "
             f"evaluates."
         )
     if config.commands.dataset is not None:
-        said += f" It needs the dataset `{config.commands.dataset}`."
-    return said
+        text += f" It needs the dataset `{config.commands.dataset}`."
+    return text
 
 
 def _card(

@@ -29,7 +29,7 @@ def status_at(address: Address) -> Status:
     """Return the status of a run from its replay service.
 
     Raises:
-        Unreachable: no service answered.
+        Unreachable: no service replied.
         ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
     """
     with connected("observer", address) as (transport, hello):
@@ -45,7 +45,7 @@ def status_from(
     """Return the status of a run by its directory or its address.
 
     Raises:
-        UdrlError: as :func:`status_of` and :func:`status_at`.
+        UdrlError: see :func:`status_of` and :func:`status_at`.
     """
     return status_of(where, keys_dir, warn) if isinstance(where, Path) else status_at(where)
 
@@ -58,7 +58,7 @@ def status_of(
     Args:
         run_dir: the run's directory.
         keys_dir: folder with the keys of an observer.
-        warn: receives the reason if there is a service and it cannot be queried.
+        warn: called with the reason if there is a service that cannot be queried.
 
     Raises:
         StoreError: the directory holds no run, or it is damaged.

@@ -1,7 +1,7 @@
-"""How well an agent follows its commands: obtained against commanded returns and horizons.
+"""Obedience of an agent: obtained against commanded returns and horizons.
 
-The report is stored in the run's directory, where model cards and the board read it. It is a
-function of the run: commands and seeds are the same each time.
+The report is stored in the run's directory, where model cards and the board read it. It is
+reproducible: commands and seeds depend only on the run.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ from udrl_inspect.csv_tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
-#: Default tolerance: the largest difference between mean obtained and commanded return, as a share
+#: Default tolerance: largest difference between mean obtained and commanded return, as a fraction
 #: of the reachable range.
 TOLERANCE = 0.1
 
@@ -44,17 +44,17 @@ class ObediencePoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """The results of one command.
 
     Attributes:
-        desired_return: commanded.
-        desired_horizon: commanded, in steps.
+        desired_return: commanded return.
+        desired_horizon: commanded horizon, steps.
         episodes: number of episodes.
-        return_mean: mean of their returns.
+        return_mean: mean obtained return.
         return_std: standard deviation of the sample.
         return_ci95_low: lower end of the 95 % confidence interval of the mean.
-        return_ci95_high: upper end.
-        length_mean: mean of their lengths, in steps.
+        return_ci95_high: upper end of that interval.
+        length_mean: mean length, steps.
         length_std: standard deviation of the sample.
         length_ci95_low: lower end of the 95 % confidence interval of the mean.
-        length_ci95_high: upper end.
+        length_ci95_high: upper end of that interval.
     """
 
     desired_return: float
@@ -76,8 +76,8 @@ class Agreement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     Attributes:
         low: lowest command.
         high: highest command.
-        mean_absolute_error: mean difference between obtained and commanded values.
-        correlation: of commands and means; 0 if the means are all equal.
+        mean_absolute_error: mean absolute difference between obtained and commanded values.
+        correlation: correlation of commands and obtained means; 0 if all means are equal.
     """
 
     low: float
@@ -90,16 +90,16 @@ class ObedienceReport(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """The report on an agent.
 
     Attributes:
-        format: of the file.
-        run_id: the run that the agent comes from.
-        environment: Gymnasium's id.
+        format: version of the file format.
+        run_id: id of the agent's run.
+        environment: Gymnasium id.
         weights_version: the agent's weights version.
         temperature: sampling temperature; 0 = most likely action.
         episodes: number of episodes for each command.
         reachable_low: lowest reachable return (:func:`udrl.obedience_statistics.spread`).
         reachable_high: highest reachable return.
         tolerance: largest difference between a mean and its command that counts as obeyed.
-        by_return: results by commanded return in increasing order, each with its horizon.
+        by_return: results by commanded return in increasing order, each with a suitable horizon.
         by_horizon: results by commanded horizon in increasing order, with the desired return of
             evaluations. Empty if the horizon has no effect, or all episodes have the same length.
         all_returns: agreement over all of ``by_return``.
@@ -182,7 +182,7 @@ def plan_commands(
         commands(value, nearest(mean_of_nearest(value, returns, lengths)) if has_horizon else None)
         for value in (evenly(*desired_returns, points) if desired_returns else common)
     ]
-    by_return = list({told[0].desired_return: told for told in by_return}.values())
+    by_return = list({same[0].desired_return: same for same in by_return}.values())
     if len(by_return) < 2:
         only = by_return[0][0].desired_return
         raise ConfigError(
@@ -290,7 +290,7 @@ def save_report(run_dir: Path, report: ObedienceReport) -> Path:
 
 
 def report_of_agent(agent: Agent, run_dir: Path) -> ObedienceReport | None:
-    """Return the report in a run's directory if it is about this agent's weights, else None.
+    """Return the report in a run's directory if it was measured with this agent's weights.
 
     Raises:
         InvalidData: the file is invalid.
@@ -298,8 +298,8 @@ def report_of_agent(agent: Agent, run_dir: Path) -> ObedienceReport | None:
     report = load_report(run_dir)
     if report is None:
         return None
-    mine = (report.run_id, report.weights_version) == (agent.run_id, agent.version)
-    return report if mine else None
+    is_same = (report.run_id, report.weights_version) == (agent.run_id, agent.version)
+    return report if is_same else None
 
 
 def load_report(run_dir: Path) -> ObedienceReport | None:

@@ -9,7 +9,7 @@ import msgspec
 from udrl.evaluation import return_text
 from udrl_inspect.obedience_report import TOLERANCE, ObediencePoint, ObedienceReport
 
-#: Correlation from which on means follow their commands, even if they are not what is commanded.
+#: Least correlation at which means follow their commands without obeying them.
 _FOLLOWS = 0.8
 
 _HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "mean length", ""
@@ -64,7 +64,7 @@ def answer(report: ObedienceReport) -> str:
     if found is not None:
         whole = (found.low, found.high) == (every.low, every.high)
         outside = (
-            "These are all that were measured."
+            "No other returns were measured."
             if whole
             else "Outside this range, do not expect the commanded return."
         )
@@ -146,18 +146,18 @@ def table(report: ObedienceReport) -> str:
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in cells
     ]
-    said = [about(report), rule(report), horizons(report), best(report), answer(report)]
-    return "\n".join([said[0], "", *lines, "", *filter(None, said[1:])])
+    below = [rule(report), horizons(report), best(report), answer(report)]
+    return "\n".join([about(report), "", *lines, "", *filter(None, below)])
 
 
 def markdown(report: ObedienceReport) -> str:
     """Return the report for a model card."""
     lines = ["| " + " | ".join(_HEAD) + " |", "|" + "---:|" * len(_HEAD)]
     lines += ["| " + " | ".join(row) + " |" for row in _cells(report, report.by_return)]
-    said = [horizons(report), best(report)]
+    below = [horizons(report), best(report)]
     return "\n\n".join(
         [f"**{answer(report)}**", "\n".join(lines), f"{about(report)} {rule(report)}",
-         " ".join(filter(None, said))]
+         " ".join(filter(None, below))]
     )  # fmt: skip
 
 

@@ -29,10 +29,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         seed: its seed.
         env_steps: env steps so far.
         max_env_steps: its budget.
-        best_return: the highest mean return of an evaluation. None: there was no evaluation.
+        best_return: the highest mean return of an evaluation. None: no evaluation yet.
         changed: time of the last change of its store, seconds since 1970.
-        problem: why it failed, or cannot be read.
-        ended_because: why it is not running. Empty if it is, or if it cannot be read.
+        problem: why it failed or cannot be read.
+        ended_because: why it is not running. Empty if it is running or cannot be read.
     """
 
     run_dir: str
@@ -54,7 +54,7 @@ def find(folder: Path) -> list[Summary]:
         ConfigError: the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such directory; name the folder of your runs")
+        raise ConfigError(f"{folder}: no such directory; give the folder of your runs")
     summaries = map(summarise, run_directories(folder))
     return sorted(summaries, key=lambda s: s.changed, reverse=True)
 
@@ -78,8 +78,8 @@ def run_directories(folder: Path, seen: set[Path] | None = None) -> Iterator[Pat
 
 
 def summarise(run_dir: Path) -> Summary:
-    """Return a run in one line, also if it cannot be read."""
-    # Not SQLite's third file, which readers write too.
+    """Return the summary of a run, even if it cannot be read."""
+    # Without the -shm file, which readers write too.
     changed = max(map(_changed, (run_dir / FILE, run_dir / f"{FILE}-wal")))
     try:
         with closing(Store(run_dir, read_only=True)) as store:

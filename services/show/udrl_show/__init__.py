@@ -1,1 +1,1 @@
-"""Views of runs and agents: figures, films, a progress panel, metrics for other programs."""
+"""Views of runs and agents: figures, videos, a progress panel, metrics for other programs."""

@@ -42,18 +42,18 @@ _COLUMNS = (
 
 #: Label and divisor of the x-axis.
 _X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
-#: Settings that the label of a line names, at most.
+#: Most settings in the label of a line.
 _MOST_NAMED = 3
 
 
 class Curve(NamedTuple):
-    """What is drawn of one run.
+    """The data of one run for a figure.
 
     Attributes:
         run_dir: its directory.
         rows: its metrics.
         settings: its settings, without the seed; empty if it has no store.
-        final: its final evaluation.
+        final: its final evaluation. None: there is none.
     """
 
     run_dir: Path
@@ -108,8 +108,8 @@ def draw(run_dir: Path, title: str) -> Path:
 def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[str]:
     """Draw the evaluations of several runs, with a panel for each environment.
 
-    A run that is named is a line. Runs in a folder that is named are a line for each
-    configuration: the mean over its seeds.
+    A given run is a line. The runs in a given folder are a line for each configuration: the mean
+    over its seeds.
 
     Args:
         places: directories of runs, and folders of such directories; at least one.
@@ -117,10 +117,10 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
         x: the quantity on the x-axis.
 
     Returns:
-        Why runs in folders are missing in the figure.
+        The reasons why runs in folders are missing in the figure.
 
     Raises:
-        ConfigError: matplotlib is not installed, or the file's extension is another.
+        ConfigError: matplotlib is not installed, or the file's extension is not supported.
         StoreError: a run has no metrics, or no run has an evaluation.
     """
     pictures.check_name(picture)
@@ -152,10 +152,10 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
 
 
 def read(run_dir: Path) -> Curve:
-    """Return what is drawn of a run.
+    """Return the data of a run.
 
     Raises:
-        StoreError: it has no metrics.
+        StoreError: the run has no metrics.
     """
     path = run_dir / _METRICS
     try:
@@ -163,12 +163,11 @@ def read(run_dir: Path) -> Curve:
             rows = [{name: float(row[name] or "nan") for name in _COLUMNS} for row in _rows(file)]
     except OSError as error:
         raise StoreError(
-            f"{path}: {error.strerror}; name the directory of a run, or a folder of runs"
+            f"{path}: {error.strerror}; give the directory of a run, or a folder of runs"
         ) from error
     except (KeyError, ValueError, csv.Error) as error:
         raise StoreError(
-            f"{path} is not what a run writes ({error}); it is written again when the run is "
-            f"resumed"
+            f"{path} is damaged ({error}); resume the run, and it will be written again"
         ) from error
     try:
         with closing(Store(run_dir, read_only=True)) as store:
@@ -188,7 +187,7 @@ def _rows(file: TextIO) -> Iterator[dict[str, str]]:
 
 
 def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
-    """Return the lines of a figure, and why runs are missing in it."""
+    """Return the lines of a figure, and the reasons why runs are missing in it."""
     lines: list[Line] = []
     missing: list[str] = []
     drawn: set[Path] = set()
@@ -221,7 +220,7 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
 
 
 def _names(curves: Sequence[Curve]) -> list[str]:
-    """Return names that distinguish runs: as few of the last parts of their paths as do."""
+    """Return unique names of runs: as few of the last parts of their paths as possible."""
     parts = [curve.run_dir.resolve().parts for curve in curves]
     for n in range(1, max(map(len, parts))):
         names = ["/".join(p[-n:]) for p in parts]
@@ -231,13 +230,13 @@ def _names(curves: Sequence[Curve]) -> list[str]:
 
 
 def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the names of settings that are not the same everywhere."""
+    """Return the names of the settings that differ."""
     first = settings[0]
     return [n for n in first if any(s.get(n) != first[n] for s in settings[1:])]
 
 
 def _label(line: Line, differing: Sequence[str]) -> str:
-    """Return the label of several seeds: their number, and the settings that they share alone."""
+    """Return the label of several seeds: the settings that distinguish them, and their number."""
     named = [f"{n} = {line[0].settings.get(n)}" for n in differing[:_MOST_NAMED]]
     if len(differing) > _MOST_NAMED:
         named.append("…")
@@ -249,7 +248,7 @@ def _evaluated(curve: Curve) -> list[Row]:
 
 
 def _points(line: Line, x: X) -> list[LinePoint]:
-    """Return the evaluations of a line: of one run with their intervals, else mean and range."""
+    """Return the evaluations of a line, with intervals for one run and ranges for several."""
     column = "eval_at_env_steps" if x == "env_steps" else x
     unit = _X[x][1]
     if len(line) == 1:

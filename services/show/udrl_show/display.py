@@ -18,9 +18,9 @@ from udrl_proto.reports import EvaluationStatus, Status, Waiting
 from udrl_proto.text import printable
 
 _PLAIN_EVERY_S = 5.0
-#: Characters of the progress bar; fewer in a narrow terminal.
+#: Width of the progress bar, characters; less in a narrow terminal.
 _BAR_WIDTH = 20
-#: States as they are shown.
+#: Texts for the states.
 _STATES = {
     "running": "running",
     "closing": "final evaluation",
@@ -155,7 +155,7 @@ def panel(status: Status) -> Table:
 
 
 class Phrases:
-    """Text that is wrapped between phrases, and within a phrase only if it is wider than a line.
+    """Text that is wrapped between phrases; a phrase wider than a line is wrapped too.
 
     Args:
         phrases: separated by spaces when they share a line.
@@ -176,7 +176,7 @@ class Phrases:
 
 
 def wrapped(phrases: Iterable[str], width: int) -> list[str]:
-    """Return phrases as lines of at most ``width`` characters, if every phrase is that short."""
+    """Return phrases as lines of at most ``width`` characters; a longer phrase is a line itself."""
     lines: list[str] = []
     for phrase in phrases:
         if lines and len(lines[-1]) + 1 + len(phrase) <= width:
@@ -231,7 +231,7 @@ def _evaluation(result: EvaluationStatus | None) -> list[str]:
 
 
 def returns(status: Status) -> list[str]:
-    """Return the returns in the buffer, each with its name."""
+    """Return the lowest, mean and highest return in the buffer as phrases."""
     held = status.buffer
     if held.return_min is None or held.return_mean is None or held.return_max is None:
         return ["empty"]
@@ -241,7 +241,7 @@ def returns(status: Status) -> list[str]:
 
 
 def time_left(status: Status) -> str:
-    """Return the time until the budget is spent; an evaluation may reach ``stop_return`` before."""
+    """Return the time left; "at most" if an evaluation may reach ``stop_return`` earlier."""
     most = "" if status.stop_return is None else "at most "
     return f"{most}{duration(status.time_left_s or 0.0)} left"
 

@@ -10,7 +10,7 @@ from udrl_inspect.inspection import settings_of
 from udrl_proto.reports import Status
 from udrl_show.metrics_file import MetricsReader
 
-#: Tags as other libraries name them, and columns.
+#: Columns by tag; the tags are those of other libraries.
 TAGS = {
     "rollout/ep_rew_mean": "explored_return",
     "rollout/desired_return_min": "commanded_min",
@@ -23,7 +23,7 @@ TAGS = {
     "time/iterations": "iteration",
     "time/wall_s": "wall_s",
 }
-#: Tags of evaluations, which have env steps of their own.
+#: Columns by tag for evaluations, which have their own env steps.
 EVALUATION_TAGS = {
     "eval/mean_reward": "eval_mean",
     "eval/ci95_low": "eval_ci95_low",
@@ -31,16 +31,16 @@ EVALUATION_TAGS = {
     "eval/desired_return": "eval_desired_return",
     "eval/desired_horizon": "eval_desired_horizon",
 }
-#: Tags of values that follow from two rows.
+#: Tags of values computed from two rows.
 DERIVED_TAGS = ("rollout/ep_len_mean", "time/fps")
 
 FOLDER = "tensorboard"
 
 
 class EventFiles:
-    """The event files of a run, written again from its first iteration at every start.
+    """The event files of a run, rewritten from the first iteration at every start.
 
-    They have the run's settings as hyperparameters.
+    The run's settings are their hyperparameters.
 
     Args:
         run_dir: the run's directory.
@@ -112,7 +112,7 @@ class EventFiles:
             self._writer = self._kind(str(self._folder))
         except OSError as error:
             raise ConfigError(
-                f"{self._folder}: {error.strerror}; make it a folder that you can write to"
+                f"{self._folder}: {error.strerror}; make it a writable folder"
             ) from error
 
     def _write_settings(self, run_id: str) -> None:

@@ -1,4 +1,4 @@
-"""Films of episodes as MP4 or GIF, with a caption below every picture."""
+"""Videos of episodes as MP4 or GIF, with a caption below every frame."""
 
 import subprocess
 import tempfile
@@ -13,14 +13,14 @@ from udrl.errors import ConfigError
 Picture = npt.NDArray[np.uint8]
 
 _CAPTION_HEIGHT = 26
-#: Smaller pictures are enlarged to at least this width in pixels.
+#: Least width of a video, pixels; smaller frames are enlarged.
 _LEAST_WIDTH = 320
-#: Maximum of GIFs; browsers slow down faster ones.
+#: Most frames per second of a GIF; browsers slow down faster ones.
 _GIF_FPS = 25
 #: Options of ffmpeg for each kind of file.
 _KINDS = {
     ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "15"),
-    # The palette is computed from all pictures, so ffmpeg keeps them in memory until the end.
+    # The palette is computed from all frames, so ffmpeg keeps them in memory until the end.
     ".gif": (
         "-filter_complex",
         "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
@@ -34,21 +34,21 @@ def check_name(path: Path) -> None:
     """Check the extension of a file name.
 
     Raises:
-        ConfigError: films cannot be written as such files.
+        ConfigError: the extension is not supported.
     """
     if path.suffix not in _KINDS:
         raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
 
 
 class Film:
-    """A film that pictures are appended to.
+    """Writes a video frame by frame.
 
     Args:
         path: ``.mp4`` (H.264) or ``.gif``.
-        fps: pictures per second. A GIF drops pictures to keep this speed.
+        fps: frames per second. A GIF drops frames to keep this speed.
 
     Raises:
-        ConfigError: the extension is another, the file cannot be written, or the extra is not
+        ConfigError: the extension is not supported, the file cannot be written, or the extra is not
             installed.
     """
 
@@ -59,7 +59,7 @@ class Film:
             from PIL import Image, ImageDraw, ImageFont
         except ModuleNotFoundError as error:
             raise ConfigError(
-                f'films need {error.name}; install it with: pip install "udrl[play]"'
+                f'videos need {error.name}; install it with: pip install "udrl[play]"'
             ) from error
         self._ffmpeg, self._image, self._draw = imageio_ffmpeg.get_ffmpeg_exe, Image, ImageDraw
         self._font = ImageFont.load_default(14)
@@ -71,7 +71,7 @@ class Film:
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the film
 
     def add(self, picture: Picture, caption: str) -> None:
-        """Append a picture, uint8 [height, width, 3]; the first one sets the size of the film."""
+        """Append a picture, uint8 [height, width, 3]; the first one sets the size of the video."""
         self._seen += 1
         if (self._seen - 1) % self._every:
             return
@@ -139,7 +139,7 @@ class Film:
             self._path.open("wb").close()
         except OSError as error:
             raise ConfigError(
-                f"--video {self._path}: {error.strerror}; name a file that you can write to"
+                f"--video {self._path}: {error.strerror}; choose a writable file"
             ) from error
         arguments = (
             "-y", "-loglevel", "error",

@@ -10,8 +10,8 @@ class NewRows(NamedTuple):
     """Rows that were appended since the last call.
 
     Attributes:
-        is_new_file: whether they are the first rows of another file: the first one, or one that a
-            restarted replay service has written.
+        is_new_file: whether the file is read for the first time, or was rewritten by a restarted
+            replay service.
         rows: values by column.
     """
 
@@ -20,7 +20,7 @@ class NewRows(NamedTuple):
 
 
 class MetricsReader:
-    """Reads each row of a run's ``metrics.csv`` once, and again if the file is written again.
+    """Reads each row of a run's ``metrics.csv`` once, and again if the file is rewritten.
 
     Args:
         run_dir: the run's directory.

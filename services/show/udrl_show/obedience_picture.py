@@ -24,8 +24,8 @@ def draw(report: ObedienceReport, picture: Path) -> None:
         picture: ``.png``, ``.svg`` or ``.pdf``.
 
     Raises:
-        ConfigError: matplotlib is not installed, the extension is another, or the file cannot be
-            written.
+        ConfigError: matplotlib is not installed, the extension is not supported, or the file cannot
+            be written.
     """
     pictures.check_name(picture)
     figure, axes = pictures.empty(2 if report.by_horizon else 1)

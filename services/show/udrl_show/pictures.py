@@ -1,4 +1,4 @@
-"""Figures by matplotlib: creating an empty one, and writing it to a file."""
+"""Creating and saving matplotlib figures."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 #: File name extensions of figures.
 _KINDS = (".png", ".svg", ".pdf")
-#: Panels in a row.
+#: Most panels in a row.
 _MOST_COLUMNS = 3
 
 
@@ -20,7 +20,7 @@ def check_name(picture: Path) -> None:
     """Check the extension of a file name.
 
     Raises:
-        ConfigError: figures cannot be written as such files.
+        ConfigError: the extension is not supported.
     """
     if picture.suffix not in _KINDS:
         raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
@@ -52,7 +52,7 @@ def save(figure: "Figure", picture: Path) -> None:
     """Write a figure atomically.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     aside = picture.with_name(f"{picture.name}.part")
     try:
@@ -60,6 +60,4 @@ def save(figure: "Figure", picture: Path) -> None:
         figure.savefig(aside, format=picture.suffix[1:], dpi=130)
         os.replace(aside, picture)
     except OSError as error:
-        raise ConfigError(
-            f"{picture}: {error.strerror}; name a file that you can write to"
-        ) from error
+        raise ConfigError(f"{picture}: {error.strerror}; choose a writable file") from error

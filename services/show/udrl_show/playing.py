@@ -1,4 +1,4 @@
-"""``udrl play``: episodes shown in a window or recorded as a film."""
+"""``udrl play``: episodes shown in a window or recorded as a video."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -17,7 +17,7 @@ from udrl.streams import Purpose, stream_key
 from udrl_inspect.agents import Agent
 from udrl_show.film import Film, Picture
 
-#: Pictures per second if the environment does not declare a speed.
+#: Frames per second if the environment does not declare them.
 _USUAL_FPS = 30.0
 
 
@@ -38,7 +38,7 @@ def with_seeds(commands: list[Command], first: int | None = None) -> list[Comman
 
     Args:
         commands: the commands of an evaluation.
-        first: the first seed; each further one adds 1. None: the seeds of the commands.
+        first: seed of the first command; each further one adds 1. None: the commands' own seeds.
     """
     seeds = [
         command.environment_seed if first is None else (first + k) % 2**31
@@ -85,12 +85,12 @@ def play(
     Args:
         agent: the agent.
         commands: its commands.
-        video: file for a film of all episodes.
-        open_screen: opens a display with a number of pictures per second. The display can stop
+        video: file for a video of all episodes.
+        open_screen: opens a display; its argument is the frames per second. The display can stop
             playing.
 
     Raises:
-        ConfigError: the film cannot be written.
+        ConfigError: the video cannot be written.
         EnvironmentFault: the environment raised an exception.
         UnsupportedEnvironment: the environment has no pictures.
     """
@@ -123,7 +123,7 @@ def _watch(rollout: Rollout, film: Film | None, screen: Screen | None) -> bool:
 
 
 def caption(rollout: Rollout) -> str:
-    """Return the return so far, and the rest of the command."""
+    """Return the text below a frame: the return so far, and the rest of the command."""
     return (
         f"step {rollout.steps}: return {return_text(rollout.episode_return)}; desired: "
         f"{return_text(rollout.desired_return)} more within {max(rollout.desired_horizon, 1)} steps"

@@ -10,20 +10,20 @@ STATES = ("running", "closing", "ended", "failed", "stopped")
 
 #: Name, status field and description of each metric, and whether it is a counter.
 _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
-    ("udrl_iteration", "iteration", "The last iteration completed.", False),
+    ("udrl_iteration", "iteration", "Last completed iteration.", False),
     ("udrl_env_steps", "env_steps", "Steps of warm-up and exploratory episodes.", True),
     ("udrl_eval_env_steps", "eval_env_steps", "Steps of evaluation episodes.", True),
-    ("udrl_env_steps_per_second", "env_steps_per_s", "In the last 10 s.", False),
-    ("udrl_max_env_steps", "max_env_steps", "The budget.", False),
-    ("udrl_wall_seconds", "wall_s", "Time that the run was served.", True),
-    ("udrl_time_left_seconds", "time_left_s", "Until the budget is spent.", False),
-    ("udrl_weights_version", "weights_version", "The newest.", False),
+    ("udrl_env_steps_per_second", "env_steps_per_s", "Env steps per second, last 10 s.", False),
+    ("udrl_max_env_steps", "max_env_steps", "Budget of env steps.", False),
+    ("udrl_wall_seconds", "wall_s", "Running time.", True),
+    ("udrl_time_left_seconds", "time_left_s", "Time until the budget is spent.", False),
+    ("udrl_weights_version", "weights_version", "Newest weights version.", False),
     ("udrl_weights_lag_versions", "weights_lag", "Versions the slowest actor is behind.", False),
     ("udrl_weights_lag_seconds", "weights_lag_s", "From a version to its first command.", False),
-    ("udrl_loss_nats", "loss", "Of the newest version.", False),
+    ("udrl_loss_nats", "loss", "Training loss of the newest version.", False),
     ("udrl_env_failures", "env_failures", "Failures that actors reported.", True),
     ("udrl_useful_concurrency", "useful_concurrency", "Episodes that can run at once.", False),
-    ("udrl_exact", "exact", "1: the result is a function of the configuration.", False),
+    ("udrl_exact", "exact", "1: the result depends only on the configuration.", False),
 )
 
 
@@ -31,7 +31,7 @@ class StatusCollector:
     """Collects a status for Prometheus.
 
     Args:
-        get: returns the status. None: it is unknown, and only ``udrl_up`` is exported, as 0.
+        get: returns the status. If it returns None, only ``udrl_up`` is exported, as 0.
     """
 
     def __init__(self, get: Callable[[], Status | None]) -> None:
@@ -62,7 +62,9 @@ class StatusCollector:
             return family
 
         status = self._get()
-        yield GaugeMetricFamily("udrl_up", "1: the run answers.", value=float(status is not None))
+        yield GaugeMetricFamily(
+            "udrl_up", "1: the status is known.", value=float(status is not None)
+        )
         if status is None:
             return
         for name, attribute, about, grows in _NUMBERS:
@@ -82,20 +84,22 @@ class StatusCollector:
             ("udrl_eval_return", status.evaluation),
             ("udrl_closing_eval_return", status.closing_evaluation),
         ):
-            yield labelled(name, "Of the last evaluation's episodes.", ["stat"], _stats(found))
+            yield labelled(name, "Returns of the evaluation.", ["stat"], _stats(found))
         held = status.buffer
         yield labelled(
-            "udrl_replay_return", "Of the replay buffer's episodes.", ["stat"],
+            "udrl_replay_return", "Returns in the replay buffer.", ["stat"],
             [(["min"], held.return_min), (["mean"], held.return_mean), (["max"], held.return_max)],
         )  # fmt: skip
-        yield GaugeMetricFamily("udrl_replay_episodes", "In the buffer.", value=held.episodes)
+        yield GaugeMetricFamily(
+            "udrl_replay_episodes", "Episodes in the replay buffer.", value=held.episodes
+        )
         for name, ledger in (
             ("udrl_commands", status.commands),
             ("udrl_episodes", status.episodes),
         ):
             fields = ledger.__struct_fields__
             yield labelled(
-                name, "The ledger.", ["state"],
+                name, "Conservation ledger.", ["state"],
                 [([field], float(getattr(ledger, field))) for field in fields],
             )  # fmt: skip
         actors = status.actors
@@ -104,13 +108,13 @@ class StatusCollector:
             (
                 "udrl_actor_env_steps_per_second",
                 "env_steps_per_s",
-                "As reported by the actor.",
+                "Env steps per second, as reported by the actor.",
                 False,
             ),
             ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
-            ("udrl_actor_reruns", "reruns", "Commands that another actor had before.", True),
+            ("udrl_actor_reruns", "reruns", "Commands that had been dealt before.", True),
             ("udrl_actor_failures", "failures", "Commands that failed.", True),
-            ("udrl_actor_last_seen_seconds", "last_seen_s", "Since its last message.", False),
+            ("udrl_actor_last_seen_seconds", "last_seen_s", "Time since its last message.", False),
         ):
             yield labelled(
                 name, about, ["actor", "host"],
@@ -118,11 +122,11 @@ class StatusCollector:
                 grows=grows,
             )  # fmt: skip
         yield labelled(
-            "udrl_waiting_seconds", "Of a service for another.", ["who", "for"],
+            "udrl_waiting_seconds", "Waiting time of a service.", ["who", "for"],
             [([w.who, w.on], w.seconds) for w in status.waiting],
         )  # fmt: skip
         yield GaugeMetricFamily(
-            "udrl_quarantined_actors", "Actors that are refused.", value=len(status.quarantined)
+            "udrl_quarantined_actors", "Quarantined actors.", value=len(status.quarantined)
         )
 
 
@@ -135,12 +139,12 @@ class Exporter:
     """Serves metrics to Prometheus over HTTP.
 
     Args:
-        get: see :class:`StatusCollector`.
+        get: returns the status, as for :class:`StatusCollector`.
         host: address to listen on.
         port: port to listen on; 0 = any free port.
 
     Attributes:
-        port: the port.
+        port: the port that is listened on.
 
     Raises:
         ConfigError: the extra is not installed, or the address cannot be used.
