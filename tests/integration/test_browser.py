@@ -208,7 +208,7 @@ def test_a_command_is_given_and_obeyed(
             f"Commanded {commanded} in 4 steps; obtained {commanded} in 4 steps."
         )
         expect(page.locator("#obeyed circle")).to_have_count(number)
-    expect(page.locator("#no-picture")).to_contain_text("draws no pictures")
+    expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
 
 
 def test_keyboard_only(
@@ -357,7 +357,7 @@ def test_the_map_shows_which_returns_the_agent_obeys(
     latest = report.weights_version
     save_report(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
     expect(said).to_contain_text(
-        f"Measured with weights version {latest - 1}; the latest are {latest}.", timeout=SOON
+        f"Measured with weights version {latest - 1}; the latest is {latest}.", timeout=SOON
     )
     expect(shaded).to_have_count(0)
 
@@ -373,7 +373,7 @@ def test_the_server_dies_and_comes_back(
     start(page, 1)
     expect(rows(page)).to_have_count(1, timeout=SOON)
     first.kill()
-    expect(page.get_by_role("alert")).to_contain_text("does not answer", timeout=SOON)
+    expect(page.get_by_role("alert")).to_contain_text("does not reply", timeout=SOON)
     second = cli("board", str(obedient), "--port", port).process
     assert second.stdout is not None
     assert second.stdout.readline()
@@ -410,9 +410,7 @@ def test_a_failed_run_says_why_and_how_to_resume(
     expect(page.get_by_role("status").first).to_have_text("Failed", timeout=SOON)
     expect(page.get_by_role("alert")).to_contain_text("reproduce it with: udrl reproduce")
     again = f"udrl train flaky_environments:Cursed-v0 --run-dir {run_dir} --resume"
-    expect(page.locator("#next")).to_contain_text(
-        f"Resume the run when the cause is fixed: {again}"
-    )
+    expect(page.locator("#next")).to_contain_text(f"Fix the cause, then resume the run: {again}")
 
 
 def test_a_stopped_run_says_how_to_resume(
@@ -447,7 +445,7 @@ def test_several_runs_are_compared(
     expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
     start(page, 3)
     expect(rows(page)).to_have_count(1, timeout=SOON)
-    expect(page.locator("#no-picture")).to_contain_text("draws no pictures")
+    expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
 
 
 def test_quarantined_actors_are_named(

@@ -1,1 +1,1 @@
-"""The board: a page in the browser that shows a run and commands its agent."""
+"""The board: a web page that shows runs and gives commands to their agents."""

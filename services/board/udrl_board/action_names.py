@@ -1,4 +1,4 @@
-"""Names of actions and of their values, as the board shows them."""
+"""Names of actions and their values, for the board."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from gymnasium import spaces
 from udrl.environments.adapter import Adapter
 from udrl.environments.conversions import leaves_within
 
-#: Actions of environments that do not name them, by what their ids begin with.
+#: Names of actions that environments do not declare, by prefix of the environment's id.
 _KNOWN = {
     "Acrobot": ("torque -1", "no torque", "torque +1"),
     "Blackjack": ("stick", "hit"),
@@ -29,7 +29,7 @@ class ActionComponent(msgspec.Struct, frozen=True, kw_only=True):
     """One component of an action.
 
     Attributes:
-        name: empty if it is the only one.
+        name: name of the component; empty if it is the only one.
         values: names of its values.
     """
 
@@ -38,7 +38,7 @@ class ActionComponent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def action_components(env: Adapter) -> list[ActionComponent]:
-    """Return the names of an action's components, in the order of their probabilities."""
+    """Return an action's components, in the order of their probabilities."""
     components: list[tuple[str, list[str]]] = []
     for path, space in leaves_within(env.env.action_space):
         values = _values_of(env, path, space, len(components))
@@ -54,7 +54,7 @@ def action_components(env: Adapter) -> list[ActionComponent]:
 def _values_of(
     env: Adapter, path: tuple[Any, ...], space: spaces.Space[Any], first: int
 ) -> list[list[str]]:
-    """Return the names of the values of one leaf's components; ``first`` is their place."""
+    """Return the names of the values of a leaf's components, the first with index ``first``."""
     match space:
         case spaces.Discrete(n=n, start=start):
             known = () if path else _declared(env) or _known(env)
@@ -71,7 +71,7 @@ def _values_of(
 def _bins(
     env: Adapter, path: tuple[Any, ...], space: spaces.Space[Any], first: int
 ) -> list[list[str]]:
-    """Return the numbers that the bins of a ``Box`` stand for."""
+    """Return the values of a ``Box`` that its bins represent."""
     ns = env.actions.plain.components
     last = first + int(np.prod(space.shape or ()))
 
@@ -87,14 +87,14 @@ def _bins(
 
 
 def _declared(env: gym.Env[Any, Any]) -> tuple[str, ...]:
-    """Return names that the environment gives: as Atari games do, or in its metadata."""
+    """Return the names that the environment declares, by Atari's method or in its metadata."""
     try:
         meanings: Callable[[], list[str]] | None = getattr(
             env.unwrapped, "get_action_meanings", None
         )
         found = meanings() if callable(meanings) else env.metadata.get("action_names", ())
         return tuple(str(name).lower().replace("_", " ") for name in found)
-    except Exception:  # noqa: BLE001 - a foreign environment's, and names are a convenience
+    except Exception:  # noqa: BLE001 - foreign code, and names are optional
         return ()
 
 

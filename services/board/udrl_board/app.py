@@ -1,4 +1,4 @@
-"""The board's web server: the page, its news, and a stage for every viewer."""
+"""The board's web server: the page, its updates, and a stage for each viewer."""
 
 import asyncio
 import contextlib
@@ -30,13 +30,13 @@ from udrl_board.stage_messages import Moment, StageProblem, StageRequest
 
 log = logging.getLogger("udrl")
 
-#: Stages at a time; each has an environment of its own.
+#: Most stages at once; each has its own environment.
 MOST_STAGES = 8
-#: Bytes of a request; the web server checks.
+#: Largest request to a stage, bytes; the web server checks it.
 MOST_BYTES = 4096
 #: Seconds without a request after which an idle stage is closed.
 IDLE_S = 300.0
-#: Seconds that a picture may take to be sent; a slower viewer is disconnected.
+#: Timeout for sending a picture, seconds; a slower viewer is disconnected.
 _SEND_S = 20.0
 
 
@@ -59,12 +59,10 @@ def make_app(
     """Return the web application.
 
     Args:
-        feeds: of the runs that it shows.
-        hosts: names that it may be called by; empty: any. A page of elsewhere whose name leads here
-            (DNS rebinding) is refused by it.
-        token: what a browser must know; empty: nothing.
-        origins: of pages that are the board's own as a proxy shows them, e.g.
-            ``https://hub.example``.
+        feeds: the feeds of the runs to show.
+        hosts: host names that requests may use; empty: any. Prevents DNS rebinding.
+        token: token that browsers need; empty: none.
+        origins: origins of the board behind a proxy, e.g. ``https://hub.example``.
     """
     static = Path(str(resources.files("udrl_board"))) / "static"
     board = _Board(feeds)
@@ -88,7 +86,7 @@ def make_app(
 
 
 class _Guard:
-    """Admits requests that have the token and one of the board's names, from its own page."""
+    """Admits requests with the token, to one of the board's host names, from its own page."""
 
     def __init__(
         self, app: ASGIApp, *, hosts: tuple[str, ...], token: str, origins: tuple[str, ...]
@@ -97,7 +95,7 @@ class _Guard:
         self._hosts = hosts
         self._token = token
         self._origins = origins
-        # Of its own: browsers keep one jar for all ports of a host.
+        # A unique name, because browsers share cookies between all ports of a host.
         self._cookie = f"udrl_board_{hashlib.sha256(token.encode()).hexdigest()[:16]}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -112,7 +110,7 @@ class _Guard:
                 return
             await self._app(scope, receive, send)
             return
-        response = refusal or self._welcome(connection)
+        response = refusal or self._login(connection)
         if response is not None:
             response.headers.update(_HEADERS)
             await response(scope, receive, send)
@@ -133,61 +131,61 @@ class _Guard:
             name = urlsplit(f"//{host}").hostname or ""
             page = urlsplit(origin).netloc if origin is not None else host
         except ValueError:
-            return PlainTextResponse("Neither Host nor Origin can be read.", 400)
+            return PlainTextResponse("Invalid Host or Origin header.", 400)
         if self._hosts and name not in self._hosts:
-            return PlainTextResponse(f"This board is not called {name!r}.", 421)
+            return PlainTextResponse(f"This board is not served as {name!r}.", 421)
         if page != host and origin not in self._origins:
             return PlainTextResponse(
-                f"A page of {origin} may not use this board; if it is the board's own, behind a "
-                f"proxy, start `udrl board` with --allow-origin {origin}.",
+                f"Requests from {origin} are not allowed; if the board is behind a proxy with this "
+                f"origin, start `udrl board` with --allow-origin {origin}.",
                 403,
             )
-        if self._token and not self._knows(connection):
+        if self._token and not self._has_token(connection):
             return PlainTextResponse(
-                "This board asks for a token: open it by the address that `udrl board` printed.",
+                "This board needs a token: open the address that `udrl board` printed.",
                 401,
             )
         return None
 
-    def _knows(self, connection: HTTPConnection) -> bool:
-        # Starlette's reading is the browsers': a strange cookie of another program hides no other.
-        shown = [connection.cookies.get(self._cookie, ""), *self._shown(connection)]
-        return any(hmac.compare_digest(one.encode(), self._token.encode()) for one in shown)
+    def _has_token(self, connection: HTTPConnection) -> bool:
+        # Starlette parses cookies as browsers do: another program's odd cookie hides no other.
+        tokens = [connection.cookies.get(self._cookie, ""), *self._tokens_in_address(connection)]
+        return any(hmac.compare_digest(one.encode(), self._token.encode()) for one in tokens)
 
-    def _shown(self, connection: HTTPConnection) -> list[str]:
+    def _tokens_in_address(self, connection: HTTPConnection) -> list[str]:
         return parse_qs(connection.url.query).get("token", [])
 
-    def _welcome(self, connection: HTTPConnection) -> Response | None:
-        """Turn a token in the address into a cookie, so that it does not stay there."""
-        if not self._token or not self._shown(connection):
+    def _login(self, connection: HTTPConnection) -> Response | None:
+        """Move a token from the address to a cookie; None: the address has no token."""
+        if not self._token or not self._tokens_in_address(connection):
             return None
-        # A proxy may show the board under a path that only the browser knows: so the redirect is
-        # relative, and the cookie has the path that it was set at.
+        # A proxy may serve the board under a path that only the browser knows, so the redirect is
+        # relative, and the cookie gets the default path.
         response = RedirectResponse("./", 303)
         response.set_cookie(self._cookie, self._token, path=None, httponly=True, samesite="strict")
         return response
 
 
 class _Board:
-    """What the routes do."""
+    """The handlers of the routes."""
 
     def __init__(self, feeds: Sequence[Feed]) -> None:
         self._feeds = feeds
         self._stages = 0
 
     def _feed(self, connection: HTTPConnection) -> Feed:
-        """Return the feed of the run that a page shows; the first, if there is no such run."""
+        """Return the feed of the run that a page shows; the first if there is no such run."""
         number = connection.query_params.get("number", "")
         known = {str(k): feed for k, feed in enumerate(self._feeds)}
         return known.get(number, self._feeds[0])
 
     async def runs(self, request: Request) -> Response:
-        """Answer with all runs of the board."""
+        """Return all runs of the board."""
         rows = [await run_in_threadpool(feed.summary) for feed in self._feeds]
         return Response(msgspec.json.encode(rows), media_type="application/json")
 
     async def news(self, request: Request) -> Response:
-        """Answer what is new after an iteration."""
+        """Return the changes since an iteration."""
         text = request.query_params.get("after", "-1")
         if not re.fullmatch(r"-?\d{1,18}", text):
             return PlainTextResponse(f"after={text[:40]!r}: expected an iteration", 400)
@@ -196,7 +194,7 @@ class _Board:
         return Response(msgspec.json.encode(news), media_type="application/json")
 
     async def stage(self, socket: WebSocket) -> None:
-        """Take a viewer's requests, and show the episodes."""
+        """Receive a viewer's requests and show the episodes."""
         await socket.accept()
         if self._stages >= MOST_STAGES:
             problem = f"all {MOST_STAGES} stages are in use; try again later"
@@ -210,12 +208,12 @@ class _Board:
             await _listen(socket, stage)
         finally:
             stage.close()
-            self._stages -= 1  # first: the server may cancel what waits
+            self._stages -= 1  # before the wait, which the server may cancel
             await run_in_threadpool(stage.join)
 
 
 async def _listen(socket: WebSocket, stage: Stage) -> None:
-    """Pass on requests until the viewer leaves."""
+    """Forward requests until the viewer disconnects."""
     while True:
         try:
             text = await asyncio.wait_for(socket.receive_text(), IDLE_S)
@@ -236,7 +234,7 @@ async def _listen(socket: WebSocket, stage: Stage) -> None:
             await socket.send_text(msgspec.json.encode(StageProblem(problem=problem)).decode())
 
 
-#: What sending raises when the socket, the server's end of it, or the loop is no more.
+#: Exceptions of sending when the socket or the event loop is closed.
 _GONE = (
     RuntimeError, WebSocketDisconnect, TimeoutError, CancelledError,
     anyio.BrokenResourceError, anyio.ClosedResourceError,
@@ -246,7 +244,7 @@ Sender = Callable[[Moment | StageProblem, bytes | None], None]
 
 
 def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
-    """Return what shows a stage's moments; it waits until they are sent."""
+    """Return a function that sends a stage's moments, and waits until they are sent."""
 
     async def send(news: Moment | StageProblem, picture: bytes | None) -> None:
         await socket.send_text(msgspec.json.encode(news).decode())
@@ -258,6 +256,6 @@ def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
         try:
             asyncio.run_coroutine_threadsafe(sending, loop).result(_SEND_S + 1)  # type: ignore[arg-type]
         except _GONE as error:
-            raise ConnectionError(f"the viewer has left: {error}") from error
+            raise ConnectionError(f"the viewer has disconnected: {error}") from error
 
     return show

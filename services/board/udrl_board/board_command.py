@@ -19,9 +19,9 @@ from udrl_launch.subcommands.options import CONNECT, KEYS, RUN, RUN_DIR, place
 if TYPE_CHECKING:
     import uvicorn
 
-#: Names of this machine that no other can have.
+#: Names of the loopback interface.
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-#: No address of any machine: what is shown instead is this one's name.
+#: Wildcard addresses; the host name is shown instead.
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 - not bound here
 
 
@@ -76,18 +76,18 @@ def board(
     if not isinstance(where, Path):
         sources = [Served(where)]
     for source in sources:
-        source.hello()  # is there a run?
+        source.hello()  # raises if there is no run
     is_local = _is_loopback(host)
-    called = tuple(map(_host_of, origins))
+    proxies = tuple(map(_host_of, origins))
     if origins or not is_local:
         token = token or secrets.token_urlsafe(18)
     if token is not None and not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
         raise ConfigError(
-            "--token: expected letters, digits and . _ ~ - only, since it stands in an address"
+            "--token: expected only letters, digits and . _ ~ -, since it is part of an address"
         )
     log_to_stderr(logging.WARNING)
     app = make_app(
-        *map(Feed, sources), hosts=(*_LOOPBACK, host, *called) if is_local else (),
+        *map(Feed, sources), hosts=(*_LOOPBACK, host, *proxies) if is_local else (),
         token=token or "", origins=origins,
     )  # fmt: skip
     with _listening(host, port) as listener:
@@ -132,16 +132,16 @@ def _is_loopback(host: str) -> bool:
 
 
 def _host_of(origin: str) -> str:
-    """Return the name of an origin's host.
+    """Return the host name of an origin.
 
     Raises:
-        ConfigError: it is not one, as browsers write them.
+        ConfigError: it is not an origin in the form that browsers send.
     """
     found = re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:[0-9]{1,5})?", origin)
     if found is None:
         raise ConfigError(
-            f"--allow-origin {origin}: expected scheme, host and port as a browser writes them, "
-            f"in small letters and without a path, e.g. https://hub.example"
+            f"--allow-origin {origin}: expected scheme, host and optional port as browsers send "
+            f"them, in lower case and without a path, e.g. https://hub.example"
         )
     return found[1].strip("[]")
 
@@ -160,7 +160,7 @@ def _listening(host: str, port: int) -> socket.socket:
         if listener is not None:
             listener.close()
         raise ConfigError(
-            f"--host {host} --port {port}: {error}; name an address of this machine and a "
-            f"port that is free, or 0"
+            f"--host {host} --port {port}: {error}; choose an address of this machine and a free "
+            f"port, or port 0"
         ) from error
     return listener

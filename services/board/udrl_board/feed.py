@@ -1,4 +1,4 @@
-"""News for the page; the run is queried at most once a second, however many pages are open."""
+"""Updates for the page. The run is queried at most once a second for all open pages."""
 
 import threading
 import time
@@ -15,9 +15,9 @@ from udrl_inspect.obedience_text import summary
 from udrl_proto.messages import Hello
 from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Status
 
-#: Seconds between two queries.
+#: Seconds between queries of the run.
 FRESH_S = 1.0
-#: Pages of history in one query; the rest comes with the next.
+#: Most pages of history in one update; the rest follows with the next.
 _PAGES = 20
 
 Answer = TypeVar("Answer")
@@ -27,10 +27,10 @@ class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
     """The report of ``udrl obedience``.
 
     Attributes:
-        low: least return of the range that the agent delivers; None: there is no such range.
-        high: greatest return of it, or None.
-        answer: a summary in two sentences.
-        weights_version: of the agent that was measured.
+        low: lowest return of the range in which the agent obeys; None: there is no such range.
+        high: highest return of that range, or None.
+        answer: summary of the report.
+        weights_version: weights version that was measured.
     """
 
     low: float | None
@@ -51,18 +51,18 @@ class Obeyed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class News(msgspec.Struct, frozen=True, kw_only=True):
-    """News for a page.
+    """An update for a page.
 
     Attributes:
         software: the board's version of udrl.
-        place: where the run is.
-        hello: the run's specification; None if the page has it.
-        status: of the run; None if it is unknown.
-        iterations: completed since the page's last.
-        evaluations: made in these.
-        contents: of the replay buffer; None if the page has them.
+        place: location of the run.
+        hello: the run specification; None if the page has it.
+        status: status of the run; None if it is unknown.
+        iterations: iterations completed since the page's last update.
+        evaluations: evaluations in these iterations.
+        contents: contents of the replay buffer; None if the page has them.
         obeyed: the report of ``udrl obedience``; None if there is none.
-        problem: why something is missing or may be out of date; empty if nothing is.
+        problem: why something is missing or may be out of date; empty: nothing is.
     """
 
     software: str
@@ -80,9 +80,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     """A run in a list of several.
 
     Attributes:
-        place: where the run is.
-        status: of the run; None if it is unknown.
-        evaluations: so far.
+        place: location of the run.
+        status: status of the run; None if it is unknown.
+        evaluations: evaluations so far.
     """
 
     place: RunLocation
@@ -94,8 +94,8 @@ class Feed:
     """Holds the state of a run, at most :data:`FRESH_S` old.
 
     Args:
-        source: of the state.
-        clock: seconds.
+        source: source of the run.
+        clock: returns the time, seconds.
     """
 
     def __init__(self, source: Source, clock: Callable[[], float] = time.monotonic) -> None:
@@ -113,16 +113,16 @@ class Feed:
         self._problem = ""
 
     def news(self, after: int = -1, run_id: str = "") -> News:
-        """Return the news for a page.
+        """Return the update for a page.
 
         Args:
-            after: the last iteration that the page has; -1: none.
-            run_id: of the run that the page shows.
+            after: last iteration that the page has; -1: none.
+            run_id: id of the run that the page shows.
         """
         with self._lock:
             self._refresh()
             known = self._iterations
-            # The page may be older than this board, and show another run.
+            # The page may have been opened with an earlier board, and show another run.
             same = self._hello is not None and run_id == self._hello.run_id
             first = after + 1 if same and after < len(known) else 0
             contents = self._contents
@@ -176,7 +176,7 @@ class Feed:
             report = self.source.obedience()
             if report is not None and report.run_id == self._status.run_id:
                 self._obeyed = Obeyed.of(report)
-        except InvalidData as error:  # the rest is there
+        except InvalidData as error:  # of the obedience report; the rest is up to date
             self._problem = str(error)
         except UdrlError as error:
             self._status = None

@@ -41,11 +41,11 @@ _SILENT_S = 10.0
 
 
 class RunLocation(msgspec.Struct, frozen=True):
-    """The place of a run, for the shell commands that the page shows; empty: unknown.
+    """The location of a run, for the shell commands that the page shows; empty: unknown.
 
     Attributes:
         run_dir: its directory on the board's machine.
-        endpoint: to which services of the run connect.
+        endpoint: endpoint to which the run's services connect.
     """
 
     run_dir: str = ""
@@ -53,18 +53,18 @@ class RunLocation(msgspec.Struct, frozen=True):
 
 
 class Source(Protocol):
-    """A source of a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
+    """Provides the data of a run. Every method may raise :class:`~udrl.errors.UdrlError`."""
 
     def place(self) -> RunLocation:
-        """Return the place of the run."""
+        """Return the location of the run."""
         ...
 
     def doubt(self) -> str:
-        """Return why replies may be out of date; empty: they are not."""
+        """Return why the data may be out of date; empty: they are not."""
         ...
 
     def hello(self) -> Hello:
-        """Return the run's specification."""
+        """Return the run specification."""
         ...
 
     def status(self) -> Status:
@@ -72,7 +72,7 @@ class Source(Protocol):
         ...
 
     def history(self, after: int) -> History:
-        """Return the iterations after one, or the first of them."""
+        """Return a page of the iterations after ``after``."""
         ...
 
     def contents(self) -> Contents:
@@ -116,7 +116,7 @@ class Stored:
             return store.fact("hello", Hello)
 
     def status(self) -> Status:
-        """Return the status that the run last had."""
+        """Return the last status of the run."""
         return read_status(self._run_dir)
 
     def history(self, after: int) -> History:
@@ -135,7 +135,7 @@ class Stored:
         return Weights(version=agent.version, weights=agent.weights)
 
     def obedience(self) -> ObedienceReport | None:
-        """Return the report in its directory, or None."""
+        """Return the report in the run's directory, or None."""
         return load_report(self._run_dir)
 
     def close(self) -> None:
@@ -143,10 +143,10 @@ class Stored:
 
 
 class Served:
-    """A run that its replay service is queried for; reconnects after a failure.
+    """A run that is queried from its replay service; reconnects after a failure.
 
     Args:
-        address: where it is.
+        address: address of the run.
     """
 
     def __init__(self, address: Address) -> None:
@@ -187,11 +187,11 @@ class Served:
         return self._query(lambda asker: asker.ask(verbs.WEIGHTS, request))
 
     def obedience(self) -> ObedienceReport | None:
-        """Return nothing: it is in the run's directory, which may be on another machine."""
+        """Return None: the report is in the run's directory, perhaps on another machine."""
         return None
 
     def close(self) -> None:
-        """Leave the run's router."""
+        """Disconnect from the run's router."""
         with self._lock:
             self._line = None
             self._stack.close()
@@ -212,13 +212,13 @@ class Served:
         return self._line
 
     def _disconnect(self) -> None:
-        """Leave the router, without waiting for a service that hangs."""
+        """Disconnect from the router, without waiting for a service that hangs."""
         self._line, stack = None, self._stack.pop_all()
         threading.Thread(target=stack.close, name="leaving", daemon=True).start()
 
 
 class Directory:
-    """A run by its directory: its replay service if there is one, else its file.
+    """A run by its directory: queried from its replay service if there is one, else read.
 
     Args:
         run_dir: its directory.
@@ -235,11 +235,11 @@ class Directory:
         self._lock = threading.Lock()
 
     def place(self) -> RunLocation:
-        """Return its directory, and its endpoint while it is served."""
+        """Return the directory, and the endpoint while the run is served."""
         return RunLocation(str(self._run_dir), served_at(self._run_dir) or "")
 
     def doubt(self) -> str:
-        """Return that the replay service does not reply, if there is one and it does not."""
+        """Return a message if there is a replay service that does not reply."""
         if served_at(self._run_dir) is None or not self._is_silent():
             return ""
         return f"The replay service does not reply; the board shows the run's file: {self._why}"
@@ -249,7 +249,7 @@ class Directory:
         return self._stored.hello()
 
     def status(self) -> Status:
-        """Return the status of the run, or the one that it last had."""
+        """Return the status of the run, or its last one."""
         return self._query(lambda source: source.status())
 
     def history(self, after: int) -> History:
@@ -265,11 +265,11 @@ class Directory:
         return self._query(lambda source: source.weights(version))
 
     def obedience(self) -> ObedienceReport | None:
-        """Return the report in its directory, or None."""
+        """Return the report in the run's directory, or None."""
         return self._stored.obedience()
 
     def close(self) -> None:
-        """Leave the run's router."""
+        """Disconnect from the run's router."""
         with self._lock:
             if self._served is not None:
                 self._served[1].close()

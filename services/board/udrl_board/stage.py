@@ -1,8 +1,8 @@
-"""An agent on a stage: a viewer gives it commands and watches.
+"""A stage: runs an agent for one viewer, who gives it commands.
 
 A stage is a thread that runs one episode at a time (:class:`udrl.rollout.Rollout`), at a multiple
-of the environment's own speed, and takes requests meanwhile. With the same seed, command and
-weights it is the episode that ``udrl play --seed`` shows.
+of the environment's own speed, and receives requests meanwhile. With the same seed, command and
+weights, the episode is that of ``udrl play --seed``.
 """
 
 import contextlib
@@ -42,9 +42,9 @@ from udrl_show.playing import filmed, fps_of
 
 log = logging.getLogger("udrl")
 
-#: Requests that may wait.
+#: Most requests that may wait.
 _MOST_REQUESTS = 64
-#: Frames a second that are sent at most; faster environments skip frames.
+#: Most frames per second; faster environments skip frames.
 _FPS = 30.0
 _QUALITY = 80
 
@@ -52,12 +52,12 @@ Show = Callable[[Moment | StageProblem, bytes | None], None]
 
 
 class Stage(threading.Thread):
-    """Answers requests until it is closed.
+    """Handles requests until it is closed.
 
     Args:
-        source: where the agent comes from.
-        show: called with every moment and its picture (JPEG); may take as long as sending takes,
-            and raises ``ConnectionError`` when the viewer has left.
+        source: source of the agent's run.
+        show: sends a moment and its picture (JPEG), may block until they are sent, and raises
+            ``ConnectionError`` if the viewer has disconnected.
     """
 
     def __init__(self, source: Source, show: Show) -> None:
@@ -94,39 +94,39 @@ class Stage(threading.Thread):
         return True
 
     def close(self) -> None:
-        """End, and close the environment; returns at once."""
+        """Make the thread end and close the environment; return at once."""
         self._closed.set()
-        with contextlib.suppress(queue.Full):  # then there is something to wake up for
+        with contextlib.suppress(queue.Full):  # then the waiting requests wake the thread
             self._requests.put_nowait(None)
 
     def run(self) -> None:
-        """Answer requests, step and show, until closed or the viewer has left."""
+        """Handle requests, step and show, until closed or the viewer has disconnected."""
         try:
             while (request := self._next()) is not None:
                 try:
                     if request == "advance":
                         self._advance()
                     else:
-                        self._answer(request)
+                        self._handle(request)
                 except UdrlError as error:
-                    self._give_up(str(error))
+                    self._abort(str(error))
                 except ConnectionError:
                     raise
                 except Exception as error:
                     log.exception("an episode failed")
-                    self._give_up(f"{type(error).__name__}: {error}")
+                    self._abort(f"{type(error).__name__}: {error}")
         except ConnectionError:
-            pass  # the viewer has left
+            pass  # the viewer has disconnected
         finally:
-            self._forget_environment()
+            self._discard_environment()
 
-    def _give_up(self, problem: str) -> None:
+    def _abort(self, problem: str) -> None:
         """End the episode and discard its environment."""
         self._rollout = None
-        self._forget_environment()
+        self._discard_environment()
         self._show(StageProblem(problem=problem, is_over=True), None)
 
-    def _forget_environment(self) -> None:
+    def _discard_environment(self) -> None:
         env, self._env = self._env, None
         if env is not None:
             with contextlib.suppress(Exception):  # it may be broken
@@ -143,7 +143,7 @@ class Stage(threading.Thread):
         except queue.Empty:
             return "advance"
 
-    def _answer(self, request: StageRequest) -> None:
+    def _handle(self, request: StageRequest) -> None:
         match request:
             case StartEpisode():
                 self._start_episode(request)
@@ -165,7 +165,7 @@ class Stage(threading.Thread):
         hello = self._source.hello()
         if hello != self._hello:
             self._policies, self._hello = {}, hello
-            self._forget_environment()
+            self._discard_environment()
         policy = self._policy(self._hello, request.version)
         if self._env is None:
             self._env, self._draws = _make(self._hello)
@@ -200,18 +200,18 @@ class Stage(threading.Thread):
         self._is_changed = True
 
     def _policy(self, hello: Hello, wanted: Wanted) -> Policy:
-        """Return the agent of a version; named ones may be another each time."""
+        """Return the agent of a version; ``latest`` and ``best`` are looked up each time."""
         if wanted not in self._policies:
             found = self._source.weights(wanted)
             behavior = decode_behavior(hello.graph, found.weights)
-            # One is enough: a viewer watches one agent at a time.
+            # Only one is kept: a viewer watches one agent at a time.
             self._policies = {found.version: Policy(behavior, hello.config, hello.environment)}
             wanted = found.version
         self._version = wanted
         return self._policies[wanted]
 
     def _advance(self) -> None:
-        """Take the steps of one frame, and show it."""
+        """Take the steps of one frame and show it."""
         assert self._rollout is not None
         assert self._env is not None
         fps = fps_of(self._env) * self._speed
@@ -251,7 +251,7 @@ class Stage(threading.Thread):
 
 
 def _make(hello: Hello) -> tuple[Adapter, bool]:
-    """Return an environment, and whether it draws itself."""
+    """Return an environment, and whether it can be rendered."""
     try:
         env: Environment = filmed(hello.config)
     except UnsupportedEnvironment:

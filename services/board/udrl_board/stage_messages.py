@@ -15,7 +15,7 @@ Speed = Annotated[float, Meta(ge=1 / 16, le=64)]
 
 
 class StartEpisode(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="start"):
-    """Start an episode; a running one ends without a result."""
+    """Start an episode; a running one is aborted."""
 
     desired_return: Return
     desired_horizon: Horizon
@@ -26,7 +26,7 @@ class StartEpisode(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", ta
 
 
 class ChangeCommand(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="change"):
-    """Change the command during the episode; what is None stays as it is."""
+    """Change the command during the episode; None leaves a value unchanged."""
 
     desired_return: Return | None = None
     desired_horizon: Horizon | None = None
@@ -44,7 +44,7 @@ class TakeStep(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="s
 
 
 class SetSpeed(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="speed"):
-    """Set the speed of this episode and of those that follow."""
+    """Set the speed of this episode and later ones."""
 
     speed: Speed
 
@@ -56,20 +56,21 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
     """The state of an episode.
 
     Attributes:
-        seed: of the episode.
-        version: of the weights.
-        commanded_return, commanded_horizon: the command that it started with.
-        desired_return, desired_horizon: the command now, after the countdown.
-        temperature: of the next action.
+        seed: seed of the episode.
+        version: weights version.
+        commanded_return, commanded_horizon: initial command.
+        desired_return, desired_horizon: current command, after the countdown.
+        temperature: sampling temperature of the next action.
         step: steps so far.
         obtained: return so far.
-        action: the last one, an index or one for each component; None before the first.
-        probabilities: of the next action, component by component; empty when it is over.
-        actions: names of the components and values, in the first moment of an episode.
-        over: whether it has ended.
+        action: last action, an index or one per component; None before the first.
+        probabilities: probabilities of the next action, component by component; empty when the
+            episode has ended.
+        actions: names of the components and values; only in the first moment of an episode.
+        over: whether the episode has ended.
         truncated: whether a time limit ended it.
         is_changed: whether the command was changed during the episode.
-        paused: whether it is paused.
+        paused: whether the episode is paused.
         picture: whether a picture follows.
     """
 
@@ -97,7 +98,7 @@ class StageProblem(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         problem: the reason.
-        is_over: whether the episode has ended because of it.
+        is_over: whether it ended the episode.
     """
 
     problem: str

@@ -1,4 +1,4 @@
-// Gets the run's news from the board's server once a second, and shows it.
+// Gets updates of the run from the board's server once a second, and shows them.
 import { outside, ranges } from "./buffer.js";
 import { command, count, number } from "./format.js";
 import { Learning } from "./learning.js";
@@ -9,7 +9,7 @@ import { compare, shown } from "./runs.js";
 import { Stage } from "./stage.js";
 
 const EVERY_MS = 1000;
-// The board waits for a replay service that hangs, and says so; the page must wait for longer.
+// Longer than the board waits for a replay service that hangs.
 const LONGEST_MS = 20_000;
 
 const known = { place: {}, hello: null, status: null, iterations: [], evaluations: [], contents: null, obeyed: null };
@@ -47,7 +47,7 @@ function showObeyed() {
   if (!status?.weights_version) return;
   const isOther = obeyed && obeyed.weights_version !== status.weights_version;
   say($("obeys"), obeyed
-    ? obeyed.answer + (isOther ? ` Measured with weights version ${obeyed.weights_version}; the latest are ${status.weights_version}.` : "")
+    ? obeyed.answer + (isOther ? ` Measured with weights version ${obeyed.weights_version}; the latest is ${status.weights_version}.` : "")
     : `Measure the returns that the agent delivers: ${commands(known).obedience}`);
 }
 
@@ -85,7 +85,7 @@ async function updateForever() {
     try {
       if (!document.hidden) await update();
     } catch (error) {
-      showProblem(`The board's server does not answer (${error.message}). Is udrl board still running? Trying again.`);
+      showProblem(`The board's server does not reply (${error.message}). Is udrl board still running? Retrying.`);
     }
     await new Promise((done) => setTimeout(done, EVERY_MS));
   }

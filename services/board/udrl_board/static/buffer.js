@@ -1,8 +1,8 @@
-// The replay buffer: the part of its plane to show, similar episodes, and commands that it suggests.
+// The replay buffer: ranges of the map, similar episodes, and suggested commands.
 import { count } from "./format.js";
 
 const CELLS = 36;
-// Names of the three presets, for environments in which they have better ones.
+// Names of the three presets by environment, and the default names.
 const PRESETS = [[/^LunarLander/, ["Land", "Hover", "Crash quickly"]], [/./, ["Best", "Longest", "Worst and quick"]]];
 
 const sorted = (numbers) => numbers.toSorted((a, b) => a - b);
@@ -14,7 +14,7 @@ const padded = (low, high) => {
   return [low - room, high + room];
 };
 
-// Commands that the buffer has examples of: that of evaluations, the longest episode, the shortest of the worst.
+// Commands with similar episodes: that of evaluations, the longest episode, the shortest of the worst.
 function suggestions(contents) {
   const episodes = contents.returns.map((r, i) => [r, contents.lengths[i]]);
   const low = quantile(contents.returns, 0.1);
@@ -23,15 +23,15 @@ function suggestions(contents) {
   return [[contents.desired_return, contents.desired_horizon], longest, worst];
 }
 
-// The same with names, each once: [[name, return, horizon]].
+// The suggestions with names, without duplicates: [[name, return, horizon]].
 export function presets(contents, environment) {
   const names = PRESETS.find(([pattern]) => pattern.test(environment))[1];
   const found = suggestions(contents).map((pair, i) => [names[i], ...pair]);
   return found.filter(([, r, h], i) => found.findIndex(([, s, g]) => s === r && g === h) === i);
 }
 
-// Ranges of returns and lengths. A few very low returns or very long episodes would leave no room
-// for the others: unless they are suggested, they are outside.
+// Ranges of returns and lengths. Outliers, very low returns or very long episodes, are outside
+// unless they are suggested commands.
 export function ranges(contents) {
   const { returns, lengths } = contents, more = suggestions(contents);
   const far = (numbers) => 0.25 * (quantile(numbers, 0.9) - quantile(numbers, 0.1)) || Infinity;
@@ -47,7 +47,7 @@ export function outside({ returns, lengths }, plane) {
   return n ? ` ${count(n, "episode is", "episodes are")} outside the map.` : "";
 }
 
-// The cells of the plane that have episodes in them, or next to them.
+// The cells of the plane with episodes in them or next to them.
 export class Similar {
   constructor({ returns, lengths }, xs, ys) {
     Object.assign(this, { xs, ys });
@@ -67,7 +67,7 @@ export class Similar {
     return this.cells.has(this.cell(r, length).join());
   }
 
-  // Shade the cells that have none.
+  // Shade the cells without similar episodes.
   shade(plane) {
     const [w, h] = [(this.xs[1] - this.xs[0]) / CELLS, (this.ys[1] - this.ys[0]) / CELLS];
     for (let i = 0; i < CELLS; i++)

@@ -1,4 +1,4 @@
-// Lines against env steps, drawn by uPlot: bands, a cursor that reads the lines, zoom by dragging.
+// Lines against env steps, drawn by uPlot: bands, values at the cursor, zoom by dragging.
 import { labels } from "./format.js";
 import { made, say } from "./page.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
@@ -14,7 +14,7 @@ export function thin(rows) {
   return n < 2 ? rows : rows.filter((_, i) => (rows.length - 1 - i) % n === 0);
 }
 
-// The mean of every value and up to n - 1 before it.
+// Moving average over up to n values.
 export function smooth(values, n) {
   let sum = 0;
   return values.map((value, i) => {
@@ -51,7 +51,7 @@ export class Chart {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
   }
 
-  // summary: the text below; read(i): the text for the i-th place, under the cursor.
+  // summary: the text below the chart; read(i): its text while the cursor is at point i.
   show(xs, columns, summary, read) {
     this.data = [xs, ...columns];
     this.place.dataset.points = xs.length;
@@ -67,7 +67,7 @@ export class Chart {
     return min > xs[0] || max < xs.at(-1);
   }
 
-  // A part that was zoomed into stays.
+  // Keeps the zoom.
   update() {
     const { min, max } = this.plot.scales.x, isZoomed = this.isZoomed(this.plot.data[0]);
     this.plot.setData(this.data, !isZoomed);
@@ -82,7 +82,7 @@ export class Chart {
     if (this.place.clientWidth) this.plot.setSize({ width: this.place.clientWidth, height: this.height });
   }
 
-  // The cursor reads of every line its last value there, which may be older.
+  // The last value of a line at the cursor or before it.
   lastAt(plot, line, place) {
     if (line === 0) return place;
     while (place >= 0 && plot.data[line][place] == null) place--;

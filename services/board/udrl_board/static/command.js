@@ -1,4 +1,4 @@
-// The command to give: fields, presets and the map of the replay buffer.
+// The form for commands: fields, presets and the map of the replay buffer.
 import { outside, presets, ranges, Similar } from "./buffer.js";
 import { command as text, nice } from "./format.js";
 import { $, legend, made, say } from "./page.js";
@@ -6,11 +6,11 @@ import { Plane } from "./plane.js";
 
 const FIELDS = ["desired-return", "desired-horizon"];
 
-// A value between steps, with one digit more than they have.
+// A value rounded to one digit more than the step.
 const rounded = (x, step) => Number(Number(x).toFixed(Math.min(6, Math.max(1, 1 - Math.floor(Math.log10(step))))));
 
 export class CommandForm {
-  // onChange(): the chosen command is another one; onEnter(): the Enter key was pressed, true if it was used.
+  // onChange(): the chosen command has changed; onEnter(): handles the Enter key, returns true if it did.
   constructor({ onChange, onEnter }) {
     Object.assign(this, { contents: null, active: null, onChange });
     this.map = new Plane($("map"), { x: "desired return", y: "desired horizon, steps", label: "Map of commands and of the episodes in the replay buffer", describedBy: "similar" });
@@ -27,7 +27,7 @@ export class CommandForm {
     });
   }
 
-  // What the run says of the buffer: fields, sliders, presets and map follow.
+  // Update fields, sliders, presets and map to the replay buffer.
   know({ hello, status, contents, obeyed }) {
     if (!contents.returns.length) return;
     const isFirst = !this.contents;
@@ -81,7 +81,7 @@ export class CommandForm {
       ["no similar episodes", "band", "unseen"],
       ...(obeys ? [["returns that the agent delivers", "band", "obeys"]] : []),
     ]);
-    say($("map-said"), `Click the map to choose a command. Arrows at its edge are outside.${outside(contents, this.map)}`);
+    say($("map-said"), `Click the map to choose a command. Arrows at the edge mark commands outside it.${outside(contents, this.map)}`);
   }
 
   fill(r, h) {

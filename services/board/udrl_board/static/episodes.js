@@ -1,4 +1,4 @@
-// The episodes that have ended on the stage: commanded and obtained returns, as a table and a plot.
+// The finished episodes: commanded and obtained returns, as a table and a plot.
 import { count, number } from "./format.js";
 import { $, legend, say } from "./page.js";
 import { Plane } from "./plane.js";
@@ -7,7 +7,7 @@ export class Episodes {
   constructor() {
     this.ended = [];
     this.plot = new Plane($("obeyed"), { x: "commanded return", y: "obtained return", label: "Commanded and obtained returns", describedBy: "obeyed-said" });
-    legend($("obeyed-legend"), [["episode", "dot", "episode"], ["command changed during it", "dot", "episode pale"], ["equal returns", "line", "even"]]);
+    legend($("obeyed-legend"), [["episode", "dot", "episode"], ["command changed during the episode", "dot", "episode pale"], ["obtained = commanded", "line", "even"]]);
   }
 
   add(m) {

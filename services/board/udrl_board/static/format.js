@@ -21,7 +21,7 @@ export function time(s) {
   return minutes >= 60 ? `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(whole % 60)}` : `${minutes}:${two(whole % 60)}`;
 }
 
-// Numbers of an axis in the largest unit that fits, with enough digits to tell them apart.
+// Numbers of an axis in the largest unit that fits, with enough digits to distinguish them.
 export function labels(values) {
   const most = Math.max(...values.map(Math.abs));
   const [unit, suffix] = most >= 1e6 ? [1e6, "M"] : most >= 1e4 ? [1e3, "K"] : [1, ""];

@@ -1,4 +1,4 @@
-// What came of the run's iterations: returns, speed, loss, admitted episodes.
+// Charts of the run's iterations: returns, speed, loss, admitted episodes.
 import { Chart, merge, smooth, thin } from "./charts.js";
 import { count, evaluated, number } from "./format.js";
 import { $, legend } from "./page.js";
@@ -41,7 +41,7 @@ export class Learning {
     this.speed.show(xs, [pace], `${number(pace.at(-1), 0)} over the last iterations, evaluations included.`, after((i) => number(pace[i], 0), rows));
     this.loss.show(xs, [rows.map((r) => r.loss ?? undefined)], last.loss == null ? "Nothing is trained yet." : `${number(last.loss, 3)} in the last iteration.`,
       after((i) => number(rows[i].loss, 3), rows));
-    const trained = rows.filter((r) => r.iteration > 0); // all of the warm-up's are among the best so far
+    const trained = rows.filter((r) => r.iteration > 0); // all warm-up episodes are among the best so far
     this.admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)], `${number(last.admitted)} of the last iteration.`,
       after((i) => number(trained[i].admitted), trained));
   }
@@ -52,7 +52,7 @@ export class Learning {
       ["evaluation, mean with 95 % interval", "line", "evaluation"],
       ...(closing ? [["final evaluation", "dot", "evaluation hollow"]] : []),
       [`exploratory episodes, mean of ${WINDOW} iterations`, "line", "explored"],
-      ["of each iteration", "line", "explored pale"],
+      ["exploratory episodes, each iteration", "line", "explored pale"],
       ["commanded returns", "band", "commanded band"],
       ...(target == null ? [] : [[`target: ${number(target)}`, "line", "target"]]),
     ]);

@@ -1,9 +1,9 @@
-// Elements of the page: find them, fill them, make new ones.
+// Finding, filling and creating elements of the page.
 const SVG = "http://www.w3.org/2000/svg";
 
 export const $ = (id) => document.getElementById(id);
 
-// Set a text only if it is new: screen readers announce every change.
+// Set a text only if it differs: screen readers announce every change.
 export function say(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -29,7 +29,7 @@ export function facts(list, entries) {
 
 export const lines = (list, texts) => list.replaceChildren(...texts.map((textContent) => made("li", { textContent })));
 
-// The path of a mark with its middle at (x, y).
+// The path of a mark centred at (x, y).
 const SHAPES = {
   line: (x, y, r) => `M${x - r},${y}h${2 * r}`,
   band: (x, y, r) => `M${x - r},${y - 5}h${2 * r}v10h${-2 * r}Z`,

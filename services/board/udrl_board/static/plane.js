@@ -1,4 +1,4 @@
-// A plane of two numbers, drawn as SVG: axes, dots, marks, ranges.
+// A scatter plot as SVG: axes, dots, marks, ranges.
 import { labels, nice } from "./format.js";
 import { mark, svg } from "./page.js";
 
@@ -25,7 +25,7 @@ export class Plane {
     }).observe(place);
   }
 
-  // Draw everything, now and whenever the width changes: paint() calls axes() and the others.
+  // Draw everything, now and whenever the width changes; paint() calls axes(), then the other methods.
   draw(paint) {
     this.paint = paint;
     this.drawnWidth = this.place.clientWidth;
@@ -68,7 +68,7 @@ export class Plane {
     return within(x, this.xs) && within(y, this.ys);
   }
 
-  // The values at a place of the screen.
+  // The coordinates of a mouse event.
   at(event) {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
     return [
@@ -77,12 +77,12 @@ export class Plane {
     ];
   }
 
-  // What is outside the axes is left out.
+  // A dot; nothing is drawn outside the axes.
   dot(x, y, attributes) {
     if (this.has(x, y)) this.svg.append(svg("circle", { cx: this.x(x), cy: this.y(y), r: 3, ...attributes }));
   }
 
-  // What is outside the axes becomes an arrow at their edge.
+  // A mark; outside the axes it becomes an arrow at their edge.
   mark(shape, x, y, name, size = 5) {
     const arrow = x > this.xs[1] ? "right" : x < this.xs[0] ? "left" : y > this.ys[1] ? "up" : y < this.ys[0] ? "down" : null;
     const found = mark(arrow ?? shape, this.x(bounded(x, this.xs)), this.y(bounded(y, this.ys)), size, arrow ? `${name} outside` : name);
@@ -90,14 +90,14 @@ export class Plane {
     return found;
   }
 
-  // A mark that exists once, and moves; without a place it disappears.
+  // Move the mark of a name, of which there is one; without coordinates it disappears.
   move(name, shape, x, y, size) {
     this.marks.set(name, [shape, x, y, size]);
     this.svg.querySelector(`.${name}`)?.remove();
     if (x != null && this.xs) this.mark(shape, x, y, name, size);
   }
 
-  // A range of the horizontal axis, as far as it is within the axes.
+  // A range of the x-axis, clipped to it.
   band(low, high, name) {
     const [a, b] = [this.x(bounded(low, this.xs)), this.x(bounded(high, this.xs))];
     this.svg.append(svg("rect", { class: name, x: a, y: TOP, width: b - a, height: this.height - BOTTOM - TOP }));

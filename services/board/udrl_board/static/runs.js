@@ -1,4 +1,4 @@
-// Several runs side by side: their evaluations in one chart, and a table to switch between them.
+// Comparison of runs: their evaluations in one chart, and a table to switch between them.
 import { Chart, merge } from "./charts.js";
 import { evaluated, number } from "./format.js";
 import { $, legend, made, say } from "./page.js";
@@ -48,7 +48,7 @@ export async function compare() {
         showChart(chart, runs);
       }
     } catch (error) {
-      if (chart) say($("all-said"), `No news of the runs (${error.message}).`);
+      if (chart) say($("all-said"), `The runs cannot be updated (${error.message}).`);
     }
     await new Promise((done) => setTimeout(done, EVERY_MS));
   }

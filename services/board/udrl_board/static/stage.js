@@ -1,4 +1,4 @@
-// The stage: an episode as it runs, its controls, and the connection to the board's server.
+// The stage: the running episode, its controls, and the connection to the board's server.
 import { Actions } from "./actions.js";
 import { CommandForm } from "./command.js";
 import { Episodes } from "./episodes.js";
@@ -13,7 +13,7 @@ export class Stage {
     this.episodes = new Episodes();
     this.form = new CommandForm({
       onChange: () => this.buttons(),
-      // Enter changes the command of a running episode, and starts no other.
+      // Enter changes the command of a running episode instead of starting a new one.
       onEnter: () => this.isActing && (this.change(), true),
     });
     $("command").addEventListener("submit", (event) => { event.preventDefault(); this.start(); });
@@ -60,7 +60,7 @@ export class Stage {
   send(request) {
     if (request.do !== "speed") say($("outcome"), "");
     if (this.socket?.readyState === WebSocket.OPEN) { this.socket.send(JSON.stringify(request)); return; }
-    if (request.do === "speed") return; // sent when the socket opens
+    if (request.do === "speed") return; // it is sent when the socket opens
     this.waiting = request.do === "start" ? [request] : [];
     if (this.socket?.readyState !== WebSocket.CONNECTING) this.connect();
   }
@@ -78,7 +78,7 @@ export class Stage {
       else this.receive(JSON.parse(data));
     });
     this.socket.addEventListener("close", ({ reason }) => {
-      if (this.isActing) say($("outcome"), `${reason || "The connection to the board's server is lost"}; the episode has ended without a result.`);
+      if (this.isActing) say($("outcome"), `${reason || "The connection to the board's server is lost"}; the episode is aborted.`);
       this.forget();
     });
   }
@@ -128,10 +128,10 @@ export class Stage {
     $("picture").hidden = true;
     $("no-picture").hidden = false;
     $("screen").classList.remove("empty");
-    say($("no-picture"), "This environment draws no pictures.");
+    say($("no-picture"), "This environment cannot be rendered.");
   }
 
-  // The likely next button is the primary one.
+  // The most likely action has the primary button.
   buttons() {
     const isActing = this.isActing, isPaused = isActing && this.moment.paused;
     const isNew = isActing && this.applied !== JSON.stringify(this.form.chosen);
