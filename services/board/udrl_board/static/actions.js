@@ -10,7 +10,7 @@ export class Actions {
   }
 
   // The names of an episode's actions: [{name, values}].
-  know(components) {
+  setComponents(components) {
     if (JSON.stringify(components) === JSON.stringify(this.components)) return;
     this.components = components;
     let first = 0;

@@ -2,7 +2,7 @@
 import { outside, ranges } from "./buffer.js";
 import { command, count, number } from "./format.js";
 import { Learning } from "./learning.js";
-import { $, legend, say } from "./page.js";
+import { $, legend, setText } from "./page.js";
 import { Plane } from "./plane.js";
 import { commands, showRun } from "./run.js";
 import { compare, shown } from "./runs.js";
@@ -39,14 +39,14 @@ function showContents(contents) {
   });
   const held = known.status?.buffer, recent = known.hello?.config.recent_size;
   const best = held ? `The ${number(held.episodes)} best episodes have returns from ${number(held.return_min)} to ${number(held.return_max)}${recent ? `; the newest ${number(recent)} are shown too` : ""}. ` : "";
-  say($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${count(pairs.length, "exploratory command is", "exploratory commands are")} outstanding.${outside(contents, buffer)}`);
+  setText($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${count(pairs.length, "exploratory command is", "exploratory commands are")} outstanding.${outside(contents, buffer)}`);
 }
 
 function showObeyed() {
   const { obeyed, status } = known;
   if (!status?.weights_version) return;
   const isOther = obeyed && obeyed.weights_version !== status.weights_version;
-  say($("obeys"), obeyed
+  setText($("obeys"), obeyed
     ? obeyed.answer + (isOther ? ` Measured with weights version ${obeyed.weights_version}; the latest is ${status.weights_version}.` : "")
     : `Measure the returns that the agent delivers: ${commands(known).obedience}`);
 }
@@ -68,16 +68,16 @@ async function update() {
   const isMeasured = JSON.stringify(news.obeyed) !== JSON.stringify(known.obeyed);
   known.obeyed = news.obeyed;
   if (news.contents) showContents((known.contents = news.contents));
-  if (known.contents && (news.contents || isMeasured)) stage.know(known);
+  if (known.contents && (news.contents || isMeasured)) stage.update(known);
   showObeyed();
-  say($("about"), `udrl ${news.software}`);
+  setText($("about"), `udrl ${news.software}`);
   const why = news.status?.problem.replace("RUN_DIR", commands(known).run_dir);
   showProblem([news.problem, why, news.status?.advice].filter(Boolean).join(" "));
 }
 
 function showProblem(text) {
   $("problem").hidden = !text;
-  say($("problem"), text);
+  setText($("problem"), text);
 }
 
 async function updateForever() {

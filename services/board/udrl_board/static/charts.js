@@ -1,6 +1,6 @@
 // Lines against env steps, drawn by uPlot: bands, values at the cursor, zoom by dragging.
 import { labels } from "./format.js";
-import { made, say } from "./page.js";
+import { made, setText } from "./page.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 
 const MOST_POINTS = 1500;
@@ -59,7 +59,7 @@ export class Chart {
     if (!xs.length) return;
     if (this.plot) this.update();
     else this.redraw();
-    this.say(this.plot?.cursor.idx);
+    this.showText(this.plot?.cursor.idx);
   }
 
   isZoomed(xs) {
@@ -74,8 +74,8 @@ export class Chart {
     if (isZoomed) this.plot.setScale("x", { min, max });
   }
 
-  say(place) {
-    say(this.said, place == null || place >= this.data[0].length ? this.summary : this.read(place));
+  showText(place) {
+    setText(this.said, place == null || place >= this.data[0].length ? this.summary : this.read(place));
   }
 
   resize() {
@@ -125,7 +125,7 @@ export class Chart {
           },
         },
         hooks: {
-          setCursor: [(plot) => this.say(plot.cursor.idx)],
+          setCursor: [(plot) => this.showText(plot.cursor.idx)],
           setScale: [(plot, key) => { if (key === "x" && this.plot === plot) this.reset.hidden = !this.isZoomed(plot.data[0]); }],
         },
       },

@@ -1,7 +1,7 @@
 // The form for commands: fields, presets and the map of the replay buffer.
 import { outside, presets, ranges, Similar } from "./buffer.js";
 import { command as text, nice } from "./format.js";
-import { $, legend, made, say } from "./page.js";
+import { $, legend, made, setText } from "./page.js";
 import { Plane } from "./plane.js";
 
 const FIELDS = ["desired-return", "desired-horizon"];
@@ -28,7 +28,7 @@ export class CommandForm {
   }
 
   // Update fields, sliders, presets and map to the replay buffer.
-  know({ hello, status, contents, obeyed }) {
+  update({ hello, status, contents, obeyed }) {
     if (!contents.returns.length) return;
     const isFirst = !this.contents;
     this.contents = contents;
@@ -81,7 +81,7 @@ export class CommandForm {
       ["no similar episodes", "band", "unseen"],
       ...(obeys ? [["returns that the agent delivers", "band", "obeys"]] : []),
     ]);
-    say($("map-said"), `Click the map to choose a command. Arrows at the edge mark commands outside it.${outside(contents, this.map)}`);
+    setText($("map-said"), `Click the map to choose a command. Arrows at the edge mark commands outside it.${outside(contents, this.map)}`);
   }
 
   fill(r, h) {
@@ -109,7 +109,7 @@ export class CommandForm {
     const { desired_return: r, desired_horizon: h } = this.chosen;
     if (this.follows) for (const id of ["desired-horizon", "desired-horizon-slider"]) $(id).value = h;
     this.map.move("chosen", "diamond", r, h, 7);
-    say($("similar"), `${this.similar.has(r, h) ? "The buffer has similar episodes." : "No similar episodes: the agent has to generalise."}${this.map.has(r, h) ? "" : " This command is outside the map."}`);
+    setText($("similar"), `${this.similar.has(r, h) ? "The buffer has similar episodes." : "No similar episodes: the agent has to generalise."}${this.map.has(r, h) ? "" : " This command is outside the map."}`);
     this.onChange();
   }
 

@@ -1,6 +1,6 @@
 // The finished episodes: commanded and obtained returns, as a table and a plot.
 import { count, number } from "./format.js";
-import { $, legend, say } from "./page.js";
+import { $, legend, setText } from "./page.js";
 import { Plane } from "./plane.js";
 
 export class Episodes {
@@ -28,6 +28,6 @@ export class Episodes {
       this.plot.line(ends[0], ends[0], ends[1], ends[1], "even");
       for (const m of this.ended) this.plot.dot(m.commanded_return, m.obtained, { class: m.is_changed ? "episode pale" : "episode", r: 4 });
     });
-    say($("obeyed-said"), `${count(this.ended.length, "episode")}.`);
+    setText($("obeyed-said"), `${count(this.ended.length, "episode")}.`);
   }
 }

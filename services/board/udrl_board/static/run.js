@@ -1,6 +1,6 @@
 // The state of the run: the header, its numbers, the actors and what to do next.
 import { count, evaluated, number, time } from "./format.js";
-import { $, facts, lines, made, say } from "./page.js";
+import { $, facts, lines, made, setText } from "./page.js";
 
 export const STATES = { running: "Running", closing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
 
@@ -20,12 +20,12 @@ export function commands({ place, status }) {
 
 export function showRun(known) {
   const { status, hello } = known;
-  say($("title"), status.environment);
-  say($("run-name"), status.run_id);
+  setText($("title"), status.environment);
+  setText($("run-name"), status.run_id);
   document.title = `${status.environment} · udrl board`;
   // The reason of a failure is in the alert, with the command that helps.
   const cause = status.state === "failed" ? "" : status.ended_because;
-  say($("state"), [STATES[status.state], cause].filter(Boolean).join(": "));
+  setText($("state"), [STATES[status.state], cause].filter(Boolean).join(": "));
   $("state").className = `state ${status.state}`;
   showProgress(status);
   showScore(status);
@@ -60,16 +60,16 @@ export function showRun(known) {
 function showProgress({ env_steps, max_env_steps, wall_s, time_left_s, stop_return, state }) {
   Object.assign($("progress"), { max: max_env_steps, value: Math.min(env_steps, max_env_steps) });
   const left = state !== "running" || time_left_s == null ? "" : `, ${stop_return == null ? "about" : "at most"} ${time(time_left_s)} left`;
-  say($("progress-said"), `${number(env_steps)} of ${number(max_env_steps)} env steps in ${time(wall_s)}${left}`);
+  setText($("progress-said"), `${number(env_steps)} of ${number(max_env_steps)} env steps in ${time(wall_s)}${left}`);
 }
 
 function showScore({ evaluation, closing_evaluation, stop_return }) {
   const shown = closing_evaluation ?? evaluation;
   $("score").classList.toggle("reached", Boolean(shown && stop_return != null && shown.mean >= stop_return));
-  say($("score-value"), shown ? number(shown.mean) : "");
+  setText($("score-value"), shown ? number(shown.mean) : "");
   const target = stop_return == null ? "" : `, target ${number(stop_return)}`;
   const what = closing_evaluation ? "final evaluation" : "last evaluation";
-  say($("score-said"), shown
+  setText($("score-said"), shown
     ? `mean return ± ${number((shown.ci95_high - shown.ci95_low) / 2)}, ${what} of ${count(shown.episodes, "episode")}${target}`
     : `no evaluation yet${target}`);
 }
@@ -85,7 +85,7 @@ function showAlerts(known) {
   const isMissing = status.waiting.some((w) => w.why.includes("no learner is connected"));
   const hint = hints[status.state] ?? "";
   $("next").hidden = !hint;
-  say($("next"), hint);
+  setText($("next"), hint);
   lines($("alerts"), [
     ...(isActive && !status.actors.length ? [`No actor is connected. Start one: ${service("actor")}`] : []),
     ...(isMissing ? [`No learner is connected. Start one: ${service("learner")}`] : []),

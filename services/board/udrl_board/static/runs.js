@@ -1,7 +1,7 @@
 // Comparison of runs: their evaluations in one chart, and a table to switch between them.
 import { Chart, merge } from "./charts.js";
 import { evaluated, number } from "./format.js";
-import { $, legend, made, say } from "./page.js";
+import { $, legend, made, setText } from "./page.js";
 import { STATES } from "./run.js";
 
 const EVERY_MS = 5000;
@@ -48,7 +48,7 @@ export async function compare() {
         showChart(chart, runs);
       }
     } catch (error) {
-      if (chart) say($("all-said"), `The runs cannot be updated (${error.message}).`);
+      if (chart) setText($("all-said"), `The runs cannot be updated (${error.message}).`);
     }
     await new Promise((done) => setTimeout(done, EVERY_MS));
   }

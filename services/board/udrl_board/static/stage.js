@@ -3,7 +3,7 @@ import { Actions } from "./actions.js";
 import { CommandForm } from "./command.js";
 import { Episodes } from "./episodes.js";
 import { command as text, count, number } from "./format.js";
-import { $, facts, say } from "./page.js";
+import { $, facts, setText } from "./page.js";
 import { shown } from "./runs.js";
 
 export class Stage {
@@ -25,10 +25,10 @@ export class Stage {
     this.buttons();
   }
 
-  know(known) {
+  update(known) {
     const isFirst = !this.form.contents;
-    this.form.know(known);
-    if (isFirst && this.form.contents) say($("no-picture"), "Start an episode to watch the agent.");
+    this.form.update(known);
+    if (isFirst && this.form.contents) setText($("no-picture"), "Start an episode to watch the agent.");
     this.buttons();
   }
 
@@ -58,7 +58,7 @@ export class Stage {
   }
 
   send(request) {
-    if (request.do !== "speed") say($("outcome"), "");
+    if (request.do !== "speed") setText($("outcome"), "");
     if (this.socket?.readyState === WebSocket.OPEN) { this.socket.send(JSON.stringify(request)); return; }
     if (request.do === "speed") return; // it is sent when the socket opens
     this.waiting = request.do === "start" ? [request] : [];
@@ -78,12 +78,12 @@ export class Stage {
       else this.receive(JSON.parse(data));
     });
     this.socket.addEventListener("close", ({ reason }) => {
-      if (this.isActing) say($("outcome"), `${reason || "The connection to the board's server is lost"}; the episode is aborted.`);
-      this.forget();
+      if (this.isActing) setText($("outcome"), `${reason || "The connection to the board's server is lost"}; the episode is aborted.`);
+      this.clearEpisode();
     });
   }
 
-  forget() {
+  clearEpisode() {
     this.moment = null;
     this.form.showActive(null);
     this.buttons();
@@ -91,13 +91,13 @@ export class Stage {
 
   receive(message) {
     if (message.problem !== undefined) {
-      say($("outcome"), message.problem);
-      if (message.is_over) this.forget();
+      setText($("outcome"), message.problem);
+      if (message.is_over) this.clearEpisode();
       return;
     }
     const isEnd = this.isActing && message.over;
     this.moment = message;
-    if (message.actions) this.actions.know(message.actions);
+    if (message.actions) this.actions.setComponents(message.actions);
     this.actions.show(message.probabilities);
     if (!message.picture) this.showNoPicture();
     facts($("moment"), [
@@ -109,7 +109,7 @@ export class Stage {
     ]);
     this.form.showActive(message.over ? null : message);
     if (isEnd) {
-      say($("outcome"), `Commanded ${text(message.commanded_return, message.commanded_horizon)}; obtained ${text(message.obtained, message.step)}.`);
+      setText($("outcome"), `Commanded ${text(message.commanded_return, message.commanded_horizon)}; obtained ${text(message.obtained, message.step)}.`);
       this.episodes.add(message);
     }
     this.buttons();
@@ -128,7 +128,7 @@ export class Stage {
     $("picture").hidden = true;
     $("no-picture").hidden = false;
     $("screen").classList.remove("empty");
-    say($("no-picture"), "This environment cannot be rendered.");
+    setText($("no-picture"), "This environment cannot be rendered.");
   }
 
   // The most likely action has the primary button.
@@ -138,7 +138,7 @@ export class Stage {
     $("start").disabled = !this.form.contents;
     $("change").disabled = $("pause").disabled = !isActing;
     $("step").disabled = !isPaused;
-    say($("pause"), isPaused ? "Resume" : "Pause");
+    setText($("pause"), isPaused ? "Resume" : "Pause");
     const primary = !isActing ? "start" : isNew ? "change" : "pause";
     for (const id of ["start", "change", "pause"]) $(id).classList.toggle("primary", id === primary);
   }
