@@ -614,13 +614,13 @@ def test_command_that_ends_its_actors_stops_the_run_and_is_named(
 ) -> None:
     run = make_run(max_env_steps=20)
     assert vanish(run, "a", "b", "c") == {0, 1, 2, 3}
-    assert "command 3 was held by 3 actors that vanished and is now carried out" in caplog.text
+    assert "command 3 was held by 3 actors that vanished and is now run alone" in caplog.text
     assert vanish(run, "d", "e") == {0}
     before = run.progress.state
     assert vanish(run, "f") == {0}
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
-        "command 0 ended three actors that carried out nothing else: its environment hangs or "
+        "command 0 ended three actors that ran nothing else: its environment hangs or "
         "crashes; reproduce it with: udrl reproduce RUN_DIR 0"
     )
     run = reopened(run)

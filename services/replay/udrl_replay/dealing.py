@@ -1,6 +1,6 @@
 """Dealing commands: evenly among actors, and again if an actor is gone or too slow.
 
-This state is only in memory. Every request of an actor lists the commands that it holds, so a
+This state is only in memory. Every request for commands lists those that the actor holds, so a
 restarted replay service knows them again after one request of each actor.
 
 An environment that hangs or crashes ends its actor without a report of the command that caused it.

@@ -339,7 +339,7 @@ class ReplayService:
                 f"version {following} is next, not {request.version}; request the state again",
             )
         if not run.is_trainable(request.version):
-            if request.version > following:  # the learner prefetches; the previous one is not here
+            if request.version > following:  # prefetched: the version before is not delivered
                 retry_after_s = run.dealer.retry_after_s()
                 return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
             here = [n for r, n in self._here if r == "actor"]

@@ -122,7 +122,7 @@ class StoredRun(RunState):
         digest = self.store.episode_digest(command_id)
         if digest is not None and digest != arrival.digest:
             self.mark_inexact(
-                f"two actors carried out command {command_id} and their episodes differ; the "
+                f"two actors ran command {command_id} and their episodes differ; the "
                 f"environment {self.config.environment} or their machines are not deterministic"
             )
         if digest is not None or self._is_done(iteration, index):
@@ -173,13 +173,13 @@ class StoredRun(RunState):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:
                 log.warning(
-                    "command %d was held by %d actors that vanished and is now carried out alone",
+                    "command %d was held by %d actors that vanished and is now run alone",
                     command_id, SUSPICIOUS,
                 )  # fmt: skip
             if self.dealer.is_hopeless(command_id):
                 self._give_up(
                     command_id,
-                    f"command {command_id} ended three actors that carried out nothing else: its "
+                    f"command {command_id} ended three actors that ran nothing else: its "
                     f"environment hangs or crashes",
                 )
 
@@ -385,7 +385,7 @@ class StoredRun(RunState):
         wanted = self.open_commands() + self.store.commands(cancelled=True)
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
         needed |= self.auditor.versions
-        needed |= self._evaluated  # for later use by `udrl play` and the like
+        needed |= self._evaluated  # for later use, e.g. by `udrl play`
         self.store.drop_weights(v for v in self.store.versions_kept() if v not in needed)
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.

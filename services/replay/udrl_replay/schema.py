@@ -28,9 +28,9 @@ def _declared(kind: type[msgspec.Struct]) -> str:
     return ", ".join(columns)
 
 
-#: SQLite rewrites a whole row when a column changes its size, so an episode's body, which may have
-#: a megabyte and never changes, has its own table. Elsewhere large columns are last, so that
-#: reading the others does not read them.
+#: SQLite rewrites a whole row when a column changes its size, so an episode's body, which may be a
+#: megabyte and never changes, has its own table. Elsewhere large columns are last, so that reading
+#: the others does not read them.
 TABLES = f"""
 CREATE TABLE facts (name TEXT PRIMARY KEY, value BLOB NOT NULL, seal BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE commands (
@@ -70,7 +70,7 @@ Value = int | float | str | bytes | None
 
 
 def seal(*values: Value) -> bytes:
-    """Return the seal of a row's values. SQLite may convert integers to floats, so all are."""
+    """Return the seal of a row's values, integers as floats because SQLite may convert them."""
     plain = [float(v) if isinstance(v, int) else v for v in values]
     return sha256(repr(plain).encode())[:16]
 

@@ -13,7 +13,7 @@ from udrl_replay.schema import SEALED
 #: Name of the fact that holds the tallies, the only row that is not counted.
 TALLIES = "tallies"
 
-#: SQL expression of a row's summand, by table: the seal, or a digest where that covers less.
+#: SQL expression of a row's summand, by table: its seal, extended where that covers too little.
 _SUMMANDS = dict.fromkeys(SEALED, "{row}seal") | {
     "facts": f"CASE {{row}}name WHEN '{TALLIES}' THEN NULL ELSE {{row}}seal END",
     "bodies": "seal({row}id)",

@@ -63,7 +63,7 @@ class Trust:
             run.auditor.stop()
             run.progress.audit = 0.0
             run.mark_inexact(
-                f"three actors carried out command {command_id} and all their episodes differ; the "
+                f"three actors ran command {command_id} and all their episodes differ; the "
                 f"environment {run.config.environment} or their machines are not deterministic; "
                 f"audits are stopped"
             )
