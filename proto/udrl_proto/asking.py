@@ -18,12 +18,12 @@ from udrl_proto.verbs import JOIN, Reply, Request, Verb
 
 log = logging.getLogger("udrl")
 
-#: Timeout of the first query and the longest timeout, seconds. It doubles with every retry, so
+#: Timeout of the first query and the longest timeout, seconds. It doubles after every timeout, so
 #: that retries do not overload a slow service.
 ATTEMPT_S, LONGEST_ATTEMPT_S = 3.0, 30.0
 #: Seconds that a service retries a request without a reply.
 PATIENCE_S = 300.0
-#: Most times that a service rejoins for one request; restarts alone never need more.
+#: Most times that a service rejoins for one request before it raises the refusal.
 _JOINS = 5
 
 

@@ -16,7 +16,7 @@ class Exchange:
         self.watching: list[tuple[str, Callable[[Presence], None]]] = []
         self.here: list[str] = []
 
-    def tell(self, presence: Presence) -> None:
+    def notify(self, presence: Presence) -> None:
         """Notify the watchers that a service appeared or disappeared."""
         with self.lock:
             watchers = [r for pattern, r in self.watching if _matches(pattern, presence.key)]
@@ -68,11 +68,11 @@ class MemoryTransport:
         """Announce a service."""
         with self._exchange.lock:
             self._exchange.here.append(key)
-        self._exchange.tell(Presence(key, here=True))
+        self._exchange.notify(Presence(key, here=True))
 
         def vanish() -> None:
             self._exchange.here.remove(key)
-            self._exchange.tell(Presence(key, here=False))
+            self._exchange.notify(Presence(key, here=False))
 
         return _Declared(vanish)
 

@@ -53,7 +53,7 @@ class Verb(Generic[Request, Reply]):
         request: message type of the request.
         reply: message type of the reply; a refusal is a :class:`udrl_proto.messages.Problem`.
         askers: roles that may send it (:mod:`udrl_proto.access`).
-        limit: largest request, bytes; for episodes each run computes a lower limit.
+        limit: largest request, bytes; for episodes each run computes its own limit.
         reply_limit: largest reply, bytes.
         is_bulk: whether its requests are many and large, and have low priority.
     """

@@ -32,7 +32,7 @@ _MAKING_S = 300.0
 
 
 class ActorService:
-    """Carries out commands of one run.
+    """Runs the commands that one run deals to this actor.
 
     Args:
         transport: reaches the run.

@@ -176,7 +176,7 @@ class Feed:
             report = self.source.obedience()
             if report is not None and report.run_id == self._status.run_id:
                 self._obeyed = Obeyed.of(report)
-        except InvalidData as error:  # of the obedience report; the rest is up to date
+        except InvalidData as error:  # e.g. in the obedience report; the rest is shown
             self._problem = str(error)
         except UdrlError as error:
             self._status = None

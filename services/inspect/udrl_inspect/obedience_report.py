@@ -182,7 +182,7 @@ def plan_commands(
         commands(value, nearest(mean_of_nearest(value, returns, lengths)) if has_horizon else None)
         for value in (evenly(*desired_returns, points) if desired_returns else common)
     ]
-    by_return = list({same[0].desired_return: same for same in by_return}.values())
+    by_return = list({group[0].desired_return: group for group in by_return}.values())
     if len(by_return) < 2:
         only = by_return[0][0].desired_return
         raise ConfigError(

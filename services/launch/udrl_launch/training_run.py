@@ -138,7 +138,7 @@ def train(
         if progress.state == "ended":
             write_weights(run_dir, store, progress.latest_version)
             return read_status(run_dir)
-        closing_store.pop_all()  # the replay service continues with it
+        closing_store.pop_all()  # the services take over the store
     kind = Threads if in_process else Processes
     services: Local = kind(
         run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
@@ -192,7 +192,7 @@ def _watch(
 
 
 class _StoppedOrFailed(threading.Event):
-    """Is set when the user stops the run; raises when a service fails. Ends waits for a reply."""
+    """Set when the run is stopped or done; raises if a service has failed. Ends waits."""
 
     def __init__(self, services: Local, stop: threading.Event) -> None:
         super().__init__()

@@ -47,7 +47,7 @@ _ASK_FOR = 10_000
 #: Pauses before the restarts of a learner without progress, seconds; after the last it gives up.
 _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 
-#: Interval at which a wait for the buffer checks the delivery and ``stop``, seconds.
+#: Interval at which a wait for the buffer checks ``stop``, seconds.
 _LOOK_S = 0.5
 
 
@@ -131,7 +131,7 @@ class LearnerService:
         """Train from the latest version; start over whenever the replay service expects another.
 
         Raises:
-            Refused: there was no progress in as many restarts as there are pauses.
+            Refused: there is no progress after the last of the pauses either.
         """
         began_with, in_vain = -1, 0
         while True:
