@@ -16,8 +16,8 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         state: ``running`` up to the last iteration N; ``closing`` while the weights of version N
-            are trained and evaluated; then ``ended``. ``failed``: a command always fails, or an
-            actor lied.
+            are trained and evaluated; then ``ended``. ``failed``: a command failed too often, or
+            an actor lied.
         iteration: last completed iteration; -1: the warm-up is not complete.
         env_steps: steps of the warm-up and exploratory episodes of completed iterations.
         eval_env_steps: steps of the evaluation episodes, those of the final evaluation included.

@@ -2,7 +2,7 @@
 
 A state machine over a :class:`~udrl_replay.store.Store`, driven by one thread inside the store's
 transactions; it imports no messaging. All persistent state is in the store when a transaction ends;
-the rest can be derived from it.
+the rest is derived from it, or sent again by the services.
 """
 
 import logging
