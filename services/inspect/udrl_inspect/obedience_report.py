@@ -290,7 +290,7 @@ def save_report(run_dir: Path, report: ObedienceReport) -> Path:
 
 
 def report_of_agent(agent: Agent, run_dir: Path) -> ObedienceReport | None:
-    """Return the report in a run's directory if it was measured with this agent's weights.
+    """Return a run's report if it was measured with this agent's weights, else None.
 
     Raises:
         InvalidData: the file is invalid.

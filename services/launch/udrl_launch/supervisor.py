@@ -17,7 +17,7 @@ log = logging.getLogger("udrl")
 #: Exit codes that a restart would only repeat (``docs/operations.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
-#: Most deaths of a child without progress in between.
+#: Deaths of a child without progress in between after which the run fails.
 _MOST_DEATHS = 6
 #: Longest log of a child, bytes; when it is longer, only the last quarter is kept.
 _LONGEST_LOG = 1 << 20

@@ -29,7 +29,7 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
     Example: udrl health actor --connect tcp/127.0.0.1:7447
     """
     address = Address(check_endpoint(connect, secure=keys is not None), run_id, patience, keys)
-    # The replay service's own certificate is not for clients, so connect as an observer.
+    # The role of the replay service has no permissions as a client, so connect as an observer.
     with connected("observer" if role == REPLAY else role, address) as (transport, hello):
         if role == REPLAY:
             click.echo(f"run {hello.run_id} is served at {connect}")
