@@ -1,4 +1,4 @@
-"""DQN and A2C from Stable-Baselines3 under UDRL's protocol (section 3.2).
+"""Algorithms of Stable-Baselines3 under UDRL's protocol (section 3.2).
 
 Networks, reset seeds and evaluations are UDRL's: an evaluation is Algorithm 2, with commands that
 nobody hears.
@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import safetensors
@@ -26,6 +25,7 @@ from udrl.evaluation import summarise
 from udrl.memory import FrameStack
 from udrl.numerics import settle
 from udrl.replay import Entry, ReplayBuffer
+from udrl_experiments.protocol import BaselineAlgorithm
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
 from udrl_inspect.csv_tables import write
@@ -38,17 +38,17 @@ class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What a baseline's run is.
 
     Attributes:
-        algorithm: who learns.
+        algorithm: the learner.
         config: environment and its time limit, ``frame_stack``, ``convolutions`` and ``hidden``,
             seed, evaluations (DQN's are greedy always) and device; what else it says is UDRL's.
-        hyperparameters: those of :class:`~udrl_experiments.tuned.DqnHyperparameters` or
-            :class:`~udrl_experiments.tuned.A2cHyperparameters` that differ from their defaults.
+        hyperparameters: those of the algorithm's class in :mod:`udrl_experiments.tuned` that differ
+            from their defaults.
 
     Raises:
         ConfigError: a hyperparameter is unknown or impossible.
     """
 
-    algorithm: Literal["DQN", "A2C"]
+    algorithm: BaselineAlgorithm
     config: Config
     hyperparameters: dict[str, KeywordValue] = {}
 
@@ -64,7 +64,7 @@ class _State(msgspec.Struct, frozen=True, kw_only=True):
     """How far a run is, besides what lies in tensors.
 
     Attributes:
-        exploration_steps: env steps in which the part of random actions falls; 0 for A2C.
+        exploration_steps: env steps in which DQN's part of random actions falls; 0 for others.
         counters: the model's.
         rows: the evaluations.
     """
@@ -174,7 +174,8 @@ def _require_stable_baselines3() -> None:
         import stable_baselines3  # noqa: F401 - whether it can be
     except ImportError as error:
         raise ConfigError(
-            f'DQN and A2C are Stable-Baselines3\'s: {error}; pip install "udrl[studies]"'
+            f"algorithms other than UDRL are Stable-Baselines3's: {error}; "
+            f'pip install "udrl[studies]"'
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Figures 4 and 5: UDRL, DQN and A2C under one protocol (sections 3.2 to 3.4)."""
+"""Figures 4 and 5: UDRL and other algorithms under one protocol (sections 3.2 to 3.4)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,7 +7,13 @@ from typing import Literal
 from udrl.config import Config, KeywordValue, flat
 from udrl_experiments import figures
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import TASKS, Algorithm, StudyPlan, Task
+from udrl_experiments.protocol import (
+    TASKS,
+    BaselineAlgorithm,
+    Participant,
+    StudyPlan,
+    Task,
+)
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Study, StudyFolders
@@ -17,18 +23,18 @@ from udrl_inspect.csv_tables import read, write
 _PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
 
 
-def comparison(name: str, plan: StudyPlan, algorithms: Sequence[Algorithm]) -> Study:
+def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) -> Study:
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
 
     Args:
         name: of the task.
         plan: seeds and steps.
-        algorithms: who takes part.
+        participants: the lines of the figure.
     """
     task = TASKS[name]
     jobs = [
-        job(task, plan, algorithm, seed)
-        for algorithm in dict.fromkeys(algorithms)
+        job(task, plan, participant, seed)
+        for participant in dict.fromkeys(participants)
         for seed in plan.seeds_of_runs()
     ]
 
@@ -38,23 +44,28 @@ def comparison(name: str, plan: StudyPlan, algorithms: Sequence[Algorithm]) -> S
     return Study(name, jobs, report)
 
 
-def job(task: Task, plan: StudyPlan, algorithm: Algorithm, seed: int) -> Job:
-    """Return an algorithm's run on a task."""
-    steps = plan.steps(task, algorithm)
-    if algorithm == "UDRL":
-        settings = flat(plan.config(task, seed))
-        return Job(algorithm=algorithm, settings=settings, max_env_steps=steps)
-    chosen = tuned(algorithm, task.environment)
-    return baseline(algorithm, plan.baseline(task, seed), chosen, steps)
+def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job:
+    """Return a participant's run on a task."""
+    if participant == "UDRL" or participant == "UDRL-paper":
+        paper = participant == "UDRL-paper"
+        return Job(
+            algorithm="UDRL",
+            settings=flat(plan.config(task, seed, paper=paper)),
+            max_env_steps=plan.steps(task),
+            variant="paper" if paper else "",
+        )
+    chosen = tuned(participant, task.environment)
+    steps = plan.steps(task, participant)
+    return baseline(participant, plan.baseline(task, seed), chosen, steps)
 
 
 def baseline(
-    algorithm: Literal["DQN", "A2C"],
+    algorithm: BaselineAlgorithm,
     config: Config,
     hyperparameters: dict[str, KeywordValue],
     max_env_steps: int,
 ) -> Job:
-    """Return a run of DQN or A2C; how DQN explores depends on how far it is to go."""
+    """Return a run of an algorithm other than UDRL; DQN's exploration depends on its length."""
     exploration = float(hyperparameters.get("exploration_fraction", 0.0))
     return Job(
         algorithm=algorithm,

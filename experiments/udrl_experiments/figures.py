@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Algorithms that look the same in every figure; UDRL is green as in the paper.
-_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2}
+#: Lines that look the same in every figure, by algorithm and variant, or by algorithm alone. UDRL
+#: is green, as in the paper.
+_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "UDRL paper": 4}
 
 _AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
 
@@ -56,7 +57,8 @@ def learning_curves(
             textcoords="offset points", va="center", fontsize="small",
         )  # fmt: skip
     several = len({environment for environment, _, _ in lines}) > 1
-    styles = _styles([algorithm for _, algorithm, _ in lines])
+    agents = [(f"{algorithm} {variant}", algorithm) for _, algorithm, variant in lines]
+    styles = _styles([name if name in _OWN_STYLES else algorithm for name, algorithm in agents])
     for (key, line), (rank, style) in zip(lines.items(), enumerate(styles), strict=True):
         seeds = line[0].seeds
         words = [word for word in key[0 if several else 1 :] if word]
@@ -149,13 +151,13 @@ def _empty(title: str, xlabel: str, ylabel: str, *, rows: int) -> "tuple[Figure,
     return figure, axes
 
 
-def _styles(algorithms: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield a style for each line; the first line of a known algorithm has that algorithm's."""
-    own = {name: rank for name, rank in _OWN_STYLES.items() if name in algorithms}
+def _styles(names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield a style for each line; the first line of a known name has that name's."""
+    own = {name: rank for name, rank in _OWN_STYLES.items() if name in names}
     taken = set(own.values())
     others = (rank for rank in itertools.count() if rank not in taken)
-    for algorithm in algorithms:
-        rank = own.pop(algorithm) if algorithm in own else next(others)
+    for name in names:
+        rank = own.pop(name) if name in own else next(others)
         yield line_style(rank)
 
 

@@ -35,9 +35,9 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """A run that a study needs.
 
     Attributes:
-        algorithm: who learns.
+        algorithm: the learner.
         settings: UDRL's; of another algorithm's, environment, networks and evaluations.
-        hyperparameters: of DQN and A2C.
+        hyperparameters: of another algorithm than UDRL.
         exploration_steps: over which DQN's part of random actions falls is a part of so many.
         max_env_steps: how far.
         variant: what sets it apart within the study; not a part of what the run is.

@@ -6,7 +6,7 @@ Importing it needs Stable-Baselines3; :mod:`udrl_experiments.baselines` does so 
 from collections.abc import Mapping
 from functools import partial
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +24,7 @@ from udrl.environments.making import Environment, make_environment
 from udrl.inference import Call
 from udrl.memory import Seen
 from udrl.streams import Purpose, Stream, stream_key
+from udrl_experiments.protocol import BaselineAlgorithm
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -88,7 +89,7 @@ class Convolutions(BaseFeaturesExtractor):
 
 
 def make(
-    algorithm: Literal["DQN", "A2C"],
+    algorithm: BaselineAlgorithm,
     hyperparameters: Mapping[str, Any],
     config: Config,
     part: int = 0,

@@ -8,7 +8,14 @@ from typing import Any, Literal, NamedTuple
 from udrl.config import Config, build, flat, parse_assignment, preset
 from udrl.errors import ConfigError
 
-Algorithm = Literal["UDRL", "DQN", "A2C"]
+#: Algorithms of Stable-Baselines3 that UDRL is compared with.
+BaselineAlgorithm = Literal["DQN", "A2C"]
+Algorithm = Literal["UDRL", BaselineAlgorithm]
+#: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has nothing that is not
+#: in the paper.
+Participant = Literal["UDRL", "UDRL-paper", BaselineAlgorithm]
+#: Those of Figures 4 and 5.
+DEFAULT_PARTICIPANTS: tuple[Participant, ...] = ("UDRL", "DQN", "A2C")
 Scale = Literal["small", "paper"]
 
 #: Evaluations that a score is the mean of (Appendix B).
@@ -22,7 +29,8 @@ class Task:
     Attributes:
         environment: Gymnasium's id; its preset has the same name.
         title: in pictures.
-        small: env steps of a run at the small scale: UDRL's, and the other algorithms'.
+        small_steps: env steps of a run of UDRL at the small scale.
+        small_baseline_steps: those of a run of another algorithm.
         desired_returns: what trained agents are told in the study of section 3.5.
         landmarks: returns that the paper names, by what they mean.
         thresholds: returns whose first evaluation is looked for, in env steps and in seconds.
@@ -31,7 +39,8 @@ class Task:
 
     environment: str
     title: str
-    small: dict[Algorithm, int]
+    small_steps: int
+    small_baseline_steps: int
     desired_returns: tuple[float, ...]
     landmarks: dict[str, float]
     thresholds: tuple[float, ...]
@@ -39,19 +48,19 @@ class Task:
 
 
 _LANDING = {"lands": 100.0, "close to optimal": 200.0}
-_SMALL: dict[Algorithm, int] = {"UDRL": 3_000_000, "DQN": 1_000_000, "A2C": 1_000_000}
+_SMALL = 3_000_000, 1_000_000
 
 TASKS = {
     "lander": Task(
-        "LunarLander-v3", "LunarLander", _SMALL, tuple(range(-150, 301, 25)), _LANDING,
+        "LunarLander-v3", "LunarLander", *_SMALL, tuple(range(-150, 301, 25)), _LANDING,
         (100.0, 150.0, 200.0), "Box2D",
     ),
     "sparse": Task(
-        "LunarLanderSparse-v3", "LunarLanderSparse", _SMALL, tuple(range(-150, 301, 25)), _LANDING,
-        (100.0, 150.0, 200.0), "Box2D",
+        "LunarLanderSparse-v3", "LunarLanderSparse", *_SMALL, tuple(range(-150, 301, 25)),
+        _LANDING, (100.0, 150.0, 200.0), "Box2D",
     ),
     "takecover": Task(
-        "TakeCover-v0", "TakeCover", {"UDRL": 300_000, "DQN": 100_000, "A2C": 100_000},
+        "TakeCover-v0", "TakeCover", 300_000, 100_000,
         tuple(range(100, 2101, 200)), {"solved": 750.0}, (300.0, 500.0, 750.0), "vizdoom",
     ),
 }  # fmt: skip
@@ -60,7 +69,7 @@ TASKS = {
 PAPER_STEPS = 10_000_000
 
 
-#: Settings of a UDRL run that DQN and A2C have too; no other is a part of what their runs are.
+#: Settings of a UDRL run that other algorithms have too; their runs do not depend on any other.
 _SHARED = (
     "environment", "environment_kwargs", "max_episode_steps", "seed", "frame_stack", "convolutions",
     "hidden", "eval_every", "eval_episodes", "eval_temperature", "eval_seeds", "device",
@@ -92,7 +101,9 @@ class StudyPlan(NamedTuple):
         """Return the env steps of a run."""
         if self.max_env_steps is not None:
             return self.max_env_steps
-        return PAPER_STEPS if self.scale == "paper" else task.small[algorithm]
+        if self.scale == "paper":
+            return PAPER_STEPS
+        return task.small_steps if algorithm == "UDRL" else task.small_baseline_steps
 
     def config(self, task: Task, seed: int, *, paper: bool = False, **changes: Any) -> Config:
         """Return the settings of a UDRL run: the preset, changes, and the plan's assignments.
@@ -116,7 +127,7 @@ class StudyPlan(NamedTuple):
         return build(Config, values | {"eval_every": 50_000} | given | own)
 
     def baseline(self, task: Task, seed: int, **changes: Any) -> Config:
-        """Return the settings of a run of DQN or A2C: what they have in common with UDRL's.
+        """Return the settings of a run of another algorithm: what they have in common with UDRL's.
 
         Args:
             task: whose environment and networks.

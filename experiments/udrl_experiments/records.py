@@ -8,7 +8,7 @@ class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         environment: Gymnasium's id.
-        algorithm: ``UDRL``, ``DQN`` or ``A2C``.
+        algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
         variant: what sets the agent apart within the study, e.g. ``lead 2``; may be empty.
         seed: of the run.
         env_steps: training steps before it.

@@ -23,7 +23,7 @@ class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         environment: Gymnasium's id.
-        algorithm: ``UDRL``, ``DQN`` or ``A2C``.
+        algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
         variant: what sets the agents apart within the study; may be empty.
         env_steps: training steps before the evaluations, a multiple of the curves' interval.
         wall_s: seconds before the end of the evaluations, mean over the seeds.
@@ -49,7 +49,7 @@ class Reached(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         environment: Gymnasium's id.
-        algorithm: ``UDRL``, ``DQN`` or ``A2C``.
+        algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
         variant: what sets the agent apart within the study; may be empty.
         seed: of the run.
         threshold: the mean return.

@@ -10,7 +10,16 @@ from typing import Any, TypeVar, get_args
 import click
 
 from udrl_experiments.comparison import comparison
-from udrl_experiments.protocol import TASKS, Algorithm, Scale, StudyPlan, parse_seeds, tasks
+from udrl_experiments.protocol import (
+    DEFAULT_PARTICIPANTS,
+    TASKS,
+    Algorithm,
+    Participant,
+    Scale,
+    StudyPlan,
+    parse_seeds,
+    tasks,
+)
 from udrl_experiments.search import search as make_search
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
@@ -23,7 +32,7 @@ from udrl_launch.subcommands.options import STEPS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-_ALGORITHMS: tuple[Algorithm, ...] = get_args(Algorithm)
+_SEARCHED: tuple[Algorithm, ...] = get_args(Algorithm)
 
 
 @click.group()
@@ -64,11 +73,12 @@ def _tasks(*default: str) -> Callable[[Command], Command]:
     )  # fmt: skip
 
 
-def _algorithms(command: Command) -> Command:
-    """Add the option that names algorithms."""
+def _participants(command: Command) -> Command:
+    """Add the option that names participants of a comparison."""
     return click.option(
-        "--algorithm", "algorithms", multiple=True, type=click.Choice(_ALGORITHMS),
-        default=_ALGORITHMS, show_default=True, help="Algorithm to run. May be repeated.",
+        "--algorithm", "participants", multiple=True, type=click.Choice(get_args(Participant)),
+        default=DEFAULT_PARTICIPANTS, show_default=True,
+        help="Algorithm to run. May be repeated. UDRL-paper is UDRL with the preset ENV-paper.",
     )(command)  # fmt: skip
 
 
@@ -105,35 +115,35 @@ def _conduct(
 
 @study.command()
 @_options
-@_algorithms
-def lander(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+@_participants
+def lander(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 4a: UDRL, DQN and A2C on LunarLander.
 
-    Example: udrl study lander --seeds 1-20 --max-env-steps 10M
+    Example: udrl study lander --algorithm UDRL --algorithm UDRL-paper
     """
-    return _conduct(lambda plan: comparison("lander", plan, algorithms), **options)
+    return _conduct(lambda plan: comparison("lander", plan, participants), **options)
 
 
 @study.command()
 @_options
-@_algorithms
-def takecover(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+@_participants
+def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 4b: UDRL, DQN and A2C on TakeCover.
 
     Example: udrl study takecover --algorithm UDRL
     """
-    return _conduct(lambda plan: comparison("takecover", plan, algorithms), **options)
+    return _conduct(lambda plan: comparison("takecover", plan, participants), **options)
 
 
 @study.command()
 @_options
-@_algorithms
-def sparse(algorithms: tuple[Algorithm, ...], **options: Any) -> int:
+@_participants
+def sparse(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 5: UDRL, DQN and A2C on LunarLanderSparse.
 
     Example: udrl study sparse --scale paper
     """
-    return _conduct(lambda plan: comparison("sparse", plan, algorithms), **options)
+    return _conduct(lambda plan: comparison("sparse", plan, participants), **options)
 
 
 @study.command()
@@ -187,7 +197,9 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 @study.command()
 @_options
 @_tasks("lander")
-@_algorithms
+@click.option("--algorithm", "algorithms", multiple=True, type=click.Choice(_SEARCHED),
+              default=_SEARCHED, show_default=True,
+              help="Algorithm to run. May be repeated.")  # fmt: skip
 @click.option("--configurations", type=click.IntRange(1, 100_000), metavar="N",
               help="Configurations per algorithm. Default: 8, or the paper's number.")  # fmt: skip
 def search(

@@ -1,4 +1,4 @@
-"""Hyperparameters of DQN and A2C: which there are, and those that ship (``tuned.toml``)."""
+"""Hyperparameters of algorithms other than UDRL: their names, and the values in ``tuned.toml``."""
 
 import tomllib
 from collections.abc import Mapping
@@ -11,6 +11,7 @@ from msgspec import Meta
 from udrl.config import KeywordValue, build
 from udrl.errors import ConfigError
 from udrl.setting_groups import Count, PositiveInt
+from udrl_experiments.protocol import BaselineAlgorithm
 
 Part = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(gt=0, le=10)]
@@ -79,15 +80,13 @@ class A2cHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
 Hyperparameters = DqnHyperparameters | A2cHyperparameters
 
-_KINDS: dict[str, type[DqnHyperparameters] | type[A2cHyperparameters]] = {
+_KINDS: dict[BaselineAlgorithm, type[Hyperparameters]] = {
     "DQN": DqnHyperparameters,
     "A2C": A2cHyperparameters,
 }
 
 
-def complete(
-    algorithm: Literal["DQN", "A2C"], chosen: Mapping[str, KeywordValue]
-) -> Hyperparameters:
+def complete(algorithm: BaselineAlgorithm, chosen: Mapping[str, KeywordValue]) -> Hyperparameters:
     """Return some hyperparameters and the defaults of all others.
 
     Raises:
@@ -103,7 +102,7 @@ def complete(
     return build(kind, chosen)
 
 
-def tuned(algorithm: Literal["DQN", "A2C"], environment: str) -> dict[str, KeywordValue]:
+def tuned(algorithm: BaselineAlgorithm, environment: str) -> dict[str, KeywordValue]:
     """Return an algorithm's hyperparameters for an environment.
 
     Raises:

@@ -1,0 +1,77 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from udrl.config import flat, preset
+from udrl_experiments.comparison import comparison, job
+from udrl_experiments.jobs import Job
+from udrl_experiments.protocol import DEFAULT_PARTICIPANTS, TASKS, StudyPlan, Task
+from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.statistics import CurvePoint, Reached
+from udrl_experiments.study import StudyFolders
+from udrl_inspect.csv_tables import read, write
+
+#: Two evaluations suffice for a curve.
+PLAN = StudyPlan(seeds=(1, 2), max_env_steps=100_000)
+
+each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+
+
+def finish(root: Path, one: Job, *, wall_s: float = 10.0) -> None:
+    """Leave what a finished run leaves."""
+    folder = one.folder(root)
+    folder.mkdir(parents=True)
+    rows = [
+        EvaluationRecord(
+            environment=one.config.environment, algorithm=one.algorithm, variant="",
+            seed=one.config.seed, env_steps=env_steps, wall_s=wall_s * number,
+            mean=float(one.config.seed + number), std=1.0, episodes=100,
+        )
+        for number, env_steps in enumerate((50_123, 100_045), 1)
+    ]  # fmt: skip
+    write(folder / "evaluations.csv", EvaluationRecord, rows)
+    (folder / "done.json").write_text(json.dumps({"max_env_steps": one.max_env_steps}))
+
+
+@each_task
+def test_the_papers_preset_is_a_participant_whose_runs_are_those_of_its_settings(
+    task: Task,
+) -> None:
+    participant = job(task, PLAN, "UDRL-paper", 1)
+    settings = flat(PLAN.config(task, 1, paper=True))
+    assert participant.name == Job(algorithm="UDRL", settings=settings, max_env_steps=1).name
+    shipped = preset(f"{task.environment}-paper")
+    del shipped["max_env_steps"]
+    assert settings.items() >= shipped.items()
+    assert participant.name != job(task, PLAN, "UDRL", 1).name
+
+
+@each_task
+def test_without_a_choice_the_figure_is_the_papers(task: Task) -> None:
+    name = next(name for name, one in TASKS.items() if one is task)
+    jobs = comparison(name, PLAN, DEFAULT_PARTICIPANTS).jobs
+    assert [(one.algorithm, one.variant, one.config.seed) for one in jobs] == [
+        (algorithm, "", seed) for algorithm in ("UDRL", "DQN", "A2C") for seed in (1, 2)
+    ]
+
+
+def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
+    study = comparison("lander", PLAN, ("UDRL", "UDRL-paper", "UDRL"))
+    assert len(study.jobs) == 4
+    for one in study.jobs:
+        finish(tmp_path, one)
+    place = StudyFolders(tmp_path, tmp_path / "lander")
+    place.folder.mkdir()
+    said = study.report(place)
+
+    points = read(place.folder / "curves.csv", CurvePoint)
+    assert {(point.algorithm, point.variant) for point in points} == {
+        ("UDRL", ""),
+        ("UDRL", "paper"),
+    }
+    assert {row.variant for row in read(place.folder / "reached.csv", Reached)} == {"", "paper"}
+    picture = (place.folder / "learning-curves.svg").read_text(encoding="utf-8")
+    for label in ("UDRL (2 seeds)", "UDRL paper (2 seeds)"):
+        assert f">{label}</text>" in picture
+    assert "LunarLander: UDRL paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
