@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Lines that look the same in every figure, by algorithm and variant, or by algorithm alone. UDRL
 #: is green, as in the paper.
-_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "UDRL paper": 4}
+_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL paper": 4}
 
 _AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
 

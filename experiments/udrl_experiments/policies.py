@@ -1,4 +1,4 @@
-"""DQN and A2C from Stable-Baselines3, with the behavior function's networks (section 3.2).
+"""Algorithms of Stable-Baselines3, with the behavior function's networks (section 3.2).
 
 Importing it needs Stable-Baselines3; :mod:`udrl_experiments.baselines` does so when it trains.
 """
@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3 import A2C, DQN
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -25,6 +25,8 @@ from udrl.inference import Call
 from udrl.memory import Seen
 from udrl.streams import Purpose, Stream, stream_key
 from udrl_experiments.protocol import BaselineAlgorithm
+
+Model = DQN | A2C | PPO
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -93,7 +95,7 @@ def make(
     hyperparameters: Mapping[str, Any],
     config: Config,
     part: int = 0,
-) -> DQN | A2C:
+) -> Model:
     """Return an untrained model with its environments.
 
     Args:
@@ -123,10 +125,12 @@ def make(
     common: dict[str, Any] = {
         "policy_kwargs": networks, "seed": int(seed), "device": config.arithmetic.device,
     }  # fmt: skip
-    model: DQN | A2C
+    model: Model
     if algorithm == "DQN":
         del chosen["exploration_fraction"]  # see `explore_for`
         model = DQN(policy, envs, **chosen, **common)
+    elif algorithm == "PPO":
+        model = PPO(policy, envs, **chosen, **common)
     else:
         networks["optimizer_class"] = torch.optim.RMSprop
         networks["optimizer_kwargs"] = {
@@ -145,7 +149,7 @@ def _environment(config: Config, part: int, index: int) -> Environment:
     return TrainingResets(env, Stream(stream_key(config.seed, Purpose.TRAINING, part, index)))
 
 
-def explore_for(model: DQN | A2C, env_steps: int) -> None:
+def explore_for(model: Model, env_steps: int) -> None:
     """Let the part of random actions fall linearly for so many env steps, if the model is DQN.
 
     Stable-Baselines3's own schedule begins anew with every call of ``learn``.
@@ -168,7 +172,7 @@ class InPlaceOfBehavior:
         shape: of what is observed, with frames stacked along the first dimension.
     """
 
-    def __init__(self, model: DQN | A2C, shape: tuple[int, ...]) -> None:
+    def __init__(self, model: Model, shape: tuple[int, ...]) -> None:
         model.policy.set_training_mode(mode=False)
         self.model = model
         self.shape = shape
@@ -189,7 +193,7 @@ class _Rows:
         self.logits = np.zeros((n, int(behavior.model.action_space.n)), np.float32)
 
     def run(self) -> None:
-        """Compute A2C's logits, or DQN's Q-values, of which the greatest one is meant."""
+        """Compute logits, or DQN's Q-values, of which the greatest one is meant."""
         model = self._model
         shape = model.observation_space.shape
         assert shape is not None
@@ -204,7 +208,7 @@ class _Rows:
         self.logits[:] = logits.cpu().numpy()
 
 
-def counters(model: DQN | A2C) -> dict[str, int]:
+def counters(model: Model) -> dict[str, int]:
     """Return what a model has counted, by name."""
     counted = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     if isinstance(model, DQN):
@@ -213,7 +217,7 @@ def counters(model: DQN | A2C) -> dict[str, int]:
     return counted
 
 
-def tensors(model: DQN | A2C) -> dict[str, Tensor]:
+def tensors(model: Model) -> dict[str, Tensor]:
     """Return weights, optimizer and the filled part of the replay buffer, by name.
 
     They are the model's own, and no two share memory.
@@ -229,7 +233,7 @@ def tensors(model: DQN | A2C) -> dict[str, Tensor]:
     return held
 
 
-def restore(model: DQN | A2C, held: Mapping[str, Tensor], counted: Mapping[str, int]) -> None:
+def restore(model: Model, held: Mapping[str, Tensor], counted: Mapping[str, int]) -> None:
     """Give a model the :func:`tensors` and :func:`counters` of another one.
 
     Raises:

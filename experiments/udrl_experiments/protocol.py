@@ -9,7 +9,7 @@ from udrl.config import Config, build, flat, parse_assignment, preset
 from udrl.errors import ConfigError
 
 #: Algorithms of Stable-Baselines3 that UDRL is compared with.
-BaselineAlgorithm = Literal["DQN", "A2C"]
+BaselineAlgorithm = Literal["DQN", "A2C", "PPO"]
 Algorithm = Literal["UDRL", BaselineAlgorithm]
 #: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has nothing that is not
 #: in the paper.

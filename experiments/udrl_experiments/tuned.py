@@ -78,11 +78,45 @@ class A2cHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     normalize_advantage: bool = False
 
 
-Hyperparameters = DqnHyperparameters | A2cHyperparameters
+class PpoHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """PPO's, by Stable-Baselines3's names and with its defaults; it has none for ``n_envs``.
+
+    Attributes:
+        activation: of the fully connected layers.
+        gamma: discount factor.
+        learning_rate: Adam's.
+        n_envs: environments that it acts in at the same time.
+        n_steps: steps of each environment before an update.
+        batch_size: of a minibatch, in env steps.
+        n_epochs: passes over the steps of an update.
+        gae_lambda: of generalised advantage estimation.
+        clip_range: largest change of an action's probability ratio that is rewarded.
+        ent_coef: factor of the entropy in the loss.
+        vf_coef: factor of the value function's error in the loss.
+        max_grad_norm: gradients are scaled down to this norm.
+    """
+
+    activation: Literal["relu", "tanh"] = "tanh"
+    gamma: Part = 0.99
+    learning_rate: Rate = 3e-4
+    n_envs: Annotated[int, Meta(ge=1, le=1024)] = 1
+    # Advantages are divided by the standard deviation of a minibatch, which takes two.
+    n_steps: Annotated[int, Meta(ge=2)] = 2048
+    batch_size: Annotated[int, Meta(ge=2)] = 64
+    n_epochs: PositiveInt = 10
+    gae_lambda: Part = 0.95
+    clip_range: Annotated[float, Meta(gt=0, le=1)] = 0.2
+    ent_coef: Coefficient = 0.0
+    vf_coef: Coefficient = 0.5
+    max_grad_norm: Annotated[float, Meta(gt=0, le=1e6)] = 0.5
+
+
+Hyperparameters = DqnHyperparameters | A2cHyperparameters | PpoHyperparameters
 
 _KINDS: dict[BaselineAlgorithm, type[Hyperparameters]] = {
     "DQN": DqnHyperparameters,
     "A2C": A2cHyperparameters,
+    "PPO": PpoHyperparameters,
 }
 
 

@@ -1,7 +1,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import msgspec
@@ -11,7 +11,7 @@ import pytest
 import safetensors.torch
 import torch
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
-from stable_baselines3 import A2C, DQN
+from stable_baselines3 import DQN
 from torch import Tensor, nn
 
 from udrl.acting import EpisodeGenerator, generate_episodes
@@ -24,14 +24,16 @@ from udrl.memory import FrameStack
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run
+from udrl_experiments.protocol import TASKS, BaselineAlgorithm, Task
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.tuned import complete, tuned
+from udrl_experiments.tuned import PpoHyperparameters, complete, tuned
 from udrl_inspect.csv_tables import read
 
-ALGORITHMS = ("DQN", "A2C")
+ALGORITHMS: tuple[BaselineAlgorithm, ...] = get_args(BaselineAlgorithm)
 FAST: dict[str, dict[str, KeywordValue]] = {
     "DQN": {"buffer_size": 500, "learning_starts": 50, "train_freq": 4},
     "A2C": {"n_envs": 2, "n_steps": 5},
+    "PPO": {"n_envs": 2, "n_steps": 5, "batch_size": 5, "n_epochs": 2},
 }
 
 seeds: list[int | None] = []
@@ -92,7 +94,7 @@ def pictures(algorithm: str) -> Baseline:
     )
 
 
-def made(of: Baseline) -> DQN | A2C:
+def made(of: Baseline) -> policies.Model:
     return policies.make(of.algorithm, msgspec.structs.asdict(of.complete()), of.config)
 
 
@@ -121,6 +123,7 @@ def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
                  "target_update_interval": 10, "train_freq": 64, "gradient_steps": 32,
                  "exploration_fraction": 0.2}, 3840),
         ("A2C", {"n_envs": 8, "n_steps": 16, "learning_rate": 2e-3}, 4096),
+        ("PPO", {"n_envs": 8, "n_steps": 32, "learning_rate": 2e-3}, 4096),
     ],
 )  # fmt: skip
 def test_it_learns(
@@ -149,7 +152,7 @@ def test_images(algorithm: str, tmp_path: Path) -> None:
 def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     """With a gate that is open, both are the same function of the same layers."""
     wanted: Baseline = make(algorithm)
-    if algorithm == "A2C":
+    if algorithm != "DQN":
         wanted = msgspec.structs.replace(wanted, hyperparameters={"activation": "relu"})
     model, config = made(wanted), wanted.config
     spec = specify(make_environment(config), config)
@@ -183,7 +186,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
         call.seen[0][:] = observation.numpy()
         call.run()
         logits = torch.from_numpy(call.logits)
-    if algorithm == "A2C":
+    if algorithm != "DQN":
         expected = expected.log_softmax(dim=1)
     torch.testing.assert_close(logits, expected)
 
@@ -236,7 +239,7 @@ def test_evaluations_act_as_udrl_does(
 
     monkeypatch.setattr(baselines, "generate_episodes", watched)
     run(baseline(algorithm), 200, tmp_path)
-    assert temperatures == [float(algorithm == "A2C")] * 4
+    assert temperatures == [float(algorithm != "DQN")] * 4
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -264,7 +267,7 @@ def test_stopped_and_resumed(
     restored: list[dict[str, Tensor]] = []
     counted: list[dict[str, int]] = []
 
-    def restore(model: DQN | A2C, *arguments: Any) -> None:
+    def restore(model: policies.Model, *arguments: Any) -> None:
         original(model, *arguments)
         restored.append({n: t.clone() for n, t in policies.tensors(model).items()})
         counted.append(policies.counters(model))
@@ -325,7 +328,7 @@ def test_extended_with_the_exploration_that_it_began_with(
     explored: list[int] = []
     original = policies.explore_for
 
-    def explore_for(model: DQN | A2C, env_steps: int) -> None:
+    def explore_for(model: policies.Model, env_steps: int) -> None:
         original(model, env_steps)
         assert isinstance(model, DQN)
         explored.append(env_steps)
@@ -390,6 +393,15 @@ def test_what_ships_is_in_the_papers_lists(algorithm: Any, environment: str) -> 
             assert np.isclose(values, chosen[name], rtol=1e-3).any()
         else:
             assert chosen[name] in values, name
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_minibatches_of_ppo_divide_its_rollouts(task: Task) -> None:
+    shipped = complete("PPO", tuned("PPO", task.environment))
+    assert isinstance(shipped, PpoHyperparameters)
+    assert (shipped.n_envs * shipped.n_steps) % shipped.batch_size == 0
+    # No two evaluations belong to the same point of a curve, and no point is left out.
+    assert shipped.n_envs * shipped.n_steps < 50_000
 
 
 def test_nothing_ships_for_other_environments() -> None:

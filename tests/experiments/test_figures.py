@@ -59,8 +59,8 @@ def data(line: Line2D) -> tuple[list[float], list[float]]:
     return x.tolist(), y.tolist()
 
 
-ALL = [*curve("DQN"), *curve("A2C"), *curve("UDRL", "paper"), *curve("UDRL")]
-MANY = [point for i in range(32) for point in curve("UDRL", f"lead {i}")]
+ALL = [*curve("DQN"), *curve("A2C"), *curve("PPO"), *curve("UDRL", "paper"), *curve("UDRL")]
+MANY = [point for i in range(31) for point in curve("UDRL", f"lead {i}")]
 
 
 def test_a_line_for_each_agent_with_its_seeds() -> None:
@@ -127,7 +127,7 @@ def test_an_algorithm_looks_the_same_in_whatever_order() -> None:
     other = labelled(learning_curves(ALL[::-1], ""))
     assert one == {label: look(line) for label, line in other.items()}
     assert one["UDRL (20 seeds)"][0] == GREEN
-    assert len({colour for colour, _, _ in one.values()}) == 4
+    assert len({colour for colour, _, _ in one.values()}) == 5
     for algorithm, variant in (("DQN", ""), ("UDRL", "paper")):
         ((label, alone),) = labelled(learning_curves(curve(algorithm, variant), "")).items()
         assert look(alone) == one[label]
