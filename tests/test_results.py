@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 
 from tests.markdown import ROOT, text_of
+from udrl_experiments.jobs import read_job
 from udrl_experiments.records import EvaluationRecord, Obtained
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_inspect.csv_tables import read
 
 RESULTS = ROOT / "docs" / "results"
-STUDIES = sorted(path.parent for path in RESULTS.rglob("evaluations.csv"))
+RUNS = sorted(path.parent for path in RESULTS.glob("runs/*/job.json"))
+STUDIES = sorted({path.parent for path in RESULTS.rglob("evaluations.csv")} - set(RUNS))
 EVERY = 50_000
 
 
@@ -30,6 +32,13 @@ def test_tables_are_made_of_the_evaluations(folder: Path) -> None:
     assert points == curves(rows, EVERY)
     found = read(folder / "reached.csv", Reached)
     assert found == reached(rows, sorted({row.threshold for row in found}))
+
+
+@pytest.mark.parametrize("folder", RUNS, ids=name)
+def test_kept_runs_are_recognised_and_only_their_records_are_kept(folder: Path) -> None:
+    job = read_job(folder)
+    assert folder == job.folder(RESULTS)
+    assert job.done(RESULTS)
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)

@@ -71,6 +71,9 @@ def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
 
 
 def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
+    if not (folder / "run").exists() and not (folder / "state.safetensors").exists():
+        # If only the records of a shorter run were kept, it begins anew.
+        (folder / "done.json").unlink(missing_ok=True)
     if job.algorithm == "UDRL":
         settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
         status = train(settings, folder / "run", stop, resume=True)

@@ -25,6 +25,10 @@ from udrl_inspect.csv_tables import put, read
 #: What is said when a study is stopped.
 INTERRUPTED = "stopped; resume with the same command and --resume"
 
+#: Files that say what a run was and what came of it. The others are its state: what it takes to
+#: extend the run, or to use its agent.
+RECORDS = "job.json", "evaluations.csv", "done.json"
+
 _PROGRAM = ("-m", "udrl_experiments.job")
 _POLL_S = 0.2
 #: Seconds that a run gets to end when it is told to.
@@ -168,6 +172,36 @@ def furthest(jobs: Iterable[Job]) -> Sequence[Job]:
         if job.max_env_steps > held.max_env_steps:
             furthest[job.name] = job
     return list(furthest.values())
+
+
+def copy_finished(
+    jobs: Iterable[Job], root: Path, sources: Sequence[Path], say: Callable[[str], None]
+) -> None:
+    """Copy the records of runs that are done in other folders of studies, and not in this one.
+
+    Args:
+        jobs: as for :func:`carry_out`.
+        root: where runs live.
+        sources: the other folders; the first that has a run counts.
+        say: receives a line for each run that is copied.
+
+    Raises:
+        ConfigError: a source has no runs.
+    """
+    for source in sources:
+        if not (source / "runs").is_dir():
+            raise ConfigError(
+                f"--runs-from {source}: expected a folder of studies with the folder runs in it; "
+                f"name what was given to --folder"
+            )
+    for job in furthest(jobs):
+        finished = next((source for source in sources if job.done(source)), None)
+        if finished is None or job.done(root):
+            continue
+        say(f"copied from {finished}: {job.described}")
+        job.folder(root).mkdir(parents=True, exist_ok=True)
+        for name in RECORDS:
+            put(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
 
 
 def _start(job: Job, root: Path) -> subprocess.Popen[bytes]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from udrl.errors import StoreError
 from udrl.obedience_statistics import correlation
 from udrl_experiments import figures
 from udrl_experiments.comparison import job
@@ -59,7 +60,13 @@ def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
 def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
     """Return what the agent of a run obtains; another study may have taken it further."""
     run_dir = run.folder(root) / "run"
-    agent, env_steps = load_agent(run_dir), read_status(run_dir).env_steps
+    try:
+        agent, env_steps = load_agent(run_dir), read_status(run_dir).env_steps
+    except StoreError as error:
+        raise StoreError(
+            f"{run.described}: its agent cannot be used: {error}; if only the records of the run "
+            f"were kept, delete {run.folder(root)} to have it made again"
+        ) from error
     commands = [
         evaluation_commands(agent, episodes=episodes, desired_return=told)
         for told in task.desired_returns

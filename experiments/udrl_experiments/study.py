@@ -10,7 +10,7 @@ import msgspec
 
 from udrl.errors import ConfigError, InvalidData
 from udrl.strategies import make_strategy
-from udrl_experiments.jobs import Job, carry_out
+from udrl_experiments.jobs import Job, carry_out, copy_finished
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
 from udrl_inspect.csv_tables import put
@@ -59,6 +59,7 @@ def conduct(
     resume: bool,
     stop: threading.Event,
     say: Callable[[str], None],
+    runs_from: Sequence[Path] = (),
 ) -> str:
     """Conduct a study, or go on with it where it stopped, and return what came of it in words.
 
@@ -69,10 +70,12 @@ def conduct(
         resume: go on if the folder holds this study already.
         stop: ends it early.
         say: is told how it goes.
+        runs_from: folders of other studies; runs that are done there are not made again.
 
     Raises:
         ConfigError: a package is missing, a strategy cannot be made, the folder cannot be written,
-            or it holds a study already: another one, or ``resume`` is not set.
+            or it holds a study already: another one, or ``resume`` is not set. Or one of
+            ``runs_from`` has no runs.
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
@@ -82,6 +85,8 @@ def conduct(
     place = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         _open(study, place, resume=resume)
+        sources = [one if study.shares_runs else one / study.name for one in runs_from]
+        copy_finished(study.jobs, place.root, sources, say)
         study.carry_out(study.jobs, place.root, side_by_side, stop, say)
         said = study.report(place)
     except OSError as error:
@@ -125,7 +130,7 @@ def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
         for job in study.jobs:
             key = job.name, job.variant
             planned[key] = max(planned.get(key, 0), job.max_env_steps)
-        for job in _begun(file):
+        for job in read_study(file):
             if planned.get((job.name, job.variant), 0) < job.max_env_steps:
                 raise ConfigError(
                     f"{place.folder} holds a study with the run {job.described}, which is not in "
@@ -137,11 +142,17 @@ def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
     put(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
 
 
-def _begun(file: Path) -> list[Job]:
+def read_study(file: Path) -> list[Job]:
+    """Return the runs of the study in a file ``study.json``.
+
+    Raises:
+        InvalidData: it is something else.
+    """
+
     class About(msgspec.Struct):
         runs: list[Job]
 
     try:
         return msgspec.json.decode(file.read_bytes(), type=About).runs
-    except msgspec.DecodeError as error:
+    except (OSError, msgspec.DecodeError, ConfigError) as error:
         raise InvalidData(f"{file}: {error}; delete it to begin the study anew") from error

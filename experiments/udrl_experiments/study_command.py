@@ -24,6 +24,7 @@ from udrl_experiments.search import search as make_search
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
 from udrl_experiments.study import Study, conduct
+from udrl_experiments.study_progress import studies, table
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
 from udrl_experiments.variants import segments as make_segments
@@ -34,6 +35,12 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 #: Algorithms that Appendix B has spaces for.
 _SEARCHED: tuple[Algorithm, ...] = ("UDRL", "DQN", "A2C")
+
+
+_FOLDER = click.option(
+    "--folder", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/studies"),
+    show_default=True, metavar="DIR", help="Folder of all studies, which share their runs.",
+)  # fmt: skip
 
 
 @click.group()
@@ -54,9 +61,7 @@ def _options(command: Command) -> Command:
         click.option("--max-env-steps", type=STEPS, help="Env steps per run, e.g. 500K or 10M."),
         click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
                      help="Change a setting of all UDRL runs. May be repeated."),
-        click.option("--folder", type=click.Path(path_type=Path, file_okay=False),
-                     default=Path("runs/studies"), show_default=True,
-                     metavar="DIR", help="Folder of all studies, which share their runs."),
+        _FOLDER,
         click.option("--side-by-side", type=click.IntRange(1, 1024), metavar="N",
                      help="Runs at a time. Default: one for every two cores."),
         click.option("--resume", is_flag=True, help="Resume the study in the folder."),
@@ -64,6 +69,15 @@ def _options(command: Command) -> Command:
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _runs_from(command: Command) -> Command:
+    """Add the option that names folders of finished runs."""
+    return click.option(
+        "--runs-from", multiple=True, metavar="DIR",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="Use finished runs from another folder of studies too. May be repeated.",
+    )(command)  # fmt: skip
 
 
 def _tasks(*default: str) -> Callable[[Command], Command]:
@@ -93,6 +107,7 @@ def _conduct(
     folder: Path,
     side_by_side: int | None,
     resume: bool,
+    runs_from: tuple[Path, ...] = (),
 ) -> int:
     log_to_stderr(logging.WARNING)
     plan = StudyPlan(
@@ -107,7 +122,7 @@ def _conduct(
     def service(stop: threading.Event) -> None:
         said = conduct(
             planned, folder, side_by_side=side_by_side or max(1, cores // 2), resume=resume,
-            stop=stop, say=lambda text: click.echo(text, err=True),
+            stop=stop, say=lambda text: click.echo(text, err=True), runs_from=runs_from,
         )  # fmt: skip
         click.echo(said)
 
@@ -115,7 +130,24 @@ def _conduct(
 
 
 @study.command()
+@click.argument("names", nargs=-1, metavar="[STUDY]...")
+@_FOLDER
+def show(names: tuple[str, ...], folder: Path) -> int:
+    """Show which runs of studies are done, and how far the others are.
+
+    Shows all studies in the folder, or those named. Starts nothing.
+
+    Example: udrl study show lander --folder runs/studies
+    """
+    for number, (name, runs) in enumerate(studies(folder, names)):
+        lines = table(name, runs)
+        click.echo("\n".join(["", *lines] if number else lines))
+    return 0
+
+
+@study.command()
 @_options
+@_runs_from
 @_participants
 def lander(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 4a: UDRL, DQN and A2C on LunarLander.
@@ -127,6 +159,7 @@ def lander(participants: tuple[Participant, ...], **options: Any) -> int:
 
 @study.command()
 @_options
+@_runs_from
 @_participants
 def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 4b: UDRL, DQN and A2C on TakeCover.
@@ -138,6 +171,7 @@ def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
 
 @study.command()
 @_options
+@_runs_from
 @_participants
 def sparse(participants: tuple[Participant, ...], **options: Any) -> int:
     """Figure 5: UDRL, DQN and A2C on LunarLanderSparse.
@@ -162,6 +196,7 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 
 @study.command()
 @_options
+@_runs_from
 @_tasks("lander")
 def lead(names: tuple[str, ...], **options: Any) -> int:
     """Cost of asynchrony: lead 0, 1, 2, 4 and 8.
@@ -173,6 +208,7 @@ def lead(names: tuple[str, ...], **options: Any) -> int:
 
 @study.command()
 @_options
+@_runs_from
 @_tasks("lander", "sparse")
 def segments(names: tuple[str, ...], **options: Any) -> int:
     """Trailing segments and segments of all lengths (section 2.3.3).
@@ -184,6 +220,7 @@ def segments(names: tuple[str, ...], **options: Any) -> int:
 
 @study.command()
 @_options
+@_runs_from
 @_tasks("lander", "sparse")
 @click.option("--strategy", "strategies", multiple=True, metavar="PACKAGE.MODULE:CLASS",
               help="Strategy of your own to add. May be repeated.")  # fmt: skip
@@ -197,6 +234,7 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 
 @study.command()
 @_options
+@_runs_from
 @_tasks("lander")
 @click.option("--algorithm", "algorithms", multiple=True, type=click.Choice(_SEARCHED),
               default=_SEARCHED, show_default=True,

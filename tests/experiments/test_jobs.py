@@ -9,10 +9,11 @@ import msgspec
 import pytest
 
 from udrl.config import Config, build, change, flat
-from udrl.errors import Interrupted, InvalidData, RunFailed, RunInUse
+from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed, RunInUse
+from udrl_experiments import job as job_module
 from udrl_experiments import jobs
 from udrl_experiments.job import carry_out as do
-from udrl_experiments.jobs import Job, carry_out, furthest, read_job
+from udrl_experiments.jobs import RECORDS, Job, carry_out, copy_finished, furthest, read_job
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import write
 
@@ -134,6 +135,62 @@ def test_no_more_than_asked_side_by_side(tmp_path: Path, program: Callable[[str]
     counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
     assert len(counts) == 4
     assert max(counts) == 2
+
+
+def names_in(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()}
+
+
+def test_records_of_finished_runs_are_copied_and_their_runs_not_made_again(
+    tmp_path: Path, program: Callable[[str], None]
+) -> None:
+    first, second, here = (tmp_path / name for name in ("first", "second", "here"))
+    program(FINISH)
+    carry_out([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
+    carry_out([job(2000, seed=2)], second, 1, threading.Event(), quietly)
+    said: list[str] = []
+    wanted = [job(seed=1), job(2000, seed=2), job(seed=3)]
+    copy_finished(wanted, here, [first, second], said.append)
+    assert said == [
+        f"copied from {first}: UDRL, CartPole-v1, seed 1: 1,000 env steps",
+        f"copied from {second}: UDRL, CartPole-v1, seed 2: 2,000 env steps",
+    ]
+    for one, source in ((wanted[0], first), (wanted[1], second)):
+        assert names_in(one.folder(here)) == set(RECORDS) < names_in(one.folder(source))
+        for name in RECORDS:
+            kept = one.folder(here) / name
+            assert kept.read_bytes() == (one.folder(source) / name).read_bytes()
+
+    del said[:]
+    copy_finished(wanted, here, [first, second], said.append)  # they are here now
+    carry_out(wanted, here, 1, threading.Event(), said.append)
+    assert said == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+
+
+def test_a_folder_without_runs_is_told(tmp_path: Path) -> None:
+    (tmp_path / "runs" / "lander").mkdir(parents=True)
+    with pytest.raises(
+        ConfigError, match=r"--runs-from .*runs: expected a folder of studies.*--folder"
+    ):
+        copy_finished([job()], tmp_path, [tmp_path / "runs"], quietly)
+
+
+@pytest.mark.parametrize(
+    ("state", "kept"), [("run", True), ("state.safetensors", True), ("", False)]
+)
+def test_a_run_of_which_only_records_were_kept_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, *, kept: bool
+) -> None:
+    def fail(*arguments: Any, **others: Any) -> None:
+        raise RunFailed("later")
+
+    monkeypatch.setattr(job_module, "train", fail)
+    (tmp_path / "done.json").write_text("{}")
+    if state:
+        (tmp_path / state).touch()
+    with pytest.raises(RunFailed, match="later"):
+        do(job(), tmp_path, threading.Event())
+    assert (tmp_path / "done.json").exists() is kept
 
 
 class WhenItRuns(threading.Event):

@@ -14,7 +14,9 @@ from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import provenance
+from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.study import Study, StudyFolders, conduct
+from udrl_inspect.csv_tables import write
 
 
 def job(seed: int, max_env_steps: int = 100) -> Job:
@@ -121,6 +123,28 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
         conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
                 say=lambda text: None)  # fmt: skip
     assert not world.reported
+
+
+@pytest.mark.parametrize(("shares_runs", "place"), [(True, "."), (False, "try")])
+def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: str) -> None:
+    other = tmp_path / "other"
+    folder = job(1).folder(other / place)
+    folder.mkdir(parents=True)
+    row = EvaluationRecord(
+        environment="CartPole-v1", algorithm="UDRL", variant="", seed=1, env_steps=100, wall_s=1.0,
+        mean=2.0, std=3.0, episodes=4,
+    )  # fmt: skip
+    write(folder / "evaluations.csv", EvaluationRecord, [row])
+    (folder / "job.json").write_bytes(msgspec.json.encode(job(1)))
+    (folder / "done.json").write_text('{"max_env_steps": 100}')
+
+    def report(place: StudyFolders) -> str:
+        return str(job(1).evaluations(place.root)[0].mean)
+
+    study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
+    said = conduct(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
+                   say=lambda text: None, runs_from=[other])  # fmt: skip
+    assert said == "2.0"
 
 
 def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World) -> None:

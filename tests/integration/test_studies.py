@@ -9,8 +9,11 @@ from typing import Any
 
 import pytest
 
-from udrl.config import Config, build
-from whole_run import Cli, reference, wait_for
+from udrl.config import Config, build, flat
+from udrl_experiments.jobs import Job
+from udrl_experiments.study_progress import job_progress
+from udrl_inspect.inspection import read_status
+from whole_run import Cli, reference, small, wait_for
 
 TINY = {
     "eval_every": 1000, "eval_episodes": 3, "n_warm_up_episodes": 5, "n_episodes_per_iter": 4,
@@ -96,6 +99,16 @@ def test_a_run_of_a_study_is_the_run_of_its_settings(
     *held, closing = rows(folder / "evaluations.csv")
     assert [float(r["mean"]) for r in held] == [e.mean for e in expected.evaluations.values()]
     assert int(closing["env_steps"]) == expected.env_steps
+
+
+def test_the_store_of_an_unfinished_run_says_how_far_it_is(ended_run: Path, tmp_path: Path) -> None:
+    status = read_status(ended_run)
+    job = Job(algorithm="UDRL", settings=flat(small()), max_env_steps=2 * status.env_steps)
+    job.folder(tmp_path).mkdir(parents=True)
+    (job.folder(tmp_path) / "run").symlink_to(ended_run)
+    found = job_progress(job, tmp_path)
+    assert status.evaluation is not None
+    assert found == (job, "unfinished", status.env_steps, status.wall_s, status.evaluation.mean)
 
 
 @pytest.mark.slow

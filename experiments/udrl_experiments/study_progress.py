@@ -1,0 +1,109 @@
+"""``udrl study show``: which runs of a study are done, and how far the others are."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from udrl.errors import ConfigError, UdrlError
+from udrl.evaluation import return_text
+from udrl_experiments.jobs import Job, furthest
+from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.study import read_study
+from udrl_inspect.csv_tables import read
+from udrl_inspect.inspection import read_status
+from udrl_show.display import duration
+
+_HEAD = "state", "env steps", "wall time", "mean return", "run"
+
+
+class JobProgress(NamedTuple):
+    """How far a run is.
+
+    Attributes:
+        job: the run.
+        state: ``done``; ``unfinished``: in progress or interrupted; ``not begun``.
+        env_steps: env steps so far; of a run that went further than asked, those asked for.
+        wall_s: seconds of training and evaluations so far.
+        mean: mean return of the last evaluation; None: there was none.
+    """
+
+    job: Job
+    state: Literal["done", "unfinished", "not begun"]
+    env_steps: int = 0
+    wall_s: float = 0.0
+    mean: float | None = None
+
+
+def job_progress(job: Job, root: Path) -> JobProgress:
+    """Return how far a run is, without changing anything.
+
+    Args:
+        job: the run.
+        root: where runs live.
+    """
+    folder = job.folder(root)
+    if job.done(root):
+        last = job.evaluations(root)[-1]
+        steps = min(last.env_steps, job.max_env_steps)
+        return JobProgress(job, "done", steps, last.wall_s, last.mean)
+    try:
+        if job.algorithm == "UDRL":
+            status = read_status(folder / "run")
+            mean = None if status.evaluation is None else status.evaluation.mean
+            return JobProgress(job, "unfinished", status.env_steps, status.wall_s, mean)
+        last = read(folder / "evaluations.csv", EvaluationRecord)[-1]
+        return JobProgress(job, "unfinished", last.env_steps, last.wall_s, last.mean)
+    except (UdrlError, IndexError):  # it has no store or table yet
+        return JobProgress(job, "unfinished" if folder.exists() else "not begun")
+
+
+def studies(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, list[JobProgress]]]:
+    """Yield the studies in a folder, each with its runs.
+
+    Args:
+        folder: of all studies.
+        names: of some studies; none: of all in the folder.
+
+    Raises:
+        ConfigError: the folder holds no such study.
+        InvalidData: a study cannot be read.
+    """
+    found = sorted(file.parent.name for file in folder.glob("*/study.json"))
+    if not found:
+        raise ConfigError(f"{folder} holds no study; begin one with e.g. udrl study lander")
+    for name in names:
+        if name not in found:
+            raise ConfigError(f"{folder} holds no study {name}; there are {', '.join(found)}")
+    for name in names or found:
+        own = folder / name / "runs"  # of a study that does not share its runs
+        root = own.parent if own.is_dir() else folder
+        runs = furthest(read_study(folder / name / "study.json"))
+        yield name, [job_progress(job, root) for job in runs]
+
+
+def table(name: str, runs: Sequence[JobProgress]) -> list[str]:
+    """Return the lines that show a study: its runs below a summary."""
+    done = [run for run in runs if run.state == "done"]
+    steps, asked = sum(run.env_steps for run in runs), sum(run.job.max_env_steps for run in runs)
+    rows = [_HEAD, *map(_cells, runs)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        f"{name}: {len(done)} of {len(runs)} runs done, {steps:,} of {asked:,} env steps, "
+        f"wall time {duration(sum(run.wall_s for run in runs))}",
+        *(
+            "  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ),
+    ]
+
+
+def _cells(run: JobProgress) -> tuple[str, ...]:
+    job = run.job
+    parts = (job.algorithm, job.variant, job.config.environment, f"seed {job.config.seed}")
+    return (
+        run.state,
+        f"{run.env_steps:,} of {job.max_env_steps:,}",
+        duration(run.wall_s) if run.wall_s else "",
+        "" if run.mean is None else return_text(run.mean),
+        " ".join(part for part in parts if part),
+    )

@@ -1,0 +1,16 @@
+from pathlib import Path
+
+import pytest
+
+from udrl.errors import StoreError
+from udrl_experiments.protocol import TASKS, StudyPlan
+from udrl_experiments.sensitivity import sensitivity
+from udrl_experiments.study import StudyFolders
+
+
+def test_an_agent_that_was_not_kept_is_told(tmp_path: Path) -> None:
+    study = sensitivity(StudyPlan(seeds=(1,)), [TASKS["sparse"]])
+    (run,) = study.jobs
+    expected = rf"UDRL, LunarLanderSparse-v3, seed 1.*delete {run.folder(tmp_path)} to have it made"
+    with pytest.raises(StoreError, match=expected):
+        study.report(StudyFolders(tmp_path, tmp_path / "sensitivity"))
