@@ -1,5 +1,6 @@
 """Figures 4 and 5: UDRL and other algorithms under one protocol (sections 3.2 to 3.4)."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -20,7 +21,11 @@ from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
-_PICTURES = {"env_steps": "learning-curves", "wall_s": "learning-curves-wall-time"}
+#: Table and figure against each quantity, without suffix.
+_FILES = {
+    "env_steps": ("curves", "learning-curves"),
+    "wall_s": ("curves-wall-time", "learning-curves-wall-time"),
+}
 
 
 def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) -> Study:
@@ -39,7 +44,9 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
     ]
 
     def report(place: StudyFolders) -> str:
-        return report_curves(jobs, task, task.title, place)
+        said = report_curves(jobs, task, task.title, place)
+        report_wall_time(jobs, task, task.title, place)
+        return said
 
     return Study(name, jobs, report)
 
@@ -96,6 +103,24 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, place: StudyFolde
     )
 
 
+def report_wall_time(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> None:
+    """Write and draw the curves against wall time, of runs on one kind of machine.
+
+    It is the one that most runs were made on, and the figure names it. Nothing is written if no
+    run's machine is known.
+    """
+    machines = {job.name: job.machine(place.root) for job in jobs}
+    known = Counter(machine for machine in machines.values() if machine is not None)
+    if not known:
+        return
+    ((machine, _),) = known.most_common(1)
+    here = [job for job in jobs if machines[job.name] == machine]
+    rows = [row for job in here for row in job.evaluations(place.root)]
+    points = curves(rows, jobs[0].config.evaluation.eval_every)
+    write(place.folder / "curves-wall-time.csv", CurvePoint, points)
+    draw_curves(place.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
+
+
 def draw_curves(
     folder: Path,
     title: str,
@@ -103,6 +128,8 @@ def draw_curves(
     x: Literal["env_steps", "wall_s"] = "env_steps",
 ) -> None:
     """Draw the curves from their table alone."""
-    points = read(folder / "curves.csv", CurvePoint)
-    picture = figures.learning_curves(points, title, x=x, references=landmarks)
-    figures.save(picture, folder / _PICTURES[x])
+    table, picture = _FILES[x]
+    points = read(folder / f"{table}.csv", CurvePoint)
+    figures.save(
+        figures.learning_curves(points, title, x=x, references=landmarks), folder / picture
+    )

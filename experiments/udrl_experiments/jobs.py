@@ -5,7 +5,6 @@ the same run, and asks only for as many of its steps as it wants.
 """
 
 import hashlib
-import json
 import os
 import re
 import subprocess
@@ -19,6 +18,7 @@ import msgspec
 from udrl.config import Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
+from udrl_experiments.provenance import Machine
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import put, read
 
@@ -80,14 +80,28 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     def done(self, root: Path) -> bool:
         """Say whether the run has got as far as is asked."""
+        done = self._done(root)
         try:
-            done = json.loads((self.folder(root) / "done.json").read_text(encoding="utf-8"))
-            far_enough = int(done["max_env_steps"]) >= self.max_env_steps
-            return far_enough and bool(
-                read(self.folder(root) / "evaluations.csv", EvaluationRecord)
+            return (
+                done is not None
+                and done.max_env_steps >= self.max_env_steps
+                and bool(read(self.folder(root) / "evaluations.csv", EvaluationRecord))
             )
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, InvalidData):
+        except InvalidData:
             return False
+
+    def machine(self, root: Path) -> Machine | None:
+        """Return the kind of machine that did the run, or its last part; None if unknown."""
+        done = self._done(root)
+        return None if done is None else done.machine
+
+    def _done(self, root: Path) -> "_Done | None":
+        try:
+            return msgspec.json.decode(
+                (self.folder(root) / "done.json").read_bytes(), type=_Done, strict=False
+            )
+        except (OSError, msgspec.DecodeError):
+            return None
 
     def evaluations(self, root: Path) -> list[EvaluationRecord]:
         """Return the run's evaluations up to the last multiple of ``eval_every`` asked for.
@@ -101,6 +115,13 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             for row in read(self.folder(root) / "evaluations.csv", EvaluationRecord)
             if row.env_steps // every * every <= self.max_env_steps
         ]
+
+
+class _Done(msgspec.Struct, frozen=True):
+    """What ``done.json`` says of a run."""
+
+    max_env_steps: int
+    machine: Machine | None = None
 
 
 def read_job(folder: Path) -> Job:

@@ -7,6 +7,8 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from udrl.version import __version__
 
 #: Packages whose version may change a result.
@@ -14,6 +16,23 @@ _PACKAGES = (
     "Box2D", "box2d-py", "eclipse-zenoh", "gymnasium", "numpy", "ray", "stable-baselines3", "torch",
     "vizdoom",
 )  # fmt: skip
+
+
+class Machine(msgspec.Struct, frozen=True):
+    """A kind of machine.
+
+    Attributes:
+        processor: its name.
+        cores: those that the process may use.
+        system: operating system and architecture.
+    """
+
+    processor: str
+    cores: int
+    system: str
+
+    def __str__(self) -> str:
+        return f"{self.processor}, {self.cores} {'core' if self.cores == 1 else 'cores'}"
 
 
 def provenance() -> dict[str, Any]:
@@ -27,8 +46,8 @@ def provenance() -> dict[str, Any]:
     return {
         "commit": _commit(),
         "versions": versions,
-        "machine": {"processor": _processor(), "cores": len(os.sched_getaffinity(0)),
-                    "system": f"{platform.system()} {platform.machine()}"},
+        "machine": Machine(_processor(), len(os.sched_getaffinity(0)),
+                           f"{platform.system()} {platform.machine()}"),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from udrl.config import flat
 from udrl.strategies import STRATEGIES
-from udrl_experiments.comparison import draw_curves, report_curves
+from udrl_experiments.comparison import report_curves, report_wall_time
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import StudyPlan, Task
 from udrl_experiments.study import Study, StudyFolders
@@ -79,7 +79,7 @@ def _variants(
             title = f"{task.title}: {name}"
             said.append(report_curves(runs, task, title, here))
             if wall_time:
-                draw_curves(folder, title, task.landmarks, "wall_s")
+                report_wall_time(runs, task, title, here)
         return "\n".join(said)
 
     # A time that was measured beside other runs, or by other code, is not comparable.

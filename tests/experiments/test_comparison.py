@@ -1,12 +1,13 @@
-import json
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from udrl.config import flat, preset
 from udrl_experiments.comparison import comparison, job
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import DEFAULT_PARTICIPANTS, TASKS, StudyPlan, Task
+from udrl_experiments.provenance import Machine
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.statistics import CurvePoint, Reached
 from udrl_experiments.study import StudyFolders
@@ -18,7 +19,7 @@ PLAN = StudyPlan(seeds=(1, 2), max_env_steps=100_000)
 each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
-def finish(root: Path, one: Job, *, wall_s: float = 10.0) -> None:
+def finish(root: Path, one: Job, *, wall_s: float = 10.0, machine: Machine | None = None) -> None:
     """Leave what a finished run leaves."""
     folder = one.folder(root)
     folder.mkdir(parents=True)
@@ -31,7 +32,8 @@ def finish(root: Path, one: Job, *, wall_s: float = 10.0) -> None:
         for number, env_steps in enumerate((50_123, 100_045), 1)
     ]  # fmt: skip
     write(folder / "evaluations.csv", EvaluationRecord, rows)
-    (folder / "done.json").write_text(json.dumps({"max_env_steps": one.max_env_steps}))
+    done = {"max_env_steps": one.max_env_steps, "machine": machine}
+    (folder / "done.json").write_bytes(msgspec.json.encode(done))
 
 
 @each_task
@@ -75,3 +77,34 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
     for label in ("UDRL (2 seeds)", "UDRL paper (2 seeds)"):
         assert f">{label}</text>" in picture
     assert "LunarLander: UDRL paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
+
+
+def test_wall_times_are_compared_on_one_kind_of_machine_alone(tmp_path: Path) -> None:
+    study = comparison("lander", PLAN._replace(seeds=(1, 2, 3)), ("UDRL", "DQN"))
+    many, few = Machine("Quick", 2, "Linux x86_64"), Machine("Slow", 2, "Linux x86_64")
+    for one in study.jobs:
+        machine = few if one.config.seed == 2 else many
+        finish(tmp_path, one, wall_s=99.0 if machine is few else 10.0, machine=machine)
+    place = StudyFolders(tmp_path, tmp_path / "lander")
+    place.folder.mkdir()
+    study.report(place)
+
+    assert {point.seeds for point in read(place.folder / "curves.csv", CurvePoint)} == {3}
+    points = read(place.folder / "curves-wall-time.csv", CurvePoint)
+    assert [(point.algorithm, point.seeds, point.wall_s) for point in points] == [
+        (algorithm, 2, wall_s) for algorithm in ("UDRL", "DQN") for wall_s in (10.0, 20.0)
+    ]
+    picture = (place.folder / "learning-curves-wall-time.svg").read_text(encoding="utf-8")
+    for text in ("LunarLander", "runs on: Quick, 2 cores", "wall time (minutes)", "DQN (2 seeds)"):
+        assert f">{text}</text>" in picture
+
+
+def test_wall_times_of_unknown_machines_are_not_compared(tmp_path: Path) -> None:
+    study = comparison("lander", PLAN, ("UDRL",))
+    for one in study.jobs:
+        finish(tmp_path, one)
+    place = StudyFolders(tmp_path, tmp_path / "lander")
+    place.folder.mkdir()
+    study.report(place)
+    assert (place.folder / "learning-curves.png").exists()
+    assert not list(place.folder.glob("*wall-time*"))
