@@ -1,7 +1,7 @@
 """Section 3.2: what all studies share, at the paper's scale and at one for two cores."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -68,11 +68,16 @@ TASKS = {
 #: Env steps of a run in the paper, of every algorithm in every environment.
 PAPER_STEPS = 10_000_000
 
+#: Env steps between evaluations (section 3.2).
+EVAL_EVERY = 50_000
+
+#: Settings of networks that all algorithms have.
+NETWORKS = "frame_stack", "convolutions", "hidden"
 
 #: Settings of a UDRL run that other algorithms have too; their runs do not depend on any other.
 _SHARED = (
-    "environment", "environment_kwargs", "max_episode_steps", "seed", "frame_stack", "convolutions",
-    "hidden", "eval_every", "eval_episodes", "eval_temperature", "eval_seeds", "device",
+    *NETWORKS, "environment", "environment_kwargs", "wrappers", "max_episode_steps", "seed",
+    "eval_every", "eval_episodes", "eval_temperature", "eval_seeds", "device",
 )  # fmt: skip
 
 
@@ -118,13 +123,10 @@ class StudyPlan(NamedTuple):
             ConfigError: a setting is unknown or impossible.
         """
         own = changes | {"environment": task.environment, "seed": seed}
-        given = dict(parse_assignment(text) for text in self.assignments)
-        for name in given:
-            if name in own:
-                raise ConfigError(f"--set {name}=...: this study sets {name} itself; leave it out")
+        given = self.assigned(own)
         values = preset(f"{task.environment}-paper" if paper else task.environment)
         del values["max_env_steps"]
-        return build(Config, values | {"eval_every": 50_000} | given | own)
+        return build(Config, values | {"eval_every": EVAL_EVERY} | given | own)
 
     def baseline(self, task: Task, seed: int, **changes: Any) -> Config:
         """Return the settings of a run of another algorithm: what they have in common with UDRL's.
@@ -137,8 +139,28 @@ class StudyPlan(NamedTuple):
         Raises:
             ConfigError: a setting is unknown or impossible.
         """
-        settings = flat(self.config(task, seed, **changes))
-        return build(Config, {name: settings[name] for name in _SHARED})
+        return shared(self.config(task, seed, **changes))
+
+    def assigned(self, own: Collection[str]) -> dict[str, Any]:
+        """Return the plan's assignments, by setting.
+
+        Args:
+            own: settings that the study sets itself.
+
+        Raises:
+            ConfigError: an assignment is none, or is of one of these.
+        """
+        given = dict(parse_assignment(text) for text in self.assignments)
+        for name in given:
+            if name in own:
+                raise ConfigError(f"--set {name}=...: this study sets {name} itself; leave it out")
+        return given
+
+
+def shared(config: Config) -> Config:
+    """Return the settings that a run of another algorithm has in common with one of UDRL."""
+    settings = flat(config)
+    return build(Config, {name: settings[name] for name in _SHARED})
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

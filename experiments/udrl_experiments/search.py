@@ -1,26 +1,40 @@
-"""Appendix B: random search over the paper's spaces, which lie in ``spaces/`` as data."""
+"""Appendix B: random search over the paper's spaces, or over one of your own."""
 
-import hashlib
 import json
-import tomllib
+import re
 from collections.abc import Sequence
-from importlib import resources
+from contextlib import closing
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
-from udrl.config import flat, preset
-from udrl.streams import Stream
+from udrl.acting import EpisodeGenerator
+from udrl.actions import Categorical
+from udrl.config import OPEN, Config, change, flat, preset
+from udrl.errors import ConfigError
+from udrl.fitting import fit
+from udrl.spaces import Image, Vector
 from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import LAST, Algorithm, StudyPlan, Task
+from udrl_experiments.protocol import (
+    EVAL_EVERY,
+    LAST,
+    PAPER_STEPS,
+    Algorithm,
+    StudyPlan,
+    Task,
+    shared,
+)
 from udrl_experiments.ray_tune import carry_out
+from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
+from udrl_experiments.tuned import complete
 from udrl_inspect.csv_tables import put, write
+from udrl_launch.settings import gather
+from udrl_replay.creation import as_toml
 
 #: Configurations of each algorithm, and env steps of each run, at the small scale.
 SMALL_CONFIGURATIONS = 8
@@ -32,7 +46,7 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         environment: Gymnasium's id.
-        algorithm: who learned.
+        algorithm: the learner.
         configuration: its number; which settings it has is a function of it.
         seeds: runs that the score is the mean of.
         score: mean of the last 20 evaluations (Appendix B), mean over the seeds; none if a run of
@@ -48,98 +62,173 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
     settings: str
 
 
-def space(environment: str) -> dict[str, Any]:
-    """Return the space of an environment as its file has it."""
-    text = resources.files("udrl_experiments") / "spaces" / f"{environment}.toml"
-    return tomllib.loads(text.read_text(encoding="utf-8"))
+class Subject(NamedTuple):
+    """An environment whose settings are searched.
 
+    Attributes:
+        space: what configurations are drawn from.
+        algorithms: whose settings are searched.
+        config: a run of UDRL but for its seed and what is drawn.
+        preset: the settings that UDRL's best configuration is written with.
+    """
 
-def draw(environment: str, algorithm: Algorithm, configuration: int) -> dict[str, Any]:
-    """Return the settings of a configuration: a value of every list, each as likely."""
-    found = space(environment)
-    lists = found["networks"] | found[algorithm]
-    name = f"udrl/search/1|{environment}|{algorithm}|{configuration}"
-    stream = Stream(hashlib.sha256(name.encode()).digest()[:16])
-    numbers = stream.uniforms(len(lists)).tolist()
-    drawn = {}
-    for (key, values), u in zip(sorted(lists.items()), numbers, strict=True):
-        if isinstance(values, dict):
-            values = np.logspace(*values["logspace"]).tolist()
-        drawn[key] = values[int(u * len(values))]
-    return drawn
+    space: SearchSpace
+    algorithms: tuple[Algorithm, ...]
+    config: Config
+    preset: dict[str, Any]
 
 
 def search(
     plan: StudyPlan,
     tasks: Sequence[Task],
-    algorithms: Sequence[Algorithm],
+    algorithms: Sequence[Algorithm] = (),
     configurations: int | None = None,
 ) -> Study:
-    """Return the study.
+    """Return the study of the paper's tasks, over the spaces of Appendix B.1.
 
     Args:
         plan: seeds and steps; at the paper's scale the space says how many seeds.
         tasks: on which.
-        algorithms: whose settings are looked for.
+        algorithms: whose settings are searched; none: of all that the space has.
         configurations: how many of each; None: as the scale says.
+
+    Raises:
+        ConfigError: the space has no such algorithm, or a setting is unknown or impossible.
     """
-    jobs = {
-        (task, algorithm, number): [
-            _job(plan, task, algorithm, number, seed) for seed in _seeds(plan, task)
-        ]
-        for task in tasks
-        for algorithm in dict.fromkeys(algorithms)
-        for number in range(_configurations(plan, task, configurations))
+    subjects = []
+    for task in tasks:
+        space = shipped_space(task.environment)
+        chosen = _chosen(space, algorithms)
+        plan.assigned(_drawn_settings(space, chosen))
+        config = plan.config(task, 1, paper=True, eval_seeds="search")
+        subjects.append(Subject(space, chosen, config, preset(f"{task.environment}-paper")))
+    return _study("search", plan, subjects, configurations)
+
+
+def search_environment(
+    plan: StudyPlan,
+    environment: str,
+    file: Path,
+    algorithms: Sequence[Algorithm] = (),
+    configurations: int | None = None,
+) -> Study:
+    """Return the study of any environment, over a space of your own.
+
+    Settings that are not drawn are those of ``udrl train``: of the preset that is named after the
+    environment, or of ``any``. What that leaves open is chosen once for all runs, with seed 1.
+
+    Args:
+        plan: as for :func:`search`; its assignments change the preset.
+        environment: Gymnasium's id.
+        file: the space (:mod:`udrl_experiments.search_space`).
+        algorithms: as for :func:`search`.
+        configurations: as for :func:`search`.
+
+    Raises:
+        ConfigError: as for :func:`search`, or the file cannot be used, or an algorithm cannot be
+            used in the environment.
+        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        EnvironmentFault: the environment failed repeatedly.
+    """
+    space = read_space(environment, file)
+    chosen = _chosen(space, algorithms)
+    assigned = plan.assigned(_drawn_settings(space, chosen))
+    own = {"seed": 1, "eval_seeds": "search", "eval_every": EVAL_EVERY}
+    # What is drawn is not left open; which value stands here does not matter.
+    drawn = {
+        name: values[0] for name, values in space.lists.get("UDRL", {}).items() if name in OPEN
     }
+    settings = gather(environment, options=own | drawn, assignments=plan.assignments)
+    config = fit(settings.config, settings.left_open)
+    others = [algorithm for algorithm in chosen if algorithm != "UDRL"]
+    with closing(EpisodeGenerator(shared(config) if others else config, 1)) as generator:
+        spec = generator.spec
+    if others and not (
+        isinstance(spec.action_space, Categorical)
+        and isinstance(spec.observation_space, Vector | Image)
+    ):
+        raise ConfigError(
+            f"{', '.join(others)} need discrete actions and one vector or image as observation, "
+            f"which {environment} has not; search with --algorithm UDRL"
+        )
+    written = {name: flat(config)[name] for name in (*sorted(settings.left_open), *assigned)}
+    subject = Subject(space, chosen, config, {"environment": environment} | written)
+    return _study(f"search-{_file_name(environment)}", plan, [subject], configurations)
+
+
+def _chosen(space: SearchSpace, algorithms: Sequence[Algorithm]) -> tuple[Algorithm, ...]:
+    for algorithm in algorithms:
+        if algorithm not in space.lists:
+            raise ConfigError(
+                f"--algorithm {algorithm}: the space of {space.environment} has "
+                f"{', '.join(space.lists)}; name one of them, or a file with a space of your own: "
+                f"udrl study search ENV --space FILE"
+            )
+    return tuple(dict.fromkeys(algorithms)) or tuple(space.lists)
+
+
+def _drawn_settings(space: SearchSpace, algorithms: Sequence[Algorithm]) -> set[str]:
+    """Return the settings of UDRL that the search sets itself."""
+    drawn = space.lists["UDRL"].keys() if "UDRL" in algorithms else ()
+    return {"environment", "seed", "eval_seeds", *space.networks, *drawn}
+
+
+def _study(
+    name: str, plan: StudyPlan, subjects: Sequence[Subject], configurations: int | None
+) -> Study:
+    jobs = {
+        (subject.space.environment, algorithm, number): [
+            _job(plan, subject, algorithm, number, seed) for seed in _seeds(plan, subject.space)
+        ]
+        for subject in subjects
+        for algorithm in subject.algorithms
+        for number in range(_configurations(plan, subject.space, configurations))
+    }
+    spaces = {subject.space.environment: subject.space for subject in subjects}
 
     def report(place: StudyFolders) -> str:
         rows = [
             Scored(
-                environment=task.environment,
+                environment=environment,
                 algorithm=algorithm,
                 configuration=number,
                 seeds=len(runs),
                 score=_score(runs, place.root),
-                settings=json.dumps(draw(task.environment, algorithm, number)),
+                settings=json.dumps(spaces[environment].draw(algorithm, number)),
             )
-            for (task, algorithm, number), runs in jobs.items()
+            for (environment, algorithm, number), runs in jobs.items()
         ]
         write(place.folder / "scores.csv", Scored, rows)
         return "\n".join(
-            _write_preset(place.folder, rows, task, algorithm)
-            for task in tasks
-            for algorithm in dict.fromkeys(algorithms)
+            _write_preset(place.folder, rows, subject, algorithm)
+            for subject in subjects
+            for algorithm in subject.algorithms
         )
 
-    return Study(
-        "search", [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",)
-    )
+    return Study(name, [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",))
 
 
-def _seeds(plan: StudyPlan, task: Task) -> tuple[int, ...]:
+def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:
     if plan.seeds is not None:
         return plan.seeds
-    return tuple(range(1, 1 + (space(task.environment)["seeds"] if plan.scale == "paper" else 1)))
+    return tuple(range(1, 1 + (space.seeds if plan.scale == "paper" else 1)))
 
 
-def _configurations(plan: StudyPlan, task: Task, given: int | None) -> int:
+def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> int:
     if given is not None:
         return given
-    if plan.scale == "paper":
-        return int(space(task.environment)["configurations"])
-    return SMALL_CONFIGURATIONS
+    return (space.configurations if plan.scale == "paper" else None) or SMALL_CONFIGURATIONS
 
 
-def _job(plan: StudyPlan, task: Task, algorithm: Algorithm, number: int, seed: int) -> Job:
-    if plan.scale == "small" and plan.max_env_steps is None:
-        plan = plan._replace(max_env_steps=SMALL_STEPS)
-    drawn = draw(task.environment, algorithm, number)
-    steps = plan.steps(task, algorithm)
+def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
+    steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_STEPS)
+    drawn = subject.space.draw(algorithm, number)
     if algorithm == "UDRL":
-        config = plan.config(task, seed, paper=True, eval_seeds="search", **drawn)
+        config = change(subject.config, seed=seed, **drawn)
         return Job(algorithm=algorithm, settings=flat(config), max_env_steps=steps)
-    networks = {k: drawn.pop(k) for k in ("hidden", "convolutions") if k in drawn}
-    config = plan.baseline(task, seed, eval_seeds="search", **networks)
+    networks = {name: drawn.pop(name) for name in subject.space.networks}
+    complete(algorithm, drawn)
+    config = shared(change(subject.config, seed=seed, **networks))
     return baseline(algorithm, config, drawn, steps)
 
 
@@ -150,24 +239,32 @@ def _score(runs: Sequence[Job], root: Path) -> float | None:
     return fmean(score([row.mean for row in run.evaluations(root)], LAST) for run in runs)
 
 
-def _write_preset(folder: Path, rows: Sequence[Scored], task: Task, algorithm: Algorithm) -> str:
+def _write_preset(
+    folder: Path, rows: Sequence[Scored], subject: Subject, algorithm: Algorithm
+) -> str:
     """Write the best settings as a file, UDRL's for ``udrl train --config``; return its text."""
-    kind = (task.environment, algorithm)
+    environment = subject.space.environment
+    kind = (environment, algorithm)
     scored = [
         (row.score, row)
         for row in rows
         if (row.environment, row.algorithm) == kind and row.score is not None
     ]
     if not scored:
-        return f"# {algorithm}, {task.environment}: no configuration got to its end"
+        return f"# {algorithm}, {environment}: no configuration got to its end"
     value, best = max(scored, key=lambda pair: pair[0])
     drawn = json.loads(best.settings)
     if algorithm == "UDRL":
-        values = preset(f"{best.environment}-paper") | drawn
+        values = subject.preset | drawn
     else:
-        values = {"environment": best.environment, **drawn}
+        values = {"environment": environment, **drawn}
     text = f"# Configuration {best.configuration}; score {value:.1f}, seeds: {best.seeds}.\n"
-    text += "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
-    path = folder / f"{algorithm.lower()}-{best.environment}.toml"
+    text += "".join(f"{name} = {as_toml(value)}\n" for name, value in values.items())
+    path = folder / f"{algorithm.lower()}-{_file_name(environment)}.toml"
     put(path, text.encode())
     return f"# {path}\n{text}"
+
+
+def _file_name(environment: str) -> str:
+    """Return an environment's id as a part of a file name."""
+    return re.sub(r"[^\w.-]+", "-", environment)

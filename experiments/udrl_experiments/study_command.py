@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args
 
 import click
 
+from udrl.errors import ConfigError
 from udrl_experiments.comparison import comparison
 from udrl_experiments.protocol import (
     DEFAULT_PARTICIPANTS,
@@ -21,6 +22,7 @@ from udrl_experiments.protocol import (
     tasks,
 )
 from udrl_experiments.search import search as make_search
+from udrl_experiments.search import search_environment
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
 from udrl_experiments.study import Study, conduct
@@ -28,13 +30,11 @@ from udrl_experiments.study_progress import studies, table
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
 from udrl_experiments.variants import segments as make_segments
+from udrl_launch import completions
 from udrl_launch.process import log_to_stderr, run_service
-from udrl_launch.subcommands.options import STEPS
+from udrl_launch.subcommands.options import FILE, STEPS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-
-#: Algorithms that Appendix B has spaces for.
-_SEARCHED: tuple[Algorithm, ...] = ("UDRL", "DQN", "A2C")
 
 
 _FOLDER = click.option(
@@ -235,13 +235,17 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 @study.command()
 @_options
 @_runs_from
-@_tasks("lander")
-@click.option("--algorithm", "algorithms", multiple=True, type=click.Choice(_SEARCHED),
-              default=_SEARCHED, show_default=True,
-              help="Algorithm to run. May be repeated.")  # fmt: skip
+@click.argument("env", required=False, shell_complete=completions.environments)
+@_tasks()
+@click.option("--space", "file", type=FILE, metavar="FILE",
+              help="Search ENV over the space in a TOML file.")  # fmt: skip
+@click.option("--algorithm", "algorithms", multiple=True, type=click.Choice(get_args(Algorithm)),
+              help="Algorithm to run. May be repeated. Default: all in the space.")  # fmt: skip
 @click.option("--configurations", type=click.IntRange(1, 100_000), metavar="N",
               help="Configurations per algorithm. Default: 8, or the paper's number.")  # fmt: skip
 def search(
+    env: str | None,
+    file: Path | None,
     names: tuple[str, ...],
     algorithms: tuple[Algorithm, ...],
     configurations: int | None,
@@ -249,8 +253,21 @@ def search(
 ) -> int:
     """Appendix B: random search with Ray Tune.
 
-    Example: udrl study search --algorithm UDRL --configurations 16
+    Searches over the paper's spaces on its tasks (--task, lander by default), or on ENV over a
+    space of your own (--space).
+
+    Example: udrl study search CartPole-v1 --space mine.toml
     """
+    if (env is None) != (file is None):
+        given, missing = ("--space", "ENV") if env is None else (f"ENV {env}", "--space FILE")
+        raise ConfigError(f"{given} needs {missing}: udrl study search ENV --space FILE")
+    if env is None or file is None:
+        return _conduct(
+            lambda plan: make_search(plan, tasks(names or ("lander",)), algorithms, configurations),
+            **options,
+        )
+    if names:
+        raise ConfigError(f"--task {names[0]}: leave it out, or leave out ENV and --space")
     return _conduct(
-        lambda plan: make_search(plan, tasks(names), algorithms, configurations), **options
+        lambda plan: search_environment(plan, env, file, algorithms, configurations), **options
     )

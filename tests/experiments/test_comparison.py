@@ -1,39 +1,21 @@
 from pathlib import Path
 
-import msgspec
 import pytest
 
+from tests.experiments.finished_runs import finish
 from udrl.config import flat, preset
 from udrl_experiments.comparison import comparison, job
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import DEFAULT_PARTICIPANTS, TASKS, StudyPlan, Task
 from udrl_experiments.provenance import Machine
-from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.statistics import CurvePoint, Reached
 from udrl_experiments.study import StudyFolders
-from udrl_inspect.csv_tables import read, write
+from udrl_inspect.csv_tables import read
 
 #: Two evaluations suffice for a curve.
 PLAN = StudyPlan(seeds=(1, 2), max_env_steps=100_000)
 
 each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-
-
-def finish(root: Path, one: Job, *, wall_s: float = 10.0, machine: Machine | None = None) -> None:
-    """Leave what a finished run leaves."""
-    folder = one.folder(root)
-    folder.mkdir(parents=True)
-    rows = [
-        EvaluationRecord(
-            environment=one.config.environment, algorithm=one.algorithm, variant="",
-            seed=one.config.seed, env_steps=env_steps, wall_s=wall_s * number,
-            mean=float(one.config.seed + number), std=1.0, episodes=100,
-        )
-        for number, env_steps in enumerate((50_123, 100_045), 1)
-    ]  # fmt: skip
-    write(folder / "evaluations.csv", EvaluationRecord, rows)
-    done = {"max_env_steps": one.max_env_steps, "machine": machine}
-    (folder / "done.json").write_bytes(msgspec.json.encode(done))
 
 
 @each_task

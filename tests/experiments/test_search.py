@@ -3,61 +3,24 @@ import math
 import tomllib
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
-import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from udrl.config import Config, build, preset
-from udrl.errors import ConfigError
-from udrl_experiments.protocol import TASKS, Algorithm, StudyPlan
+from tests.experiments.finished_runs import finish
+from udrl.config import change, preset, read_toml
+from udrl.errors import ConfigError, UnsupportedEnvironment
+from udrl.fitting import fit
+from udrl_experiments import study_command
+from udrl_experiments.protocol import TASKS, StudyPlan
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.search import Scored, draw, search, space
+from udrl_experiments.search import Scored, search, search_environment
+from udrl_experiments.search_space import read_space, shipped_space
 from udrl_experiments.study import StudyFolders
 from udrl_inspect.csv_tables import read, write
+from udrl_launch.settings import gather
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
-ALGORITHMS: tuple[Algorithm, ...] = ("UDRL", "DQN", "A2C")
-
-
-def values(kept: Any) -> list[Any]:
-    if isinstance(kept, dict):
-        low, high, n = kept["logspace"]
-        return [10 ** (low + (high - low) * i / (n - 1)) for i in range(n)]
-    assert isinstance(kept, list)
-    return kept
-
-
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_configurations_come_from_the_lists_and_all_values_come(
-    environment: str, algorithm: Algorithm
-) -> None:
-    lists = space(environment)["networks"] | space(environment)[algorithm]
-    drawn = [draw(environment, algorithm, number) for number in range(1500)]
-    for name, kept in lists.items():
-        allowed = values(kept)
-        found = [one[name] for one in drawn]
-        if isinstance(kept, dict):
-            assert all(np.isclose(allowed, value, rtol=1e-9).any() for value in found)
-            assert len(set(found)) == len(allowed)
-        else:
-            assert all(value in allowed for value in found)
-            counts = [found.count(value) for value in allowed]
-            expected = len(drawn) / len(allowed)
-            assert all(abs(count - expected) < 5 * math.sqrt(expected) for count in counts)
-    assert all(set(one) == set(lists) for one in drawn)
-
-
-def test_a_configuration_is_a_function_of_its_number() -> None:
-    assert draw("LunarLander-v3", "DQN", 5) == draw("LunarLander-v3", "DQN", 5)
-    assert draw("LunarLander-v3", "DQN", 5) != draw("LunarLander-v3", "DQN", 6)
-
-
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
-def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -> None:
-    for number in range(100):
-        build(Config, {"environment": environment} | draw(environment, "UDRL", number))
 
 
 def test_the_papers_scale_is_the_papers() -> None:
@@ -72,7 +35,7 @@ def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
     (job,) = search(StudyPlan(), [TASKS["lander"]], ["UDRL"], 1).jobs
     buffer = job.config.buffer
     assert (buffer.max_age, buffer.recent_size, job.config.lead) == (None, 0, 0)
-    drawn = draw("LunarLander-v3", "UDRL", 0)
+    drawn = shipped_space("LunarLander-v3").draw("UDRL", 0)
     assert job.config.training.batch_size == drawn["batch_size"]
     assert list(job.config.network.hidden) == drawn["hidden"]
 
@@ -108,7 +71,7 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
     assert scored == pytest.approx({key: fmean(both) for key, both in scores.items()})
     best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score or -math.inf)
     kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
-    drawn = draw("LunarLanderSparse-v3", "UDRL", best.configuration)
+    drawn = shipped_space("LunarLanderSparse-v3").draw("UDRL", best.configuration)
     assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in said
     assert kept == preset("LunarLanderSparse-v3-paper") | drawn
     assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()
@@ -126,3 +89,140 @@ def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
     said = study.report(StudyFolders(tmp_path, tmp_path / "search"))
     assert "no configuration got to its end" in said
     assert not list((tmp_path / "search").glob("*.toml"))
+
+
+def test_an_algorithm_that_the_space_has_not_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"--algorithm PPO: .*LunarLander-v3 has UDRL, DQN, A2C"):
+        search(StudyPlan(), [TASKS["lander"]], ["PPO"], 1)
+
+
+SPACE = """
+configurations = 3
+seeds = 2
+
+[networks]
+hidden = [[8], [16, 8]]
+
+[UDRL]
+batch_size = [32, 64]
+return_scale = [0.5]
+
+[PPO]
+gamma = [0.9, 0.99]
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    file = tmp_path / "mine.toml"
+    file.write_text(SPACE)
+    return file
+
+
+def test_any_environment_is_searched_from_the_settings_of_a_training(mine: Path) -> None:
+    plan = StudyPlan(seeds=(1, 2), assignments=("n_updates_per_iter=7",))
+    study = search_environment(plan, "MountainCar-v0", mine, configurations=2)
+    assert study.name == "search-MountainCar-v0"
+    assert [(one.algorithm, one.config.seed) for one in study.jobs] == [
+        (algorithm, seed) for algorithm in ("UDRL", "PPO") for _ in range(2) for seed in (1, 2)
+    ]
+    settings = gather("MountainCar-v0", options={"seed": 1}, assignments=plan.assignments)
+    fitted = fit(settings.config, settings.left_open)
+    drawn = read_space("MountainCar-v0", mine).draw("UDRL", 1)
+    assert study.jobs[3].config == change(
+        fitted, seed=2, eval_seeds="search", eval_every=50_000, **drawn
+    )
+    assert study.jobs[3].config.network.return_scale == 0.5
+    ppo = study.jobs[6]
+    assert set(ppo.hyperparameters) == {"gamma"}
+    assert list(ppo.config.network.hidden) in [[8], [16, 8]]
+    assert {one.max_env_steps for one in study.jobs} == {500_000}
+    paper = search_environment(StudyPlan("paper"), "MountainCar-v0", mine)
+    assert len(paper.jobs) == 2 * 3 * 2
+
+
+def test_the_best_settings_of_any_environment_are_those_that_were_run(
+    mine: Path, tmp_path: Path
+) -> None:
+    plan = StudyPlan(assignments=("environment_kwargs={ a = 1 }", "eval_every=10"))
+    with pytest.raises(UnsupportedEnvironment):
+        search_environment(plan, "MountainCar-v0", mine)
+    plan = StudyPlan(assignments=("wrappers=['gymnasium.wrappers:RecordEpisodeStatistics']",))
+    study = search_environment(plan, "MountainCar-v0", mine, ["UDRL"], 1)
+    (run,) = study.jobs
+    finish(tmp_path, run)
+    place = StudyFolders(tmp_path, tmp_path / study.name)
+    place.folder.mkdir()
+    study.report(place)
+    written = read_toml(place.folder / "udrl-MountainCar-v0.toml")
+    again = gather("MountainCar-v0", options=written, assignments=())
+    assert not again.left_open
+    assert change(again.config, eval_seeds="search", eval_every=50_000) == run.config
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[UDRL]", "[ULDR]", r"mine\.toml: ULDR; expected .*UDRL, DQN, A2C, PPO"),
+        (
+            "[32, 64]",
+            "[]",
+            r"mine\.toml: \[UDRL\] batch_size = \[\].*expected a list of at least one value",
+        ),
+        (
+            "[32, 64]",
+            "32",
+            r"mine\.toml: \[UDRL\] batch_size = 32.*expected a list of at least one",
+        ),
+        (
+            "[32, 64]",
+            "{ logspace = [1, 2] }",
+            r"batch_size = \{'logspace': \[1, 2\]\}.*logspace = \[",
+        ),
+        (SPACE, "UDRL = 3", r"mine\.toml: \[UDRL\] = 3: expected a table"),
+        ("seeds = 2", "seeds = 0", r"mine\.toml: .*seeds"),
+        ("hidden", "lead", r"mine\.toml: lead in \[networks\].*frame_stack, convolutions, hidden"),
+        ("batch_size", "bach_size", r"unknown.*bach_size"),
+        ("[32, 64]", '["many"]', r"batch_size = 'many'"),
+        ("gamma", "gama", r"unknown hyperparameter 'gama' of PPO"),
+        ("seeds = 2", "seeds =", r"mine\.toml is not TOML"),
+    ],
+)
+def test_a_space_that_cannot_be_used_is_told(mine: Path, old: str, new: str, message: str) -> None:
+    mine.write_text(SPACE.replace(old, new))
+    with pytest.raises(ConfigError, match=message):
+        search_environment(StudyPlan(), "MountainCar-v0", mine)
+
+
+def test_a_space_without_algorithms_is_told(mine: Path) -> None:
+    mine.write_text("seeds = 2")
+    with pytest.raises(ConfigError, match=r"no algorithm to search for; expected a table \[UDRL\]"):
+        search_environment(StudyPlan(), "MountainCar-v0", mine)
+
+
+def test_what_a_search_of_any_environment_draws_cannot_be_set(mine: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--set batch_size=\.\.\.: this study sets batch_size"):
+        search_environment(StudyPlan(assignments=("batch_size=1",)), "MountainCar-v0", mine)
+
+
+def test_algorithms_that_cannot_act_in_the_environment_are_told(mine: Path) -> None:
+    with pytest.raises(ConfigError, match=r"PPO need discrete actions.*--algorithm UDRL"):
+        search_environment(StudyPlan(), "Pendulum-v1", mine)
+    assert search_environment(StudyPlan(), "Pendulum-v1", mine, ["UDRL"]).jobs
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["CartPole-v1"], "ENV CartPole-v1 needs --space FILE"),
+        (["--space", "mine.toml"], "--space needs ENV"),
+        (
+            ["CartPole-v1", "--space", "mine.toml", "--task", "lander"],
+            "--task lander: leave it out",
+        ),
+    ],
+)
+def test_environment_and_space_belong_together(arguments: list[str], message: str) -> None:
+    result = CliRunner().invoke(study_command.study, ["search", *arguments])
+    assert isinstance(result.exception, ConfigError)
+    assert message in str(result.exception)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from udrl.config import Config, build, flat
+from udrl.config import Config, build, flat, read_toml
 from udrl_experiments.jobs import Job
 from udrl_experiments.study_progress import job_progress
 from udrl_inspect.inspection import read_status
@@ -172,6 +172,23 @@ def test_a_search_goes_on_with_more_configurations(
     assert len(runs_of(here, "a2c")) == 2
     assert first.stat().st_mtime_ns == done_at
     assert (folder / "a2c-LunarLander-v3.toml").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_search_over_a_space_of_ones_own(study: Callable[..., Path], tmp_path: Path) -> None:
+    space = tmp_path / "mine.toml"
+    space.write_text(
+        "[networks]\nhidden = [[8], [16]]\n[UDRL]\nbatch_size = [32]\nn_updates_per_iter = [2]\n"
+        "[PPO]\nn_steps = [100]\n"
+    )
+    arguments = ("CartPole-v1", "--space", str(space), "--configurations", "1")
+    study("search", *arguments, root=tmp_path, timeout=200)
+    folder = tmp_path / "search-CartPole-v1"
+    assert [r["algorithm"] for r in rows(folder / "scores.csv")] == ["UDRL", "PPO"]
+    assert all(float(r["score"]) > 0 for r in rows(folder / "scores.csv"))
+    best = read_toml(folder / "udrl-CartPole-v1.toml")
+    assert (best["batch_size"], best["n_updates_per_iter"]) == (32, 2)
 
 
 @pytest.mark.slow

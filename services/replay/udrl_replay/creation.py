@@ -164,7 +164,7 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
     for settings in (config, budget):
         for name, value in flat(settings).items():
             if value is not None and value != {}:
-                lines.append(f"{name} = {_toml(value)}")
+                lines.append(f"{name} = {as_toml(value)}")
     path = run_dir / "config.toml"
     unfinished = path.with_suffix(".new")
     try:
@@ -176,11 +176,12 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
         raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error
 
 
-def _toml(value: object) -> str:
+def as_toml(value: object) -> str:
+    """Return a setting's value in TOML."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_toml(k)} = {_toml(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{as_toml(k)} = {as_toml(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(as_toml, value)) + "]"
     # JSON's booleans, numbers and strings are TOML's.
     return msgspec.json.encode(value).decode()
 

@@ -1,0 +1,138 @@
+"""The spaces that a search draws from: those of Appendix B.1 (``spaces/``), and users' files."""
+
+import hashlib
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, get_args
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from udrl.config import read_toml
+from udrl.errors import ConfigError
+from udrl.setting_groups import PositiveInt
+from udrl.streams import Stream
+from udrl_experiments.protocol import NETWORKS, Algorithm
+
+
+class SearchSpace(NamedTuple):
+    """What the configurations of an environment are drawn from.
+
+    Attributes:
+        environment: Gymnasium's id.
+        configurations: how many are drawn at the paper's scale; None: as at the small scale.
+        seeds: runs of each configuration at the paper's scale.
+        networks: values of settings that all algorithms have, among
+            :data:`~udrl_experiments.protocol.NETWORKS`.
+        lists: for each algorithm, values of its settings or hyperparameters.
+    """
+
+    environment: str
+    configurations: int | None
+    seeds: int
+    networks: dict[str, list[Any]]
+    lists: dict[Algorithm, dict[str, list[Any]]]
+
+    def draw(self, algorithm: Algorithm, configuration: int) -> dict[str, Any]:
+        """Return the settings of a configuration: a value of every list, each as likely.
+
+        Args:
+            algorithm: one that the space has.
+            configuration: its number, from 0; the settings are a function of it.
+        """
+        lists = self.networks | self.lists[algorithm]
+        name = f"udrl/search/1|{self.environment}|{algorithm}|{configuration}"
+        stream = Stream(hashlib.sha256(name.encode()).digest()[:16])
+        numbers = stream.uniforms(len(lists)).tolist()
+        return {
+            key: values[int(u * len(values))]
+            for (key, values), u in zip(sorted(lists.items()), numbers, strict=True)
+        }
+
+
+def shipped_space(environment: str) -> SearchSpace:
+    """Return the space of Appendix B.1 for one of the paper's environments."""
+    name = f"{environment}.toml"
+    text = (resources.files("udrl_experiments") / "spaces" / name).read_text(encoding="utf-8")
+    return _space(environment, tomllib.loads(text), name)
+
+
+def read_space(environment: str, file: Path) -> SearchSpace:
+    """Return the space in a file.
+
+    Raises:
+        ConfigError: it cannot be read, or it is no space.
+    """
+    return _space(environment, read_toml(file), str(file))
+
+
+class _Logspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Numbers from 10^low to 10^high in equal ratios: ``[low, high, how many]``."""
+
+    logspace: tuple[
+        Annotated[float, Meta(ge=-300, le=300)],
+        Annotated[float, Meta(ge=-300, le=300)],
+        Annotated[int, Meta(ge=1, le=100_000)],
+    ]
+
+
+_Values = Annotated[list[Any], Meta(min_length=1)] | _Logspace
+
+
+class _File(msgspec.Struct, frozen=True):
+    """What a file says besides the tables of algorithms."""
+
+    configurations: PositiveInt | None = None
+    seeds: PositiveInt = 1
+    networks: dict[str, Any] = {}
+
+
+def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSpace:
+    algorithms: tuple[Algorithm, ...] = get_args(Algorithm)
+    for name in values:
+        if name not in (*_File.__struct_fields__, *algorithms):
+            raise ConfigError(
+                f"{source}: {name}; expected configurations, seeds and the tables networks, "
+                f"{', '.join(algorithms)}"
+            )
+    try:
+        file = msgspec.convert(values, _File)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {error}; expected a number from 1, or a table") from error
+    for name in file.networks:
+        if name not in NETWORKS:
+            raise ConfigError(
+                f"{source}: {name} in [networks]; expected settings that all algorithms have: "
+                f"{', '.join(NETWORKS)}; move it to the table of an algorithm"
+            )
+    lists = {
+        name: _expanded(values[name], f"{source}: [{name}]")
+        for name in algorithms
+        if name in values
+    }
+    if not lists:
+        raise ConfigError(
+            f"{source}: no algorithm to search for; expected a table [{'] or ['.join(algorithms)}]"
+        )
+    networks = _expanded(file.networks, f"{source}: [networks]")
+    return SearchSpace(environment, file.configurations, file.seeds, networks, lists)
+
+
+def _expanded(table: Any, source: str) -> dict[str, list[Any]]:
+    """Return the lists of a table, with those written as ``logspace`` expanded."""
+    if not isinstance(table, dict):
+        raise ConfigError(f"{source} = {table!r}: expected a table of lists")
+    lists = {}
+    for name, value in table.items():
+        try:
+            one: list[Any] | _Logspace = msgspec.convert(value, _Values)
+        except msgspec.ValidationError as error:
+            raise ConfigError(
+                f"{source} {name} = {value!r}: {error}; expected a list of at least one value, or "
+                f"{{ logspace = [low, high, n] }}: n numbers from 10^low to 10^high"
+            ) from error
+        lists[name] = np.logspace(*one.logspace).tolist() if isinstance(one, _Logspace) else one
+    return lists

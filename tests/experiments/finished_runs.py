@@ -1,0 +1,27 @@
+"""Runs that are finished, without the runs."""
+
+from pathlib import Path
+
+import msgspec
+
+from udrl_experiments.jobs import Job
+from udrl_experiments.provenance import Machine
+from udrl_experiments.records import EvaluationRecord
+from udrl_inspect.csv_tables import write
+
+
+def finish(root: Path, one: Job, *, wall_s: float = 10.0, machine: Machine | None = None) -> None:
+    """Leave what a finished run leaves."""
+    folder = one.folder(root)
+    folder.mkdir(parents=True)
+    rows = [
+        EvaluationRecord(
+            environment=one.config.environment, algorithm=one.algorithm, variant="",
+            seed=one.config.seed, env_steps=env_steps, wall_s=wall_s * number,
+            mean=float(one.config.seed + number), std=1.0, episodes=100,
+        )
+        for number, env_steps in enumerate((50_123, 100_045), 1)
+    ]  # fmt: skip
+    write(folder / "evaluations.csv", EvaluationRecord, rows)
+    done = {"max_env_steps": one.max_env_steps, "machine": machine}
+    (folder / "done.json").write_bytes(msgspec.json.encode(done))
