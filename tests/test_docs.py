@@ -95,7 +95,7 @@ def default_of(field: inspect.Field) -> str:
     ("kind", "heading"),
     [
         (Config, "## Run settings: `Config`"),
-        (Budget, "## Stopping criteria: `Budget`"),
+        (Budget, "## Limits: `Budget`"),
         (Fleet, "## Parallelism: `Fleet`"),
     ],
 )

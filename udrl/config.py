@@ -1,4 +1,4 @@
-"""Settings of a run (:class:`Config`) and its stopping criteria (:class:`Budget`).
+"""Settings of a run (:class:`Config`) and its limits (:class:`Budget`).
 
 The results of a run's iterations depend only on its :class:`Config`: the paper's hyperparameters
 (Table 2) under the paper's names, the network, and choices that the paper does not specify. The
@@ -123,15 +123,20 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
 
 
 class Budget(SettingsGroup, frozen=True, kw_only=True):
-    """Stopping criteria. A run ends after the first iteration that meets one of them.
+    """Limits of a run: its stopping criteria, and the weights that it keeps.
+
+    A run ends after the first iteration that meets a stopping criterion.
 
     Attributes:
         max_env_steps: env steps of warm-up and exploratory episodes.
         stop_return: mean return of an evaluation. None: no such criterion.
+        keep_versions: number of evaluated weights versions to keep, the newest ones, in addition to
+            those that the run needs and the best one. None: all.
     """
 
     max_env_steps: Annotated[int, Meta(ge=1, le=2**53)] = 1_000_000
     stop_return: float | None = None
+    keep_versions: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
 
 
 #: Settings that accept ``auto``, with placeholders until :mod:`udrl.fitting` chooses values.

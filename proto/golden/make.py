@@ -263,6 +263,7 @@ EXAMPLES: tuple[Message, ...] = (
         weights_lag_s=0.0125,
         weights_sha256="ab" * 32,
         replay_sha256="cd" * 32,
+        weights_kept=(2, 4, 5),
         loss=0.6875,
         evaluation=EVALUATION,
         closing_evaluation=None,

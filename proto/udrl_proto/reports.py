@@ -122,6 +122,7 @@ class Status(Message, frozen=True, kw_only=True):
     weights_lag_s: float
     weights_sha256: Text
     replay_sha256: Text
+    weights_kept: tuple[Number, ...]
     loss: float | None
     evaluation: EvaluationStatus | None
     closing_evaluation: EvaluationStatus | None

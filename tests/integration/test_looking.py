@@ -29,11 +29,12 @@ from udrl_inspect.run_list import find
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training_run import train
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 from udrl_show import curve
 from udrl_show.curve import compare
 from udrl_show.playing import with_seeds
-from whole_run import small, toy
+from whole_run import digests, reference, small, toy
 
 
 def call(*arguments: object) -> str:
@@ -352,6 +353,27 @@ def test_commands_and_values_are_completed(ended_run: Path) -> None:
     for command in ("play", "evaluate", "obedience", "export"):
         assert completed(command, str(ended_run), "--weights", "") == ["latest", "best", *kept]
     assert completed("play", "nowhere", "--weights", "b") == ["best"]
+
+
+def test_kept_versions_act_and_the_rest_are_gone(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    settings = Settings(toy(lead=0), Budget(max_env_steps=400, keep_versions=1), Fleet(actors=1))
+    ended = train(settings, run_dir, threading.Event(), in_process=True)
+    assert digests(ended) == digests(reference(toy(lead=0), 400))
+    with closing(Store(run_dir, read_only=True)) as store:
+        evaluated = {e.iteration for e in store.evaluations(-1, 2**62)}
+        best = store.fact("progress", RunProgress).best_version
+    needed = {c for c in ended.weights_kept if c >= max(evaluated)}  # to extend the run
+    assert set(ended.weights_kept) == {best, max(evaluated)} | needed
+    for version in ended.weights_kept:
+        (played,) = lines(
+            call("play", run_dir, "--weights", version, "--episodes", 1, "--json")
+        )  # fmt: skip
+        assert played["weights_version"] == version
+    gone = min(evaluated - set(ended.weights_kept))
+    with pytest.raises(StoreError, match="are not kept"):
+        call("evaluate", run_dir, "--weights", gone)
+    assert f"{len(ended.weights_kept)} versions: " in call("status", run_dir)
 
 
 @pytest.fixture

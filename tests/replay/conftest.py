@@ -23,11 +23,17 @@ def make_run(stack: ExitStack, tmp_path: Path) -> Callable[..., StoredRun]:
     """Makes a new run in ``tmp_path``."""
 
     def make(
-        lead: int = 0, max_env_steps: int = 1_000_000, stop_return: float | None = None
+        lead: int = 0,
+        max_env_steps: int = 1_000_000,
+        stop_return: float | None = None,
+        keep_versions: int | None = None,
     ) -> StoredRun:
         store = create(tmp_path, lead)
         stack.callback(store.close)
-        return StoredRun(store, Budget(max_env_steps=max_env_steps, stop_return=stop_return))
+        budget = Budget(
+            max_env_steps=max_env_steps, stop_return=stop_return, keep_versions=keep_versions
+        )
+        return StoredRun(store, budget)
 
     return make
 

@@ -60,17 +60,25 @@ class Died(Exception):
 class RunMachine(RuleBasedStateMachine):
     """Actors, a learner and a replay process that do everything they can do, in any order."""
 
-    @initialize(lead=st.integers(0, 3), max_env_steps=st.integers(1, FINAL // 2))
-    def start(self, lead: int, max_env_steps: int) -> None:
+    @initialize(
+        lead=st.integers(0, 3),
+        max_env_steps=st.integers(1, FINAL // 2),
+        keep_versions=st.none() | st.integers(0, 2),
+    )
+    def start(self, lead: int, max_env_steps: int, keep_versions: int | None) -> None:
         self.lead = lead
+        self.keep_versions = keep_versions
         self.folder = tempfile.TemporaryDirectory(dir=MEMORY)
         self.run_dir = Path(self.folder.name)
-        self.run = StoredRun(create(self.run_dir, lead), Budget(max_env_steps=max_env_steps))
+        self.run = StoredRun(create(self.run_dir, lead), self.budget(max_env_steps))
         self.now = 0.0
         self.held: dict[tuple[str, int], tuple[Command, bytes]] = {}
         self.accepted: dict[int, tuple[Command, bytes]] = {}
         self.explored: list[Entry] = []
         self.trained: list[Version] = []
+
+    def budget(self, max_env_steps: int) -> Budget:
+        return Budget(max_env_steps=max_env_steps, keep_versions=self.keep_versions)
 
     # Actors.
 
@@ -234,7 +242,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @rule(more=st.integers(0, FINAL // 4))
     def run_is_resumed_with_a_larger_budget(self, more: int) -> None:
-        budget = Budget(max_env_steps=min(self.run.budget.max_env_steps + more, FINAL))
+        budget = self.budget(min(self.run.budget.max_env_steps + more, FINAL))
         self.run = reopen(self.run, self.run_dir, budget)
         if self.run.progress.state == "running":
             # Evaluations that closed the run before are forgotten.
@@ -308,14 +316,16 @@ class RunMachine(RuleBasedStateMachine):
         latest, lead = progress.latest_version, self.run.config.lead
         evaluated = {weights_version(e.iteration, lead) for e in store.evaluations(-1, 2**62)}
         assert progress.best_version in evaluated | {0}
-        named |= evaluated | {latest}
+        if self.keep_versions is not None:
+            evaluated = set(sorted(evaluated, reverse=True)[: self.keep_versions])
+        named |= evaluated | {latest, progress.best_version}
         assert set(store.versions_kept()) == {v for v in named if 0 < v <= latest}
 
     def teardown(self) -> None:
         if not hasattr(self, "run"):
             return
         with self.folder:
-            self.run = reopen(self.run, self.run_dir, Budget(max_env_steps=FINAL))
+            self.run = reopen(self.run, self.run_dir, self.budget(FINAL))
             finish(self.run)
             assert self.run.progress.state == "ended"
             assert result(self.run) == reference(self.lead, FINAL)
@@ -533,6 +543,25 @@ def test_best_version_is_kept(make_run: MakeRun) -> None:
     version = run.store.version(expected)
     assert version is not None
     assert version.weights
+
+
+def test_so_many_of_the_evaluated_versions_are_kept(
+    make_run: MakeRun, reopened: MakeRun, tmp_path: Path
+) -> None:
+    run = make_run(lead=1, max_env_steps=120, keep_versions=2)
+    finish(run)
+    last, best = run.progress.latest_version, run.progress.best_version
+    cancelled = {c.weights_version for c in run.store.commands(cancelled=True)}
+    evaluated = sorted(weights_version(e.iteration, 1) for e in run.store.evaluations(-1, 2**62))
+    assert len(set(evaluated)) > 4
+    assert set(run.store.versions_kept()) == {*evaluated[-2:], *cancelled, best, last} - {last + 1}
+    assert result(run) == reference(1, 120)
+    run = reopened(run, Budget(max_env_steps=120, keep_versions=0))
+    assert set(run.store.versions_kept()) == {*cancelled, best, last} - {last + 1}
+    assert read_status(tmp_path).weights_kept == tuple(run.store.versions_kept())
+    run = reopened(run, Budget(max_env_steps=200, keep_versions=0))
+    finish(run)
+    assert result(run) == reference(1, 200)
 
 
 def test_version_with_other_values_is_refused_with_both_digests(make_run: MakeRun) -> None:

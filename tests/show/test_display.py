@@ -1,6 +1,7 @@
 """Progress: a panel in a terminal, plain lines elsewhere."""
 
 import io
+from collections.abc import Sequence
 
 import msgspec
 import pytest
@@ -26,7 +27,7 @@ STATUS = Status(
     episodes=EpisodeLedger(delivered=1, accepted=1, duplicate=0, rejected=0),
     buffer=BufferStatus(episodes=3, return_min=1.0, return_mean=2.0, return_max=3.0),
     weights_version=6, weights_lag=1, weights_lag_s=0.25, weights_sha256="", replay_sha256="",
-    loss=0.5,
+    weights_kept=(2, 4, 6), loss=0.5,
     evaluation=EvaluationStatus(
         iteration=5, env_steps=10_000, mean=42.0, std=3.0, ci95_low=41.0, ci95_high=43.0,
         episodes=100,
@@ -136,6 +137,20 @@ def shown(status: Status, width: int) -> list[str]:
     return [row.rstrip() for row in capture.get().splitlines()]
 
 
+@pytest.mark.parametrize(
+    ("kept", "text"),
+    [
+        ((), []),
+        ((7,), ["weights kept   1 version: 7"]),
+        ((2, 4, 6), ["weights kept   3 versions: 2, 4, 6"]),
+        (range(10, 200, 10), ["weights kept   19 versions: 10, 20, 30, 40, … 160, 170, 180, 190"]),
+    ],
+)
+def test_panel_lists_the_weights_that_are_kept(kept: Sequence[int], text: list[str]) -> None:
+    status = msgspec.structs.replace(STATUS, weights_kept=tuple(kept))
+    assert [row for row in shown(status, 120) if "kept" in row] == text
+
+
 @pytest.mark.parametrize("width", [40, 50, 80, 120])
 def test_panel_fits_its_terminal(width: int) -> None:
     lines = shown(STATUS, width)
@@ -158,13 +173,14 @@ def test_a_number_and_its_label_are_on_one_line() -> None:
         "               highest 3.0",
         "weights        version 6; loss 0.500;",
         "               lag 1 version and 0.25 s",
+        "weights kept   3 versions: 2, 4, 6",
         "actors         0 with 0 environments;",
         "               0 of at most 60 episodes running",
         "time           1:01 elapsed; 1:01:40 left",
         "waiting        learner l for actors:",
         "               iteration 7 (2.5 s)",
     ]
-    assert len(shown(STATUS, 80)) == 12  # a line each
+    assert len(shown(STATUS, 80)) == 13  # a line each
     assert "replay buffer  lowest return 1.0; mean 2.0; highest 3.0" in shown(STATUS, 80)
 
 

@@ -5,6 +5,7 @@ from contextlib import closing
 from pathlib import Path
 
 from udrl import folder as folders
+from udrl.config import change
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import return_text
 from udrl.offline import write_dataset
@@ -113,7 +114,8 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
     card = _card(agent, folder, found, report_of_agent(agent, run_dir), _again(agent, progress))
     folders.save(folder, policy, card)
-    write_config(folder, agent.config, budget_of(run_dir))
+    # The card promises that a run with these settings keeps the exported version.
+    write_config(folder, agent.config, change(budget_of(run_dir), keep_versions=None))
 
 
 def export_model(agent: Agent, path: Path) -> None:

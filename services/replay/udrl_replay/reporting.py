@@ -196,6 +196,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         weights_lag_s=round(lag_s, 4),
         weights_sha256=latest.digest.hex() if latest else "",
         replay_sha256=replay_digest(run.digests[e.id] for e in run.buffer).hex(),
+        weights_kept=tuple(run.store.versions_kept()),
         loss=latest.loss if latest else None,
         evaluation=_evaluation(run.store.last_evaluation(closing=False)),
         closing_evaluation=_evaluation(run.store.last_evaluation(closing=True))

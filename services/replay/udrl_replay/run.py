@@ -7,6 +7,7 @@ the rest is derived from it, or sent again by the services.
 
 import logging
 import math
+from heapq import nlargest
 from typing import Literal
 
 from udrl.commands import FINAL_EVALUATION, Command, CommandSampler
@@ -62,6 +63,7 @@ class StoredRun(RunState):
                 self._reopen()
             self.progress.ended_because = "" if self.progress.state == "running" else why
             self._advance()
+            self._keep_needed_weights()  # the budget may allow fewer than before
             self.save()
 
     def save(self) -> None:
@@ -385,7 +387,9 @@ class StoredRun(RunState):
         wanted = self.open_commands() + self.store.commands(cancelled=True)
         needed = {c.weights_version for c in wanted} | {latest, self.progress.best_version}
         needed |= self.auditor.versions
-        needed |= self._evaluated  # for later use, e.g. by `udrl play`
+        # Evaluated versions are for later use, e.g. by `udrl play`.
+        most = self.budget.keep_versions
+        needed |= self._evaluated if most is None else set(nlargest(most, self._evaluated))
         self.store.drop_weights(v for v in self.store.versions_kept() if v not in needed)
         self.store.drop_optimizers(latest)
         # The learner that trains version latest + 1 needs the buffer after iteration `latest`.

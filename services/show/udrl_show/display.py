@@ -20,6 +20,8 @@ from udrl_proto.text import printable
 _PLAIN_EVERY_S = 5.0
 #: Width of the progress bar, characters; less in a narrow terminal.
 _BAR_WIDTH = 20
+#: Weights versions that are listed; of more, the first and the last ones.
+_MOST_VERSIONS = 8
 #: Texts for the states.
 _STATES = {
     "running": "running",
@@ -123,6 +125,8 @@ def panel(status: Status) -> Table:
     lag = _counted(status.weights_lag, "version")
     weights.append(f"lag {lag} and {status.weights_lag_s:.2f} s")
     add("weights", *_separated(weights))
+    if status.weights_kept:
+        add("weights kept", *_kept(status.weights_kept))
     running = sum(a.running for a in status.actors)
     add(
         "actors",
@@ -189,6 +193,16 @@ def wrapped(phrases: Iterable[str], width: int) -> list[str]:
 def _separated(phrases: Sequence[str]) -> list[str]:
     """Return phrases with a semicolon after each but the last."""
     return [f"{phrase};" for phrase in phrases[:-1]] + list(phrases[-1:])
+
+
+def _kept(versions: Sequence[int]) -> list[str]:
+    """Return the number of versions, and the first and the last of them."""
+    names = [f"{version}" for version in versions]
+    if len(names) > _MOST_VERSIONS:
+        half = _MOST_VERSIONS // 2
+        names = [*names[:half], "…", *names[-half:]]
+    listed = [f"{name}," for name in names[:-1]] + names[-1:]
+    return [f"{_counted(len(versions), 'version')}:", *(n.replace("…,", "…") for n in listed)]
 
 
 def _progress(status: Status) -> Table:
