@@ -13,7 +13,8 @@ from tensorboard.plugins.hparams.metadata import SESSION_START_INFO_TAG
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from udrl_inspect.inspection import read_status
-from udrl_show.event_files import DERIVED_TAGS, EVALUATION_TAGS, FOLDER, TAGS
+from udrl_show.event_files import FOLDER
+from udrl_show.scalars import DERIVED_TAGS, EVALUATION_TAGS, TAGS
 from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 
@@ -45,7 +46,7 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
     run_dir = tmp_path / "run"
     for budget in (3000, 4500):
         cli(
-            *arguments(SMALL, budget, run_dir), "--resume", "--tensorboard", "--in-process"
+            *arguments(SMALL, budget, run_dir), "--resume", "--log", "tensorboard", "--in-process"
         ).status()
         told, rows = read(run_dir), metrics(run_dir)
         assert set(told) == {*TAGS, *EVALUATION_TAGS, *DERIVED_TAGS}

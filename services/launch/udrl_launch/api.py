@@ -29,6 +29,7 @@ from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
 from udrl_replay.creation import directory_name, exists
 from udrl_replay.store import EVALUATION_COLUMNS
 from udrl_show.metrics_file import MetricsReader
+from udrl_show.run_logs import opened
 
 #: Called with the status of a run. It stops the run by returning False.
 Callback = Callable[[Status], bool | None]
@@ -70,6 +71,7 @@ def train(
     on_iteration: IterationCallback | None = None,
     on_evaluation: EvaluationCallback | None = None,
     on_end: Callable[[Status], object] | None = None,
+    log: str | Iterable[str] = (),
     in_process: bool = True,
     **settings: Any,
 ) -> Trained:
@@ -86,6 +88,7 @@ def train(
         on_evaluation: called once with each evaluation, in order. The final evaluation is in the
             status that ``on_end`` receives.
         on_end: called once with the last status, when the run has ended, failed or was stopped.
+        log: programs to log to: ``tensorboard``, ``wandb``, ``mlflow``.
         in_process: run all services as threads of this process. False: as separate processes,
             which is faster for long runs.
         settings: any setting of ``docs/configuration.md``, by name. Numbers of env steps can be
@@ -115,16 +118,19 @@ def train(
     watcher.on_status += [callbacks] if callable(callbacks) else list(callbacks)
     watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation
     try:
-        status = run_training(
-            gathered, folder, stop, resume=resume, in_process=in_process, watcher=watcher
-        )
+        with opened([log] if isinstance(log, str) else log, folder) as run_logs:
+            watcher.on_status += [run_log.show for run_log in run_logs]
+            status = run_training(
+                gathered, folder, stop, resume=resume, in_process=in_process, watcher=watcher
+            )
+            watcher.show(status)
     except Interrupted:
         status = read_status(folder)
+        watcher.show(status)
     except RunFailed:
         if on_end is not None:
             on_end(read_status(folder))
         raise
-    watcher.show(status)
     if on_end is not None:
         on_end(status)
     if status.problem:

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,9 @@ from udrl_proto.text import printable
 from udrl_replay.creation import directory_name
 from udrl_show.curve import draw
 from udrl_show.display import Display
-from udrl_show.event_files import EventFiles
 from udrl_show.prometheus import Exporter
+from udrl_show.run_log import RunLog
+from udrl_show.run_logs import WRITERS, opened
 
 log = logging.getLogger("udrl")
 
@@ -59,8 +61,8 @@ log = logging.getLogger("udrl")
 @KEYS
 @ALLOW_INEXACT
 @AUDIT
-@click.option("--tensorboard", is_flag=True,
-              help="Write TensorBoard event files to RUN_DIR/tensorboard.")  # fmt: skip
+@click.option("--log", "logs", type=click.Choice(tuple(WRITERS)), multiple=True,
+              help="Also log metrics and settings to this program. May be repeated.")  # fmt: skip
 @click.option("--metrics-port", type=click.IntRange(0, 65_535), metavar="PORT",
               help="Serve metrics for Prometheus on this port; 0 = any free port.")  # fmt: skip
 @METRICS_HOST
@@ -76,7 +78,7 @@ def train(
     keys: Path | None,
     allow_inexact: bool,
     audit: float,
-    tensorboard: bool,
+    logs: tuple[str, ...],
     metrics_port: int | None,
     metrics_host: str,
     as_json: bool,
@@ -102,8 +104,9 @@ def train(
                 exporter = Exporter(watchers.latest, metrics_host, metrics_port)
                 stack.enter_context(closing(exporter))
                 click.echo(f"metrics: http://{metrics_host}:{exporter.port}/metrics", err=True)
-            if tensorboard:
-                watchers.add(stack.enter_context(closing(EventFiles(run_dir))))
+            run_logs = stack.enter_context(opened(logs, run_dir))
+            for run_log in run_logs:
+                watchers.add(run_log)
             watchers.add(stack.enter_context(Display()))
             watchers.add(Adviser())
             status = run_training(
@@ -112,7 +115,7 @@ def train(
                 audit=audit, watcher=watchers,
             )  # fmt: skip
             watchers.show(status)
-        _finish(run_dir, status)
+        _finish(run_dir, status, run_logs)
         if as_json:
             print_json(status)
         if status.problem:
@@ -136,7 +139,7 @@ def warn_of_idle_environments(settings: Settings) -> None:
         )  # fmt: skip
 
 
-def _finish(run_dir: Path, status: Status) -> None:
+def _finish(run_dir: Path, status: Status, run_logs: Sequence[RunLog]) -> None:
     """Draw the learning curve, and print the result and the paths of all files."""
     closing = status.closing_evaluation
     lines = []
@@ -161,5 +164,9 @@ def _finish(run_dir: Path, status: Status) -> None:
     except ConfigError as error:
         curve = str(error)
     lines.append(("learning curve", curve))
+    for run_log in run_logs:
+        if run_log.place:
+            place = Path(run_log.place)
+            lines.append((run_log.name, shown(place) if place.exists() else run_log.place))
     for label, text in lines:
         print_text(text, f"{label + ':':<18}")

@@ -1,0 +1,311 @@
+"""Logs of runs for TensorBoard, Weights & Biases and MLflow, each read by its own code."""
+
+import csv
+import json
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import msgspec
+import pytest
+import wandb
+from mlflow.entities import Run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
+
+import udrl
+from udrl.errors import ConfigError
+from udrl_inspect.inspection import read_status, settings_of
+from udrl_show.event_files import FOLDER
+from udrl_show.run_log import Logged, RunLog
+from udrl_show.run_logs import WRITERS, opened
+from udrl_show.scalars import Scalar
+from whole_run import TOY, Cli, arguments
+
+#: (env steps, value) by tag.
+Series = dict[str, list[tuple[int, float]]]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let no log leave this machine."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    yield
+    wandb.teardown()
+
+
+@pytest.fixture
+def run_dir(ended_run: Path, tmp_path: Path) -> Path:
+    """A copy of an ended run."""
+    return Path(shutil.copytree(ended_run, tmp_path / "run"))
+
+
+def log(run_dir: Path, *names: str, stopped: bool = False) -> list[str]:
+    """Log a run as ``udrl train`` does; return the places of the logs."""
+    status = read_status(run_dir)
+    if stopped:
+        status = msgspec.structs.replace(status, state="stopped", closing_evaluation=None)
+    with opened(names, run_dir) as logs:
+        for one in logs:
+            one.show(status)
+    return [one.place for one in logs]
+
+
+def event_files(run_dir: Path) -> Series:
+    """Return what TensorBoard reads of a run."""
+    log(run_dir, "tensorboard")
+    found = EventAccumulator(str(run_dir / FOLDER), size_guidance={"scalars": 0})
+    found.Reload()
+    return {
+        tag: [(event.step, event.value) for event in found.Scalars(tag)]
+        for tag in found.Tags()["scalars"]
+    }
+
+
+def assert_same(found: Series, expected: Series) -> None:
+    """Compare values; event files have them in single precision."""
+    assert {tag: [step for step, _ in points] for tag, points in found.items()} == {
+        tag: [step for step, _ in points] for tag, points in expected.items()
+    }
+    for tag, points in found.items():
+        assert [v for _, v in points] == pytest.approx([v for _, v in expected[tag]], rel=1e-6)
+
+
+def records(folder: Path) -> Iterator[Any]:
+    """Yield the records of an offline run; its file is LevelDB's log after seven bytes."""
+    (path,) = folder.glob("*.wandb")
+    data, at, parts = path.read_bytes(), 7, b""
+    while at + 7 <= len(data):
+        if (left := 32768 - at % 32768) < 7:
+            at += left
+            continue
+        _, size, kind = struct.unpack("<IHB", data[at : at + 7])
+        parts += data[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):  # the whole record, or its last part
+            yield Record.FromString(parts)
+            parts = b""
+
+
+def values(items: Sequence[Any]) -> dict[str, Any]:
+    return {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in items}
+
+
+def test_weights_and_biases_has_what_event_files_have(run_dir: Path) -> None:
+    (place,) = log(run_dir, "wandb")
+    runs: list[Any] = []
+    found: Series = defaultdict(list)
+    summary: dict[str, Any] = {}
+    for record in records(Path(place)):
+        if record.HasField("run"):
+            runs.append(record.run)
+        if record.HasField("summary"):
+            summary |= values(record.summary.update)
+        if record.HasField("history"):
+            row = values(record.history.item)
+            for tag, value in row.items():
+                if "/" in tag:
+                    found[tag].append((row["env_steps"], value))
+    status = read_status(run_dir)
+    assert (runs[0].run_id, runs[0].project, runs[0].display_name) == (
+        status.run_id, "udrl", run_dir.name,
+    )  # fmt: skip
+    config = {item.key: json.loads(item.value_json) for r in runs for item in r.config.update}
+    assert settings_of(run_dir).items() <= config.items()
+    assert summary["ended_because"] == status.ended_because
+    assert_same(found, event_files(run_dir))
+
+
+class ServedRun:
+    """A run at W&B's server: what it has is there when the run is resumed."""
+
+    id, offline, url, dir = "", False, "https://wandb.example/run", "/"
+
+    def __init__(self) -> None:
+        self.summary: dict[str, Any] = {}
+        self.rows: list[dict[str, Any]] = []
+        self.options: list[dict[str, Any]] = []
+
+    def init(self, **options: Any) -> "ServedRun":
+        self.options.append(options)
+        return self
+
+    def define_metric(self, name: str, step_metric: str | None = None) -> None: ...
+
+    def log(self, row: dict[str, Any]) -> None:
+        self.rows.append(row)
+        self.summary |= row
+
+    def finish(self) -> None: ...
+
+
+def shorten(run_dir: Path, share: float) -> str:
+    """Cut ``metrics.csv`` as if the run had been stopped; return the whole text."""
+    path = run_dir / "metrics.csv"
+    text = path.read_text()
+    lines = text.splitlines(keepends=True)
+    path.unlink()
+    path.write_text("".join(lines[: int(share * len(lines))]))
+    return text
+
+
+def test_a_resumed_run_continues_at_weights_and_biases(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = ServedRun()
+    monkeypatch.setattr(wandb, "init", served.init)
+    text = shorten(run_dir, 0.5)
+    assert log(run_dir, "wandb", stopped=True) == [served.url]
+    half = len(served.rows)
+    assert half > 0
+    assert "ended_because" not in served.summary
+    (run_dir / "metrics.csv").write_text(text)
+    for _ in range(2):  # the second time there is nothing to add
+        log(run_dir, "wandb")
+        with (run_dir / "metrics.csv").open(newline="") as file:
+            expected = [int(row["iteration"]) for row in csv.DictReader(file)]
+        told = [row["time/iterations"] for row in served.rows if "time/iterations" in row]
+        assert told == expected
+        assert served.rows[-1]["eval/mean_reward"] == read_status(run_dir).closing_evaluation.mean  # type: ignore[union-attr]
+        assert sum("eval/mean_reward" in row for row in served.rows[-2:]) == 1
+        assert served.summary["ended_because"] == read_status(run_dir).ended_because
+    assert {(o["id"], o["resume"]) for o in served.options} == {
+        (read_status(run_dir).run_id, "allow")
+    }
+
+
+def logged_to_mlflow(place: str) -> tuple[Run, Series]:
+    """Return the only run in the experiment, and its metrics."""
+    client = mlflow.MlflowClient()
+    experiment = client.get_experiment_by_name("udrl")
+    assert experiment is not None
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert place.endswith(f"experiment udrl, run {run.info.run_id}")
+    return run, {
+        tag: [(m.step, m.value) for m in client.get_metric_history(run.info.run_id, tag)]
+        for tag in run.data.metrics
+    }
+
+
+def test_mlflow_has_what_event_files_have_also_of_a_resumed_run(run_dir: Path) -> None:
+    text = shorten(run_dir, 0.5)
+    run, found = logged_to_mlflow(*log(run_dir, "mlflow", stopped=True))
+    assert run.info.status == "KILLED"
+    assert len(found["time/iterations"]) == len((run_dir / "metrics.csv").read_text().split()) - 1
+    (run_dir / "metrics.csv").write_text(text)
+    expected = event_files(run_dir)
+    for _ in range(2):  # the second time there is nothing to add
+        run, found = logged_to_mlflow(*log(run_dir, "mlflow"))
+        assert_same(found, expected)
+        assert (run.info.status, run.info.run_name) == ("FINISHED", run_dir.name)
+        assert run.data.tags["udrl.ended_because"] == read_status(run_dir).ended_because
+    assert run.data.params.keys() == settings_of(run_dir).keys()
+    assert json.loads(run.data.params["hidden"]) == [16, 16]
+    assert run.data.params["environment"] == "CartPole-v1"
+
+
+def test_a_log_that_fails_does_not_end_the_training(
+    tmp_path: Path, cli: Callable[..., Cli], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    run_dir = tmp_path / "run"
+    started = cli(
+        *arguments(TOY, 200, run_dir), "--in-process", "--log", "mlflow", "--log", "wandb"
+    )
+    code, _, err = started.finish(timeout=100)
+    assert code == 0, err
+    assert err.count("the log for mlflow failed, and the run continues without it: ") == 1
+    assert "Connection refused" in err
+    (folder,) = run_dir.glob("wandb/offline-run-*")
+    assert f"wandb:            run/wandb/{folder.name}\n" in err
+    assert "mlflow: " not in err.partition("learning curve:")[2]
+
+
+def test_without_a_login_weights_and_biases_does_not_wait_for_one(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    script = (
+        "import sys, pathlib, logging\n"
+        "from udrl_inspect.inspection import read_status\n"
+        "from udrl_show.run_logs import opened\n"
+        "logging.basicConfig()\n"
+        "run_dir = pathlib.Path(sys.argv[1])\n"
+        "with opened(['wandb'], run_dir) as logs:\n"
+        "    for _ in range(3):\n"
+        "        logs[0].show(read_status(run_dir))\n"
+        "print('the run continues')\n"
+    )
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("WANDB_")}
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(run_dir)], env=kept | {"HOME": str(tmp_path)},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=100, check=True,
+    )  # fmt: skip
+    assert done.stdout == "the run continues\n"
+    assert done.stderr.count("the log for wandb failed, and the run continues without it: ") == 1
+    assert "No API key configured" in done.stderr
+
+
+class Stuck:
+    """A writer whose server does not answer."""
+
+    place = ""
+
+    def __init__(self) -> None:
+        self.answers = threading.Event()
+
+    def begin(self, run_id: str, settings: dict[str, Any], began: float) -> Logged:
+        self.answers.wait(60)
+        return Logged()
+
+    def write(self, scalars: Sequence[Scalar]) -> None: ...
+
+    def end(self, because: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_a_log_that_hangs_is_left_behind(run_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
+    writer = Stuck()
+    hanging = RunLog(run_dir, "stuck", writer)
+    hanging.show(read_status(run_dir))
+    hanging.finish()
+    hanging.join(0.1)
+    assert caplog.messages == ["the log for stuck is incomplete: it takes too long to write"]
+    writer.answers.set()
+    hanging.join(60)
+    assert len(caplog.messages) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("tensorboard", "tensorboard.compat.proto.event_pb2"), ("wandb", "wandb"),
+     ("mlflow", "mlflow")],
+)  # fmt: skip
+def test_a_missing_extra_is_named(
+    name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=rf'pip install "udrl\[{name}\]"'):
+        WRITERS[name](tmp_path)
+
+
+def test_logs_that_cannot_be_opened_are_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = tmp_path / "run"
+    with pytest.raises(ConfigError, match="log 'tensorbord': expected one of tensorboard, wandb"):
+        udrl.train("Figure2-v0", run_dir=run_dir, log="tensorbord")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "carrier-pigeon://home")
+    with pytest.raises(ConfigError, match=r"carrier-pigeon://home: .*set MLFLOW_TRACKING_URI to"):
+        udrl.train("Figure2-v0", run_dir=run_dir, log=["mlflow"])
+    assert not run_dir.exists()
