@@ -71,7 +71,7 @@ $(VENV)/.installed: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[$(EXTRAS),metrics,minari,mlflow,tensorboard,wandb,dev]'
+	$(PIP_INSTALL) --editable '.[$(EXTRAS),hub,metrics,minari,mlflow,tensorboard,wandb,dev]'
 	touch $@
 
 $(VENV)/.installed-docs: $(VENV)/bin/python pyproject.toml constraints.txt

@@ -23,8 +23,10 @@ FORMAT = 2
 
 _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
 _GRAPH = "graph.onnx"
+#: The files that :func:`load` reads.
+FILES = _DESCRIPTION, _WEIGHTS, _GRAPH
 #: Maximum size of a file.
-_MAX_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 
 
 class Description(
@@ -143,9 +145,9 @@ def _refuse_foreign(folder: Path) -> None:
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             raise InvalidData(
-                f"{path}: {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}; export "
+                f"{path}: {path.stat().st_size:,} bytes, expected at most {MAX_BYTES:,}; export "
                 f"the run again"
             )
         return path.read_bytes()

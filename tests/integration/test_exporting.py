@@ -112,6 +112,8 @@ def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
         export(ended_run)
     with pytest.raises(ConfigError, match="is the directory of a run"):
         export(ended_run, "--folder", ended_run)
+    with pytest.raises(ConfigError, match="--public needs --hub REPO_ID"):
+        export(ended_run, "--onnx", tmp_path / "agent.onnx", "--public")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="choose a writable file"):
         export(ended_run, "--onnx", tmp_path / "file" / "agent.onnx")

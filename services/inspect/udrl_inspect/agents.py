@@ -22,6 +22,7 @@ from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
 from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
+from udrl_inspect.hub import HUB_SCHEME, download
 from udrl_proto.messages import Hello
 from udrl_replay.database import FILE
 from udrl_replay.progress import RunProgress
@@ -107,23 +108,26 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
     Its ``desired_return`` and ``desired_horizon`` are those of its evaluations.
 
     Args:
-        path: the directory of a run, or a folder written by ``udrl export --folder``.
+        path: the directory of a run, a folder written by ``udrl export --folder``, or
+            ``hf://OWNER/NAME`` for an agent on the Hugging Face Hub, ``hf://OWNER/NAME@REVISION``
+            for one of its revisions.
         weights: a weights version that the run keeps, ``latest`` or ``best``.
 
     Raises:
-        ConfigError: the path is neither, or ``weights`` cannot be chosen.
+        ConfigError: the path is none of these, or ``weights`` cannot be chosen.
         InvalidData: the files are invalid.
         StoreError: the run has no such version.
+        Unreachable: the Hub does not answer.
     """
-    path = Path(path)
-    if (path / FILE).exists():
-        return load_agent(path, weights).policy
+    is_on_hub = isinstance(path, str) and path.startswith(HUB_SCHEME)
+    if (Path(path) / FILE).exists() and not is_on_hub:
+        return load_agent(Path(path), weights).policy
     if weights != "latest":
         raise ConfigError(
             f"weights = {weights!r}: {path} is not a run directory, and an exported agent has one "
             f"version; leave weights out"
         )
-    return load_folder(path)
+    return load_folder(download(str(path)) if is_on_hub else path)
 
 
 def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:

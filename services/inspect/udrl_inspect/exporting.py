@@ -3,6 +3,7 @@
 import shlex
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from udrl import folder as folders
 from udrl.config import change
@@ -11,6 +12,7 @@ from udrl.evaluation import return_text
 from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
+from udrl_inspect.hub import HUB_SCHEME, upload
 from udrl_inspect.inspection import budget_of
 from udrl_inspect.obedience_report import ObedienceReport, report_of_agent
 from udrl_inspect.obedience_text import markdown
@@ -42,7 +44,7 @@ a command: *get this return within this many steps*.
 ```python
 {example}```
 
-This needs `udrl` and the environment's dependencies.
+This needs `{needs}` and the environment's dependencies.
 
 ## Training
 
@@ -81,7 +83,7 @@ model-index:
 _EXAMPLE = """\
 import udrl
 
-policy = udrl.load("{folder}")
+policy = udrl.load("{address}")
 env = policy.make_environment()
 observation, _ = env.reset(seed=1)
 policy.reset()
@@ -94,10 +96,16 @@ while not over:
 """
 
 
-def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
+def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None = None) -> None:
     """Write an agent, its settings and a model card with the results of its evaluation.
 
     The card includes the report of ``udrl obedience`` if it was measured with these weights.
+
+    Args:
+        agent: the agent.
+        run_dir: the directory of its run.
+        folder: the folder to write.
+        address: what ``udrl.load`` reads in the card's example. None: the folder's name.
 
     Raises:
         ConfigError: the folder cannot be written, or it is a run directory.
@@ -112,10 +120,26 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path) -> None:
     policy = agent.policy
     if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
-    card = _card(agent, folder, found, report_of_agent(agent, run_dir), _again(agent, progress))
-    folders.save(folder, policy, card)
+    report, again = report_of_agent(agent, run_dir), _again(agent, progress)
+    folders.save(folder, policy, _card(agent, address or folder.name, found, report, again))
     # The card promises that a run with these settings keeps the exported version.
     write_config(folder, agent.config, change(budget_of(run_dir), keep_versions=None))
+
+
+def export_to_hub(agent: Agent, run_dir: Path, repo_id: str, *, public: bool) -> str:
+    """Upload an agent to the Hugging Face Hub: its folder, and its ONNX model; return the URL.
+
+    Raises:
+        ConfigError: the extra is not installed, or the Hub refuses.
+        InvalidData: the report of ``udrl obedience`` is damaged.
+        StoreError: the run cannot be read.
+        Unreachable: the Hub does not answer.
+    """
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        export_folder(agent, run_dir, folder, f"{HUB_SCHEME}{repo_id}")
+        export_model(agent, folder / "model.onnx")
+        return upload(folder, repo_id, public=public)
 
 
 def export_model(agent: Agent, path: Path) -> None:
@@ -178,7 +202,7 @@ def _again(agent: Agent, progress: RunProgress) -> str:
 
 def _card(
     agent: Agent,
-    folder: Path,
+    address: str,
     found: EvaluationRow | None,
     report: ObedienceReport | None,
     again: str,
@@ -200,7 +224,8 @@ def _card(
         index=index,
         results=results,
         obedience="" if report is None else _OBEDIENCE.format(report=markdown(report)),
-        example=_EXAMPLE.format(folder=folder.name),
+        example=_EXAMPLE.format(address=address),
+        needs="udrl[hub]" if address.startswith(HUB_SCHEME) else "udrl",
         command=shlex.join(
             ["udrl", "train", environment, "--preset", "none", "--config", "config.toml"]
         ),
