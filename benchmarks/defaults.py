@@ -37,7 +37,7 @@ TASKS = {
     "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
     "FrozenLakeSlippery": Task("FrozenLake-v1", 200_000, {}),
     # One return says little here.
-    "Blackjack": Task("flat_blackjack:FlatBlackjack-v0", 60_000, {"eval_episodes": 5_000}),
+    "Blackjack": Task("Blackjack-v1", 60_000, {"eval_episodes": 5_000}),
     "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
     "Taxi": Task("Taxi-v4", 200_000, {}),
     "CartPole": Task("CartPole-v1", 100_000, {}),
