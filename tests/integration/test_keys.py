@@ -138,7 +138,7 @@ def test_status_of_a_live_run_needs_an_observers_key(
     for keys, remedy in [
         ((), "add --keys DIR"),
         (("--keys", str(foreign_keys_dir)), "same `udrl keys create`"),
-        (("--keys", str(keys_dir / "actor")), "'observer' is needed"),
+        (("--keys", str(keys_dir / "actor")), "expected 'observer'"),
     ]:
         result = CliRunner().invoke(command_line, ["status", "--connect", endpoint, *keys])
         assert isinstance(result.exception, ConfigError)
@@ -154,6 +154,6 @@ def test_keys_that_cannot_be_used_are_refused_before_anything_is_written(
     run_dir = tmp_path / "run"
     with pytest.raises(ConfigError, match=r"nowhere.ca\.pem: No such file"):
         run(toy(), 100, run_dir=run_dir, keys=tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match="'actor', 'replay' is needed"):
+    with pytest.raises(ConfigError, match="'actor', expected 'replay'"):
         run(toy(), 100, run_dir=run_dir, keys=keys_dir / "actor")
     assert not run_dir.exists()

@@ -28,7 +28,7 @@ from udrl_show.event_files import FOLDER
 from udrl_show.run_log import Logged, RunLog
 from udrl_show.run_logs import WRITERS, opened
 from udrl_show.scalars import Scalar
-from whole_run import TOY, Cli, arguments
+from whole_run import TOY, Cli, arguments, wait_for
 
 #: (env steps, value) by tag.
 Series = dict[str, list[tuple[int, float]]]
@@ -100,29 +100,36 @@ def values(items: Sequence[Any]) -> dict[str, Any]:
     return {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in items}
 
 
+class OfflineRun:
+    """What an offline run of W&B has; its file may be completed after ``finish`` has returned."""
+
+    def __init__(self, folder: Path) -> None:
+        self.runs: list[Any] = []
+        self.series: Series = defaultdict(list)
+        self.summary: dict[str, Any] = {}
+        for record in records(folder):
+            if record.HasField("run"):
+                self.runs.append(record.run)
+            if record.HasField("summary"):
+                self.summary |= values(record.summary.update)
+            if record.HasField("history"):
+                row = values(record.history.item)
+                for tag, value in row.items():
+                    if "/" in tag:
+                        self.series[tag].append((row["env_steps"], value))
+
+
 def test_weights_and_biases_has_what_event_files_have(run_dir: Path) -> None:
     (place,) = log(run_dir, "wandb")
-    runs: list[Any] = []
-    found: Series = defaultdict(list)
-    summary: dict[str, Any] = {}
-    for record in records(Path(place)):
-        if record.HasField("run"):
-            runs.append(record.run)
-        if record.HasField("summary"):
-            summary |= values(record.summary.update)
-        if record.HasField("history"):
-            row = values(record.history.item)
-            for tag, value in row.items():
-                if "/" in tag:
-                    found[tag].append((row["env_steps"], value))
+    wait_for(lambda: "ended_because" in OfflineRun(Path(place)).summary, "the end of the log")
+    found = OfflineRun(Path(place))
     status = read_status(run_dir)
-    assert (runs[0].run_id, runs[0].project, runs[0].display_name) == (
-        status.run_id, "udrl", run_dir.name,
-    )  # fmt: skip
-    config = {item.key: json.loads(item.value_json) for r in runs for item in r.config.update}
+    run = found.runs[0]
+    assert (run.run_id, run.project, run.display_name) == (status.run_id, "udrl", run_dir.name)
+    config = {i.key: json.loads(i.value_json) for r in found.runs for i in r.config.update}
     assert settings_of(run_dir).items() <= config.items()
-    assert summary["ended_because"] == status.ended_because
-    assert_same(found, event_files(run_dir))
+    assert found.summary["ended_because"] == status.ended_because
+    assert_same(found.series, event_files(run_dir))
 
 
 class ServedRun:

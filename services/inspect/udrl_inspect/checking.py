@@ -91,12 +91,14 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
     before, began = _memory(), time.perf_counter()
     env = make_environment(config)
     make_s = time.perf_counter() - began
-    declared = env.observations.declared, env.actions.declared
     advice = _of_gymnasium(env.unwrapped)
     env.close()
     with closing(EpisodeGenerator(config, 1)) as generator:
         memory = (_memory() - before) / 2  # two were created
         fitted = choose(config, left_open, generator) if left_open else config
+    env = make_environment(fitted)  # what is chosen may add to the observations
+    declared = env.observations.declared, env.actions.declared
+    env.close()
     with closing(EpisodeGenerator(fitted, 1)) as generator:
         spec = generator.spec
         digest = repeated_digest(generator)

@@ -63,7 +63,8 @@ class StoredRun(RunState):
                 self._reopen()
             self.progress.ended_because = "" if self.progress.state == "running" else why
             self._advance()
-            self._keep_needed_weights()  # the budget may allow fewer than before
+            if budget.keep_versions is not None:  # it may be fewer than before
+                self._keep_needed_weights()
             self.save()
 
     def save(self) -> None:

@@ -71,6 +71,10 @@ def _lines(found: Check) -> list[tuple[str, str]]:
         ),
     ]
     if found.chosen:
-        chosen = ", ".join(f"{name} = {value}" for name, value in found.chosen.items())
+        # As --set accepts them.
+        chosen = ", ".join(
+            f"{name} = {str(value).lower() if isinstance(value, bool) else value}"
+            for name, value in found.chosen.items()
+        )
         lines.append(("settings", f"{chosen} (chosen from random episodes)"))
     return lines + [("advice", sentence) for sentence in found.advice]
