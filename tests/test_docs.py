@@ -106,7 +106,7 @@ def test_every_setting_is_documented_with_its_type_default_and_range(
     for field in setting_fields(kind):
         name, allowed = described(field.type)
         if field.name in OPEN:
-            allowed += ", or `auto`"
+            allowed += ", or `auto`" if allowed else "or `auto`"
         expected[f"`{field.name}`"] = [name, default_of(field), allowed]
     rows = records(section("docs/configuration.md", heading), "setting")
     assert {row[0]: row[1:4] for row in rows} == expected

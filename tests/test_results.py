@@ -34,11 +34,11 @@ def test_tables_are_made_of_the_evaluations(folder: Path) -> None:
     assert found == reached(rows, sorted({row.threshold for row in found}))
 
 
-@pytest.mark.parametrize("folder", RUNS, ids=name)
-def test_kept_runs_are_recognised_and_only_their_records_are_kept(folder: Path) -> None:
-    job = read_job(folder)
-    assert folder == job.folder(RESULTS)
-    assert job.done(RESULTS)
+def test_kept_runs_are_recognised() -> None:
+    for folder in RUNS:
+        job = read_job(folder)
+        assert folder == job.folder(RESULTS)
+        assert job.done(RESULTS)
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)

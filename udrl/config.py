@@ -221,6 +221,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 def parse_assignment(text: str) -> tuple[str, Any]:
     """Return name and value of ``NAME=VALUE``. VALUE is TOML; a bare word is a string.
 
+    ``True`` and ``False`` are accepted as Python writes them.
+
     Raises:
         ConfigError: there is no ``=``.
     """
@@ -230,7 +232,8 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
-        return name.strip(), value.strip()
+        word = value.strip()
+        return name.strip(), {"True": True, "False": False}.get(word, word)
 
 
 @cache

@@ -177,7 +177,10 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         first = int(found[1])
         last = int(found[2] or first)
         if not first <= last < first + 10_000:
-            raise ConfigError(f"--seeds {text}: {part.strip()} must go up, by less than 10,000")
+            raise ConfigError(
+                f"--seeds {text}: {part.strip()}: expected the smaller number first, and at most "
+                f"10,000 seeds"
+            )
         seeds.extend(range(first, last + 1))
     return tuple(dict.fromkeys(seeds))
 

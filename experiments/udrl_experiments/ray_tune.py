@@ -97,6 +97,6 @@ def carry_out(
         for failure in results.errors:
             say(f"a run failed: {failure}")
         if len(results.errors) == len(waiting):
-            raise RunFailed(f"all {len(waiting)} runs failed, the first with: {results.errors[0]}")
+            raise RunFailed(f"no run succeeded; the first failed with: {results.errors[0]}")
     finally:
         ray.shutdown()

@@ -148,8 +148,8 @@ def search_environment(
         and isinstance(spec.observation_space, Vector | Image)
     ):
         raise ConfigError(
-            f"{', '.join(others)} need discrete actions and one vector or image as observation, "
-            f"which {environment} has not; search with --algorithm UDRL"
+            f"{environment} with {', '.join(others)}: expected discrete actions, and one vector or "
+            f"image as observation; search with --algorithm UDRL"
         )
     written = {name: flat(config)[name] for name in (*sorted(settings.left_open), *assigned)}
     subject = Subject(space, chosen, config, {"environment": environment} | written)

@@ -199,6 +199,8 @@ def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
         ("hidden=[64, 128]", "hidden", [64, 128]),
         ("eval_temperature=0.5", "eval_temperature", 0.5),
         ("segments=all", "segments", "all"),
+        ("observe_time=True", "observe_time", True),
+        ("observe_time=False", "observe_time", False),
         ('segments="all"', "segments", "all"),
         ("environment_kwargs={steps = 4}", "environment_kwargs", {"steps": 4}),
         ("environment=module:Env-v0", "environment", "module:Env-v0"),

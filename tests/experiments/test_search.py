@@ -206,7 +206,7 @@ def test_what_a_search_of_any_environment_draws_cannot_be_set(mine: Path) -> Non
 
 
 def test_algorithms_that_cannot_act_in_the_environment_are_told(mine: Path) -> None:
-    with pytest.raises(ConfigError, match=r"PPO need discrete actions.*--algorithm UDRL"):
+    with pytest.raises(ConfigError, match=r"with PPO: expected discrete actions.*--algorithm UDRL"):
         search_environment(StudyPlan(), "Pendulum-v1", mine)
     assert search_environment(StudyPlan(), "Pendulum-v1", mine, ["UDRL"]).jobs
 
