@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 from udrl.config import Config, build, flat, parse_assignment, preset
 from udrl.errors import ConfigError
+from udrl_launch.settings import with_steps_as_numbers
 
 #: Algorithms of Stable-Baselines3 that UDRL is compared with.
 BaselineAlgorithm = Literal["DQN", "A2C", "PPO"]
@@ -150,7 +151,7 @@ class StudyPlan(NamedTuple):
         Raises:
             ConfigError: an assignment is none, or is of one of these.
         """
-        given = dict(parse_assignment(text) for text in self.assignments)
+        given = with_steps_as_numbers(dict(parse_assignment(text) for text in self.assignments))
         for name in given:
             if name in own:
                 raise ConfigError(f"--set {name}=...: this study sets {name} itself; leave it out")

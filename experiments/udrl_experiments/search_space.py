@@ -117,6 +117,12 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
         raise ConfigError(
             f"{source}: no algorithm to search for; expected a table [{'] or ['.join(algorithms)}]"
         )
+    for algorithm, settings in lists.items():
+        if "environment" in settings:
+            raise ConfigError(
+                f"{source}: environment in [{algorithm}]; the environment is the argument ENV, "
+                f"{environment!r}; leave it out"
+            )
     networks = _expanded(file.networks, f"{source}: [networks]")
     return SearchSpace(environment, file.configurations, file.seeds, networks, lists)
 

@@ -84,9 +84,9 @@ def conduct(
     folder = root / study.name
     place = StudyFolders(root if study.shares_runs else folder, folder)
     try:
-        _open(study, place, resume=resume)
         sources = [one if study.shares_runs else one / study.name for one in runs_from]
         copy_finished(study.jobs, place.root, sources, say)
+        _open(study, place, resume=resume)
         study.carry_out(study.jobs, place.root, side_by_side, stop, say)
         said = study.report(place)
     except OSError as error:

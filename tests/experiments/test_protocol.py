@@ -69,3 +69,10 @@ def test_a_baseline_is_the_same_whatever_udrl_does() -> None:
     assert other.baseline(TASKS["lander"], 3) == usual
     shared = StudyPlan(assignments=("hidden=[8]",)).baseline(TASKS["lander"], 3)
     assert (shared.network.hidden, shared.seed, shared.environment) == ((8,), 3, "LunarLander-v3")
+
+
+def test_numbers_of_steps_have_suffixes_as_elsewhere() -> None:
+    config = StudyPlan(assignments=("eval_every=10K",)).config(TASKS["lander"], 1)
+    assert config.evaluation.eval_every == 10_000
+    with pytest.raises(ConfigError, match="eval_every = 'often' is not a number of steps"):
+        StudyPlan(assignments=("eval_every=often",)).config(TASKS["lander"], 1)

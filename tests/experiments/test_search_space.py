@@ -1,11 +1,13 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from udrl.config import Config, build
+from udrl.errors import ConfigError
 from udrl_experiments.protocol import TASKS, Algorithm
-from udrl_experiments.search_space import shipped_space
+from udrl_experiments.search_space import read_space, shipped_space
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
 #: Those of the paper.
@@ -48,3 +50,10 @@ def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -
     space = shipped_space(environment)
     for number in range(100):
         build(Config, {"environment": environment} | space.draw("UDRL", number))
+
+
+def test_a_space_is_of_one_environment(tmp_path: Path) -> None:
+    file = tmp_path / "space.toml"
+    file.write_text('[UDRL]\nenvironment = ["CartPole-v1"]\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"environment in \[UDRL\]; .*ENV, 'Acrobot-v1'"):
+        read_space("Acrobot-v1", file)

@@ -147,6 +147,14 @@ def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: st
     assert said == "2.0"
 
 
+def test_a_source_without_runs_leaves_no_study(world: World, tmp_path: Path) -> None:
+    study = Study("try", [job(1)], world.report, lambda *_: None)
+    with pytest.raises(ConfigError, match=r"--runs-from .*nowhere: expected a folder of studies"):
+        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                say=lambda text: None, runs_from=[tmp_path / "nowhere"])  # fmt: skip
+    assert not (world.root / "try").exists()
+
+
 def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World) -> None:
     settings = flat(job(1).config) | {"command_strategy": "not.there:Missing"}
     with pytest.raises(ConfigError, match=r"not\.there:Missing"):

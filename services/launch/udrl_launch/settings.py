@@ -85,6 +85,25 @@ def read_steps(text: str) -> int:
     return steps
 
 
+def with_steps_as_numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings in which numbers of env steps are integers, e.g. 500000 for ``500K``.
+
+    Raises:
+        ConfigError: one of them is not a number of steps.
+    """
+    read = dict(values)
+    for name in _STEPS:
+        given = values.get(name)
+        if isinstance(given, float) and given.is_integer():  # 1e6 in Python and TOML
+            read[name] = int(given)
+        elif isinstance(given, str):
+            try:
+                read[name] = read_steps(given)
+            except ConfigError as error:
+                raise ConfigError(f"{name} = {error}") from error
+    return read
+
+
 class Settings(NamedTuple):
     """All settings of a command.
 
@@ -151,15 +170,7 @@ def gather(
             raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
         values[name] = value
     values["environment"] = environment
-    for name in _STEPS:
-        given = values.get(name)
-        if isinstance(given, float) and given.is_integer():  # 1e6 in Python and TOML
-            values[name] = int(given)
-        elif isinstance(given, str):
-            try:
-                values[name] = read_steps(given)
-            except ConfigError as error:
-                raise ConfigError(f"{name} = {error}") from error
+    values = with_steps_as_numbers(values)
     kinds = (Config, Budget, Fleet)
     refuse_unknown(values, tuple(name for kind in kinds for name in setting_names(kind)))
 
