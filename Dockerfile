@@ -28,7 +28,7 @@ COPY udrl udrl
 COPY proto proto
 COPY services services
 COPY experiments experiments
-# Nobody installs anything later.
+# Nothing is installed later.
 RUN /opt/udrl/bin/pip install --no-deps . \
     && /opt/udrl/bin/pip uninstall --yes pip setuptools
 
