@@ -12,7 +12,7 @@ from udrl_launch.settings import with_steps_as_numbers
 #: Algorithms of Stable-Baselines3 that UDRL is compared with.
 BaselineAlgorithm = Literal["DQN", "A2C", "PPO"]
 Algorithm = Literal["UDRL", BaselineAlgorithm]
-#: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has nothing that is not
+#: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has only what is
 #: in the paper.
 Participant = Literal["UDRL", "UDRL-paper", BaselineAlgorithm]
 #: Those of Figures 4 and 5.
@@ -117,7 +117,7 @@ class StudyPlan(NamedTuple):
         Args:
             task: whose environment and preset.
             seed: of the run.
-            paper: start from the preset that has nothing that is not in the paper.
+            paper: start from the preset that has only what is in the paper.
             changes: of the preset.
 
         Raises:

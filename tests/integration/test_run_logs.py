@@ -180,8 +180,8 @@ def test_a_resumed_run_continues_at_weights_and_biases(
         log(run_dir, "wandb")
         with (run_dir / "metrics.csv").open(newline="") as file:
             expected = [int(row["iteration"]) for row in csv.DictReader(file)]
-        told = [row["time/iterations"] for row in served.rows if "time/iterations" in row]
-        assert told == expected
+        logged = [row["time/iterations"] for row in served.rows if "time/iterations" in row]
+        assert logged == expected
         assert served.rows[-1]["eval/mean_reward"] == read_status(run_dir).closing_evaluation.mean  # type: ignore[union-attr]
         assert sum("eval/mean_reward" in row for row in served.rows[-2:]) == 1
         assert served.summary["ended_because"] == read_status(run_dir).ended_because
