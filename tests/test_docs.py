@@ -269,6 +269,13 @@ def test_messages_in_troubleshooting_are_those_of_the_code() -> None:
         assert is_in_the_code(message), message
 
 
+def test_every_extra_is_documented() -> None:
+    project = tomllib.loads(text_of("pyproject.toml"))["project"]
+    documented = names(section("docs/operations.md", "## Installing"), "extra")
+    extras = project["optional-dependencies"].keys() - {"dev", "docs", "fuzz"}
+    assert sorted(documented) == sorted(extras)
+
+
 def test_every_make_target_is_documented() -> None:
     documented = names(section("CONTRIBUTING.md", "## Set-up"), "target")
     assert sorted(documented) == sorted(f"make {target}" for target in make_targets())

@@ -25,6 +25,7 @@ from udrl.actions import Actions, random_actions
 from udrl.architecture import state_sizes
 from udrl.commands import Command
 from udrl.config import Config
+from udrl.environments.adapter import raised
 from udrl.environments.making import Environment, make_environment
 from udrl.episode import Episode, fault
 from udrl.errors import EnvironmentFault
@@ -233,7 +234,7 @@ class EpisodeGenerator:
 def _failure(where: str, command: Command, error: Exception) -> Failure:
     what = str(error)
     if not isinstance(error, EnvironmentFault):
-        what = f"{where}() raised {type(error).__name__}: {error}"
+        what = raised(where, error)
     fault = EnvironmentFault(
         f"the environment failed under command {command.id} (seed {command.environment_seed}): "
         f"{what}"

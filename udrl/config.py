@@ -197,7 +197,10 @@ def preset(name: str) -> dict[str, Any]:
         ConfigError: there is no preset of that name.
     """
     if name not in preset_names():
-        raise ConfigError(f"unknown preset {name!r}: expected one of {', '.join(preset_names())}")
+        near = difflib.get_close_matches(name, preset_names(), n=1)
+        hint = f"did you mean {near[0]!r}? Presets: " if near else "expected one of "
+        names = ", ".join((*preset_names(), "none"))
+        raise ConfigError(f"unknown preset {name!r}: {hint}{names}")
     text = (resources.files("udrl") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 

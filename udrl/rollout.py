@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from udrl.actions import random_actions
 from udrl.commands import Command
+from udrl.environments.adapter import raised
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.inference import State
@@ -177,7 +178,7 @@ class Rollout:
         except Exception as error:
             what = str(error)
             if not isinstance(error, EnvironmentFault):
-                what = f"{where}() raised {type(error).__name__}: {error}"
+                what = raised(where, error)
             raise EnvironmentFault(
                 f"the environment failed, {self.steps} steps into the episode of seed "
                 f"{self.command.environment_seed}: {what}"

@@ -474,8 +474,8 @@ def test_episodes_longer_than_the_first_storage_are_whole(n_environments: int) -
 
 NOT_FINITE = "not all finite numbers"
 FAULTS = {
-    "raises in reset": "reset() raised RuntimeError: no more worlds",
-    "raises in step": "step() raised RuntimeError: the world has ended",
+    "raises in reset": "reset() raised RuntimeError: no more worlds (test_acting.py, line ",
+    "raises in step": "step() raised RuntimeError: the world has ended (test_acting.py, line ",
     "returns four values": "step() returned a tuple of 4, expected (observation, reward, ",
     "observes a matrix": "step() returned as observation an array of float32, shape (2, 2), decl",
     "observes NaN": f"observations are {NOT_FINITE}",

@@ -44,7 +44,7 @@ def test_advice_for_what_is_unusual() -> None:
     for part in (
         "Episodes cannot be repeated from their seeds",
         "All random episodes return 0",
-        "All random episodes reach the limit of 50 steps",
+        "All random episodes reach the limit of 50 steps. A lower max_train_steps",
         "horizon_scale = 0.0001 scales values of about 50 to inputs of about 0.005",
     ):
         assert part in advice

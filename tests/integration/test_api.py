@@ -160,5 +160,8 @@ def test_what_cannot_be_trained(tmp_path: Path) -> None:
         udrl.train("CartPole-v1", batchsize=3)
     with pytest.raises(ConfigError, match="resume needs run_dir"):
         udrl.train("CartPole-v1", resume=True)
+    for given in ({"on_evaluation": 3}, {"on_end": ""}, {"callbacks": [print, None]}):
+        with pytest.raises(ConfigError, match="is not a function"):
+            udrl.train("CartPole-v1", run_dir=tmp_path / "run", **given)
     with pytest.raises(UdrlError, match="cannot be made"):
         udrl.train("Nothing-v0", run_dir=tmp_path / "run")

@@ -22,6 +22,13 @@ def refusal(process: Cli) -> tuple[int, str]:
     ("given", "expected"),
     [
         (["train", "NoSuchLander-v9"], "NoSuchLander"),
+        (["train", "CartPole"], "'CartPole' has no version"),
+        (["train", "CartPole"], "did you mean 'CartPole-v1'?"),
+        (["train", "CartPole-v1", "--preset", "ani"], "did you mean 'any'? Presets: "),
+        (["train", "CartPole-v1", "--preset", "xyz"], ", any, none"),
+        (["train", "CartPole-v1", "--metrics-port", "99999"], "99999 is not from 0 to 65535"),
+        (["metrics", "nowhere"], "nowhere holds no run"),
+        (["obedience", "nowhere", "--desired-returns", "16"], "'16' is not LOW:HIGH"),
         (["train", "CartPole-v1", "--set", "batchsize=3"], "did you mean 'batch_size'"),
         (["train", "CartPole-v1", "--set", "batch_size=0"], "batch_size = 0"),
         (["train", "CartPole-v1", "--set", "batch_size=many"], "batch_size = 'many'"),

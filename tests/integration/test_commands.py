@@ -83,7 +83,7 @@ def test_budget_spent_in_the_warm_up_trains_nothing(
 ) -> None:
     code, out, error = cli(*arguments(TOY, 1, tmp_path / "run"), "--in-process").finish()
     assert code == 0, error
-    assert "none; the budget was spent in the warm-up" in error
+    assert "none: the warm-up spent the budget; raise --max-env-steps" in error
     assert json.loads(out)["weights_version"] == 0, "with --json there is nothing else"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from udrl_launch.subcommands.runs_commands import _narrow
+from udrl_launch.subcommands.train_command import _options_to_repeat, train
 
 
 def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -159,3 +160,10 @@ cli.main()
         [sys.executable, "-c", program], env=unset, capture_output=True, timeout=30
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"1\n", b"")
+
+
+def test_the_command_that_resumes_repeats_what_the_run_does_not_remember(tmp_path: Path) -> None:
+    given = ["--run-dir", str(tmp_path / "run"), "--seed", "3", "--log", "tensorboard"]
+    context = train.make_context("train", ["X-v0", *given, "--actors", "1", "--in-process"])
+    with context:
+        assert _options_to_repeat() == ["--actors", "1", "--in-process", "--log", "tensorboard"]

@@ -1,7 +1,10 @@
 """The wrapper that adapts an environment to the algorithm's spaces, and checks what it returns."""
 
 import logging
+import sysconfig
+import traceback
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +21,8 @@ _STEP = "(observation, reward, terminated, truncated, info)"
 _LARGEST = float(np.finfo(np.float32).max)
 #: Python's message if an environment's step() has the interface of Gym before version 0.26.
 _OLD_STEP = "not enough values to unpack (expected 5, got 4)"
+#: Folders of Python, of installed packages, and of this one.
+_INSTALLED = (*set(sysconfig.get_paths().values()), str(Path(__file__).parents[1]))
 
 
 class Adapter(gym.Wrapper[Any, Any, Any, Any]):
@@ -99,6 +104,18 @@ def close(env: gym.Env[Any, Any]) -> None:
         env.close()
     except Exception as error:  # noqa: BLE001 - the environment is foreign code
         log.warning("environment %s failed in close(): %s: %s", env, type(error).__name__, error)
+
+
+def raised(where: str, error: Exception) -> str:
+    """Return what a method of an environment raised, and the line of the environment's code.
+
+    That is the innermost line outside of installed packages, or the innermost one of all.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(_INSTALLED)]
+    found = (own or frames)[-1:]
+    place = "".join(f" ({Path(f.filename).name}, line {f.lineno})" for f in found)
+    return f"{where}() raised {type(error).__name__}: {error}{place}"
 
 
 def _wrong(where: str, returned: str, expected: str) -> EnvironmentFault:

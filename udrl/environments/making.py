@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import gymnasium as gym
 import msgspec
+from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
 from msgspec import Meta
 
 from udrl.actions import ActionSpace
@@ -92,6 +93,11 @@ def make_environment(config: Config) -> Adapter:
     limit: dict[str, Any] = {}
     if config.max_episode_steps is not None:
         limit["max_episode_steps"] = config.max_episode_steps
+    if (latest := _latest_version(name)) != name:
+        raise UnsupportedEnvironment(
+            f"environment {name!r} has no version, and the latest one depends on what is "
+            f"installed; did you mean {latest!r}?"
+        )
     try:
         with indexed(int(os.environ.get(INDEX, "0"))):
             env: Environment = gym.make(
@@ -107,6 +113,18 @@ def make_environment(config: Config) -> Adapter:
     if config.observe_time and env.spec is not None and env.spec.max_episode_steps is not None:
         env = ObserveTime(env, env.spec.max_episode_steps)
     return adapt(ObservePrevious(env) if config.observe_previous else env, name, config.actions)
+
+
+def _latest_version(name: str) -> str:
+    """Return the latest version of a registered environment; any other name unchanged."""
+    if name in gym.registry or ":" in name:
+        return name
+    try:
+        namespace, base, version = parse_env_id(name)
+    except gym.error.Error:
+        return name
+    latest = find_highest_version(namespace, base)
+    return get_env_id(namespace, base, latest) if version is None and latest is not None else name
 
 
 def _wrapped(env: Environment, name: str) -> Environment:

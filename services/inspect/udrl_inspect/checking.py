@@ -198,8 +198,8 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
         )
     if all(e.truncated and not e.terminated for e in episodes):
         advice.append(
-            f"All random episodes reach the limit of {lengths[0]} steps; a lower "
-            f"max_episode_steps shortens the warm-up."
+            f"All random episodes reach the limit of {lengths[0]} steps. A lower max_train_steps "
+            f"shortens episodes in training, but not in evaluations."
         )
     for name, scale, size in (
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),

@@ -103,6 +103,11 @@ def train(
     """
     if resume and run_dir is None:
         raise ConfigError("resume needs run_dir, the directory of the run to resume")
+    to_call = [callbacks] if callable(callbacks) else list(callbacks)
+    _require_functions("callbacks", to_call)
+    _require_functions("on_iteration, on_evaluation, on_end", [
+        function for function in (on_iteration, on_evaluation, on_end) if function is not None
+    ])  # fmt: skip
     chosen = None if run_dir is None else Path(run_dir).absolute()
     is_resumed = resume and chosen is not None and exists(chosen)
     gathered = gather(
@@ -115,7 +120,7 @@ def train(
     stop = threading.Event()
     after = last_iteration(folder) if is_resumed else -1
     watcher = _Callbacks(folder, after, gathered.config.evaluation.eval_episodes, stop)
-    watcher.on_status += [callbacks] if callable(callbacks) else list(callbacks)
+    watcher.on_status += to_call
     watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation
     try:
         with opened([log] if isinstance(log, str) else log, folder) as run_logs:
@@ -136,6 +141,12 @@ def train(
     if status.problem:
         raise UdrlError(status.problem)
     return Trained(folder, status)
+
+
+def _require_functions(name: str, values: Iterable[object]) -> None:
+    for value in values:
+        if not callable(value):
+            raise ConfigError(f"{name}: {value!r} is not a function")
 
 
 class _Callbacks:

@@ -76,6 +76,8 @@ def _one_line(error: click.ClickException) -> str:
     """Return click's message in the form of the other errors."""
     message = error.format_message().removesuffix(".")
     message = re.sub(r"\.? \(?Did you mean (.*\?)\)?$", r"; did you mean \1", message)
+    message = re.sub(r"is not in the range (\S+?)<=x<=(\S+)$", r"is not from \1 to \2", message)
+    message = re.sub(r"is not in the range x>=(\S+)$", r"is not \1 or more", message)
     if isinstance(error, click.UsageError) and error.ctx and type(error) is not click.BadParameter:
         message += f" (see {error.ctx.command_path} --help)"
     return message[:1].lower() + message[1:]

@@ -5,7 +5,7 @@ import shlex
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Protocol
@@ -100,6 +100,7 @@ def train(
     keys: Path | None = None,
     audit: float = 0.0,
     watcher: Watcher | None = None,
+    resume_options: Sequence[str] = (),
 ) -> Status:
     """Train an agent and return the final status of its run.
 
@@ -115,6 +116,7 @@ def train(
         keys: folder with the keys of all roles (``udrl keys create``). None: no authentication.
         audit: share of the episodes that are audited, 0 to 1.
         watcher: receives the status.
+        resume_options: further options of the command that resumes the run, for the message.
 
     Raises:
         UdrlError: the run cannot be started or cannot continue.
@@ -150,19 +152,9 @@ def train(
     finally:
         services.end()
     if stop.is_set():
-        raise Interrupted(
-            "stopped; resume with: "
-            + shlex.join(
-                [
-                    "udrl",
-                    "train",
-                    settings.config.environment,
-                    "--run-dir",
-                    shown(run_dir),
-                    "--resume",
-                ]
-            )
-        )
+        resume_with = ["udrl", "train", settings.config.environment, "--run-dir", shown(run_dir)]
+        command = shlex.join([*resume_with, "--resume", *resume_options])
+        raise Interrupted(f"stopped; resume with: {command}")
     return read_status(run_dir)
 
 

@@ -147,9 +147,9 @@ class LearnerService:
             if in_vain > len(_PAUSES_S):
                 raise Refused(
                     refusal.code,
-                    f"learner {self._name} restarted {in_vain} times from weights version "
-                    f"{began_with} without progress: {refusal}; the replay service is "
-                    f"inconsistent: stop it and restart it with --resume",
+                    f"learner {self._name} failed {in_vain} times to train the version after "
+                    f"{began_with}: {refusal}; the replay service is inconsistent: stop it and "
+                    f"restart it with --resume",
                 )
             if in_vain:
                 self._stop.wait(_PAUSES_S[in_vain - 1])

@@ -36,6 +36,8 @@ class MlflowWriter:
             raise ConfigError(
                 'MLflow needs mlflow-skinny; install it with: pip install "udrl[mlflow]"'
             ) from error
+        # By default MLflow retries for minutes before it reports that a server is unreachable.
+        os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
         uri = mlflow.get_tracking_uri()
         try:
             self._client = mlflow.MlflowClient()

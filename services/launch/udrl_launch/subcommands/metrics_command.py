@@ -41,6 +41,8 @@ def metrics(
     """
     where = place(run_dir, connect, run_id, keys)
     log_to_stderr()
+    if isinstance(where, Path):
+        status_from(where, keys)  # a run that cannot be read would be down for ever
 
     def service(stop: threading.Event) -> None:
         with closing(Exporter(partial(_ask, where, keys), host, port)) as exporter:

@@ -144,8 +144,10 @@ class _Returns(click.ParamType):  # type: ignore[type-arg]
     ) -> tuple[float, float]:
         if isinstance(value, tuple):  # converted already
             return value
-        low, _, high = str(value).partition(":")
-        ends = RETURN.convert(low, param, ctx), RETURN.convert(high, param, ctx)
+        low, colon, high = str(value).partition(":")
+        ends = (math.nan, math.nan)
+        if colon:
+            ends = RETURN.convert(low, param, ctx), RETURN.convert(high, param, ctx)
         if not ends[0] < ends[1]:
             self.fail(f"{value!r} is not LOW:HIGH with LOW below HIGH, e.g. -100:250", param, ctx)
         return ends

@@ -39,6 +39,12 @@ from udrl_show.run_logs import WRITERS, opened
 
 log = logging.getLogger("udrl")
 
+_COMMAND_LINE = click.core.ParameterSource.COMMANDLINE
+_NOT_STORED = {
+    "actors", "envs_per_actor", "hang_timeout", "in_process", "listen", "insecure", "keys", "audit",
+    "logs", "metrics_port", "metrics_host", "as_json",
+}  # fmt: skip
+
 
 @click.command()
 @click.argument("env", shell_complete=completions.environments)
@@ -112,7 +118,7 @@ def train(
             status = run_training(
                 settings, run_dir, stop, resume=resume, in_process=in_process,
                 allow_inexact=allow_inexact, listen=listen, insecure=insecure, keys=keys,
-                audit=audit, watcher=watchers,
+                audit=audit, watcher=watchers, resume_options=_options_to_repeat(),
             )  # fmt: skip
             watchers.show(status)
         _finish(run_dir, status, run_logs)
@@ -122,6 +128,20 @@ def train(
             raise UdrlError(printable(status.problem))
 
     return run_service(service, PARENTS_GRACE_S)
+
+
+def _options_to_repeat() -> list[str]:
+    """Return the options of this command that the run directory does not remember."""
+    context = click.get_current_context()
+    words = []
+    for option in context.command.params:
+        name = option.name or ""
+        if name not in _NOT_STORED or context.get_parameter_source(name) is not _COMMAND_LINE:
+            continue
+        value = context.params[name]
+        for one in value if isinstance(value, tuple) else (value,):
+            words += [option.opts[0]] if one is True else [option.opts[0], str(one)]
+    return words
 
 
 def warn_of_idle_environments(settings: Settings) -> None:
@@ -157,7 +177,7 @@ def _finish(run_dir: Path, status: Status, run_logs: Sequence[RunLog]) -> None:
         weights = shown(run_dir / "weights.safetensors")
         lines.append(("weights", f"{weights} (version {status.weights_version})"))
     else:
-        lines.append(("weights", "none; the budget was spent in the warm-up"))
+        lines.append(("weights", "none: the warm-up spent the budget; raise --max-env-steps"))
     lines.append(("metrics", shown(run_dir / "metrics.csv")))
     try:
         curve = shown(draw(run_dir, status.environment))
