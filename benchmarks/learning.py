@@ -70,13 +70,13 @@ def train(env: str, seed: int, run_dir: Path) -> Trained:
 
 def row(env: str, run: Trained) -> str:
     """Return a run as a row of the table."""
-    closing = run.status.closing_evaluation
-    assert closing is not None
+    final = run.status.final_evaluation
+    assert final is not None
     best = max(run.rows, key=lambda r: float(r["eval_mean"]))
-    half = (closing.ci95_high - closing.ci95_low) / 2
+    half = (final.ci95_high - final.ci95_low) / 2
     greedy_half = (run.greedy["ci95_high"] - run.greedy["ci95_low"]) / 2
     return (
-        f"| {env} | {run.seed} | {run.status.env_steps:,} | {closing.mean:.1f} ± {half:.1f} | "
+        f"| {env} | {run.seed} | {run.status.env_steps:,} | {final.mean:.1f} ± {half:.1f} | "
         f"{run.greedy['mean']:.1f} ± {greedy_half:.1f} | {float(best['eval_mean']):.1f} at "
         f"{int(best['eval_at_env_steps']):,} | {run.status.wall_s / 60:.1f} |"
     )

@@ -113,9 +113,9 @@ def _evaluations(job: Job, run_dir: Path, status: Status) -> list[EvaluationReco
                 float(r["eval_std"]))
             for r in csv.DictReader(file) if r["eval_mean"]
         ]  # fmt: skip
-    closing = status.closing_evaluation
-    if closing is not None:
-        rows.append(row(closing.env_steps, status.wall_s, closing.mean, closing.std))
+    final = status.final_evaluation
+    if final is not None:
+        rows.append(row(final.env_steps, status.wall_s, final.mean, final.std))
     return rows
 
 

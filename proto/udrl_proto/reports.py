@@ -104,7 +104,7 @@ class Status(Message, frozen=True, kw_only=True):
     """
 
     run_id: Name
-    state: Literal["running", "closing", "ended", "failed", "stopped"]
+    state: Literal["running", "finishing", "ended", "failed", "stopped"]
     environment: Text
     iteration: Number
     env_steps: Number
@@ -125,7 +125,7 @@ class Status(Message, frozen=True, kw_only=True):
     weights_kept: tuple[Number, ...]
     loss: float | None
     evaluation: EvaluationStatus | None
-    closing_evaluation: EvaluationStatus | None
+    final_evaluation: EvaluationStatus | None
     exact: bool
     inexact_reason: Text
     useful_concurrency: Number

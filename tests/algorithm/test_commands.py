@@ -174,7 +174,7 @@ def test_a_training_command_is_drawn_again_without_its_buffer() -> None:
         )
 
 
-def test_a_closing_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
+def test_a_final_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
     sample, buffer = sampler(lead=3, eval_episodes=50), buffer_of([1.0, 3.0])
     final, usual = sample.evaluate_final(9, buffer), sample.evaluate(9, buffer)
     assert {command.weights_version for command in final} == {9}

@@ -387,14 +387,14 @@ def test_the_cursor_reads_the_curve(
 ) -> None:
     page = pages(board(ended_run))
     said, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
-    closing = read_status(ended_run).closing_evaluation
-    assert closing is not None
+    final = read_status(ended_run).final_evaluation
+    assert final is not None
     expect(said).to_contain_text("best evaluation", timeout=SOON)
     summary = said.inner_text()
     box = curve.bounding_box()
     assert box is not None
     curve.hover(position={"x": box["width"] - 2, "y": 20})
-    expect(said).to_contain_text(f"final evaluation {closing.mean:,.1f}".removesuffix(".0"))
+    expect(said).to_contain_text(f"final evaluation {final.mean:,.1f}".removesuffix(".0"))
     page.mouse.move(0, 0)
     expect(said).to_have_text(summary)
 

@@ -51,8 +51,8 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
     code, out, error = cli("evaluate", str(run_dir), "--episodes", "5", "--json").finish()
     assert code == 0, error
     report = json.loads(out)
-    assert ended.closing_evaluation is not None
-    assert report["mean"] == ended.closing_evaluation.mean
+    assert ended.final_evaluation is not None
+    assert report["mean"] == ended.final_evaluation.mean
 
     code, out, error = cli(
         "evaluate", str(run_dir), "--episodes", "3", "--greedy", "--desired-return", "30",

@@ -77,4 +77,4 @@ def test_resuming_an_ended_run_with_the_same_budget_changes_nothing(
     again = run(toy(), 300, run_dir=run_dir, resume=True)
     assert digests(again) == digests(first)
     assert again.commands == first.commands
-    assert again.closing_evaluation == first.closing_evaluation
+    assert again.final_evaluation == first.final_evaluation

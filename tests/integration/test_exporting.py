@@ -52,7 +52,7 @@ def test_the_folder_holds_the_runs_agent(ended_run: Path, folder: Path) -> None:
 
 def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
     card = ModelCard.load(folder / "README.md")
-    last = read_status(ended_run).closing_evaluation
+    last = read_status(ended_run).final_evaluation
     assert last is not None
     (result,) = card.data.eval_results
     assert result.dataset_name == "CartPole-v1"

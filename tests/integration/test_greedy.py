@@ -28,7 +28,7 @@ def greedy(agent: Agent) -> Command:
 
 @pytest.fixture
 def sampled(ended_run: Path) -> Evaluation:
-    found = read_status(ended_run).closing_evaluation
+    found = read_status(ended_run).final_evaluation
     assert found is not None
     return Evaluation(found.mean, found.std, found.ci95_low, found.ci95_high, found.episodes)
 

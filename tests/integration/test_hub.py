@@ -168,7 +168,7 @@ def test_an_agent_is_uploaded_in_one_commit_and_loaded_again(
     assert str(ended_run).encode() not in everything
 
     text = hub.files["README.md"].decode()
-    last = read_status(ended_run).closing_evaluation
+    last = read_status(ended_run).final_evaluation
     assert last is not None
     card: Any = ModelCard(text).data
     (result,) = card.eval_results

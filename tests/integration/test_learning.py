@@ -10,5 +10,5 @@ def test_cartpole_passes_200(run: Callable[..., Status]) -> None:
     settings = {k: v for k, v in preset("CartPole-v1").items() if k != "max_env_steps"}
     settings |= {"eval_every": 10_000, "eval_episodes": 20, "eval_temperature": 0.0}
     status = run(build(Config, settings), 200_000, stop_return=200.0)
-    assert status.closing_evaluation is not None
-    assert status.closing_evaluation.mean > 200
+    assert status.final_evaluation is not None
+    assert status.final_evaluation.mean > 200

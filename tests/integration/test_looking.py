@@ -204,8 +204,8 @@ def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
     assert summary["state"] == "ended"
     assert summary["environment"] == "CartPole-v1"
     assert summary["env_steps"] == status.env_steps
-    assert status.closing_evaluation is not None
-    assert summary["best_return"] >= status.closing_evaluation.mean
+    assert status.final_evaluation is not None
+    assert summary["best_return"] >= status.final_evaluation.mean
     table = call("runs", ended_run.parent).splitlines()
     assert table[0].split() == [
         "state", "environment", "seed", "env", "steps", "best", "return", "changed", "because",

@@ -53,7 +53,7 @@ def log(run_dir: Path, *names: str, stopped: bool = False) -> list[str]:
     """Log a run as ``udrl train`` does; return the places of the logs."""
     status = read_status(run_dir)
     if stopped:
-        status = msgspec.structs.replace(status, state="stopped", closing_evaluation=None)
+        status = msgspec.structs.replace(status, state="stopped", final_evaluation=None)
     with opened(names, run_dir) as logs:
         for one in logs:
             one.show(status)
@@ -182,7 +182,7 @@ def test_a_resumed_run_continues_at_weights_and_biases(
             expected = [int(row["iteration"]) for row in csv.DictReader(file)]
         logged = [row["time/iterations"] for row in served.rows if "time/iterations" in row]
         assert logged == expected
-        assert served.rows[-1]["eval/mean_reward"] == read_status(run_dir).closing_evaluation.mean  # type: ignore[union-attr]
+        assert served.rows[-1]["eval/mean_reward"] == read_status(run_dir).final_evaluation.mean  # type: ignore[union-attr]
         assert sum("eval/mean_reward" in row for row in served.rows[-2:]) == 1
         assert served.summary["ended_because"] == read_status(run_dir).ended_because
     assert {(o["id"], o["resume"]) for o in served.options} == {

@@ -96,9 +96,9 @@ def test_a_run_of_a_study_is_the_run_of_its_settings(
     (folder,) = runs_of(tmp_path, "udrl")
     config: dict[str, Any] = json.loads((folder / "job.json").read_text())["config"]
     expected = reference(build(Config, config), STEPS)
-    *held, closing = rows(folder / "evaluations.csv")
+    *held, final = rows(folder / "evaluations.csv")
     assert [float(r["mean"]) for r in held] == [e.mean for e in expected.evaluations.values()]
-    assert int(closing["env_steps"]) == expected.env_steps
+    assert int(final["env_steps"]) == expected.env_steps
 
 
 def test_the_store_of_an_unfinished_run_says_how_far_it_is(ended_run: Path, tmp_path: Path) -> None:

@@ -38,14 +38,28 @@ def masked(output: str) -> list[str]:
     return [line for line in lines if line not in ("", "...")]
 
 
+def left_out(printed: list[str], page: list[str]) -> list[str]:
+    """Return the printed lines that the page does not show; all that it shows must be printed."""
+    lines = iter(printed)
+    missing = []
+    for shown in page:
+        for line in lines:
+            if line == shown:
+                break
+            missing.append(line)
+        else:
+            raise AssertionError(f"the page has {shown!r}, which is not printed:\n{printed}")
+    return [*missing, *lines]
+
+
 def follow(command: list[str], folder: Path) -> str:
-    """Run one command of the page, and return all that it prints."""
+    """Run one command of the page, and return what it prints but for its progress."""
     program = {"udrl": [sys.executable, "-m", "udrl_launch"], "python": [sys.executable]}
     done = subprocess.run(
-        program[command[0]] + command[1:], cwd=folder, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, timeout=200, check=False,
+        program[command[0]] + command[1:], cwd=folder, capture_output=True, text=True, timeout=200,
+        check=False,
     )  # fmt: skip
-    assert done.returncode == 0, f"{shlex.join(command)}:\n{done.stdout}"
+    assert done.returncode == 0, f"{shlex.join(command)}:\n{done.stdout}{done.stderr}"
     return done.stdout
 
 
@@ -65,13 +79,12 @@ def test_the_page_runs_and_its_agents_are_as_it_says(tmp_path: Path) -> None:
                 if command[0] != "pip":
                     printed = follow(command, tmp_path)
         else:
-            lines = iter(masked(printed))
-            for line in masked(text):
-                assert line in lines, f"the page has {line!r}, printed is:\n{printed}"
+            differences = left_out(masked(printed), masked(text))
+            assert not differences or "..." in text, f"the page lacks {differences}:\n{printed}"
 
     first, second = (tmp_path / "runs" / name for name in ("first", "second"))
     for run_dir in (first, second):
-        evaluation = read_status(run_dir).closing_evaluation
+        evaluation = read_status(run_dir).final_evaluation
         assert evaluation is not None
         assert evaluation.mean > 14  # of 16; random play obtains 5.4
     ranges = [obedience(run_dir)["obeyed"] for run_dir in (first, second)]

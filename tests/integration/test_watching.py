@@ -69,7 +69,7 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
         assert hyperparameters(run_dir)["learning_rate"] == SMALL["learning_rate"]
         assert hyperparameters(run_dir)["hidden"] == "[16, 16]"
         assert hyperparameters(run_dir)["max_env_steps"] == budget
-        last = read_status(run_dir).closing_evaluation
+        last = read_status(run_dir).final_evaluation
         assert last is not None
         for tag in ("eval/mean_reward", "eval/ci95_low", "eval/ci95_high"):
             assert told[tag].pop()[0] == last.env_steps

@@ -127,7 +127,7 @@ class Result(NamedTuple):
     weights: bytes
     replay: bytes
     evaluation: Evaluation | None
-    closing: Evaluation | None
+    final: Evaluation | None
 
 
 def reference(lead: int, max_env_steps: int) -> Result:
@@ -167,25 +167,25 @@ def reference(lead: int, max_env_steps: int) -> Result:
                 evaluation = summarise(returns)
         steps.append(sum(e.length for done in explored for e in done))
     digest = replay_digest(map(episode_digest, buffer(i)))
-    closing = None
+    final = None
     if i > 0:
         last = ReplayBuffer(settings.buffer, map(entry, buffer(i)))
-        closing = summarise([e.episode_return for e in carry_out(sample.evaluate_final(i, last))])
-    return Result(i, steps[-1], weights[-1], digest, evaluation, closing)
+        final = summarise([e.episode_return for e in carry_out(sample.evaluate_final(i, last))])
+    return Result(i, steps[-1], weights[-1], digest, evaluation, final)
 
 
 def result(run: RunState) -> Result:
     """Say where a run stands, in the terms of :func:`reference`."""
     version = run.store.version(run.progress.latest_version)
-    last = run.store.last_evaluation(closing=False)
-    closing = run.store.last_evaluation(closing=True)
+    last = run.store.last_evaluation(is_final=False)
+    final = run.store.last_evaluation(is_final=True)
     return Result(
         run.progress.iteration,
         run.progress.env_steps,
         version.weights if version else b"",
         replay_digest(run.digests[e.id] for e in run.buffer),
         last.evaluation if last else None,
-        closing.evaluation if closing else None,
+        final.evaluation if final else None,
     )
 
 
@@ -222,7 +222,7 @@ def work(run: StoredRun) -> None:
 
 def finish(run: StoredRun) -> None:
     """Work until the run has ended."""
-    while run.progress.state in ("running", "closing"):
+    while run.progress.state in ("running", "finishing"):
         work(run)
 
 

@@ -19,8 +19,8 @@ def test_no_statement_reads_a_whole_table_that_grows(make_run: Callable[..., Sto
     run.store._db.set_trace_callback(statements.add)
     for _ in range(10):
         work(run)
-    run.store.last_evaluation(closing=False)
-    run.store.last_evaluation(closing=True)
+    run.store.last_evaluation(is_final=False)
+    run.store.last_evaluation(is_final=True)
     run.store.metrics(after=run.progress.iteration - 1)
     run.store._db.set_trace_callback(None)
 

@@ -61,7 +61,7 @@ def read_everything(run_dir: Path) -> object:
             store.commands(cancelled=True),
             store.commands(cancelled=False),
             store.metrics(-1),
-            store.last_evaluation(closing=True),
+            store.last_evaluation(is_final=True),
         )
 
 
@@ -291,7 +291,7 @@ from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
 run = StoredRun(Store(Path(sys.argv[1])), Budget(max_env_steps=3000))
-while run.progress.state in ("running", "closing"):
+while run.progress.state in ("running", "finishing"):
     work(run)
     print(run.progress.accepted, flush=True)
 """

@@ -55,7 +55,7 @@ def test_service_that_runs_needs_no_more_files(tmp_path: Path) -> None:
         no_more_files(),
     ):
         run = StoredRun(store, Budget(max_env_steps=300))
-        while run.progress.state in ("running", "closing"):
+        while run.progress.state in ("running", "finishing"):
             work(run)
             metrics.update(run.progress.iteration)
         assert result(run) == reference(0, 300)

@@ -42,7 +42,7 @@ def test_status_of_a_new_run_is_empty_but_complete(make_run: MakeRun) -> None:
     assert (seen.state, seen.iteration, seen.env_steps) == ("running", 0, 0)
     assert (seen.buffer.episodes, seen.buffer.return_mean) == (0, None)
     assert (seen.weights_version, seen.weights_sha256, seen.loss) == (0, "", None)
-    assert (seen.evaluation, seen.closing_evaluation, seen.time_left_s) == (None, None, None)
+    assert (seen.evaluation, seen.final_evaluation, seen.time_left_s) == (None, None, None)
     assert seen.commands.outstanding == seen.commands.issued == config().commands.n_warm_up_episodes
     assert seen.useful_concurrency == config().commands.n_episodes_per_iter
     assert decode(encode(seen), Status) == seen
@@ -58,17 +58,17 @@ def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
     seen = shown(run)
     returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
     version = run.store.version(run.progress.iteration)
-    closing = run.store.last_evaluation(closing=True)
+    final = run.store.last_evaluation(is_final=True)
     assert version is not None
-    assert closing is not None
+    assert final is not None
     assert seen.state == "ended"
     assert seen.weights_version == seen.iteration == run.progress.iteration
     assert seen.weights_sha256 == version.digest.hex()
     assert seen.loss == version.loss
     assert (seen.buffer.return_min, seen.buffer.return_max) == (returns[0], returns[-1])
     assert seen.buffer.return_mean == math.fsum(returns) / len(returns)
-    assert seen.closing_evaluation is not None
-    assert seen.closing_evaluation.mean == closing.evaluation.mean
+    assert seen.final_evaluation is not None
+    assert seen.final_evaluation.mean == final.evaluation.mean
     assert seen.evaluation is not None
     assert seen.time_left_s is None
     assert decode(encode(seen), Status) == seen
@@ -200,7 +200,7 @@ def test_line_of_an_evaluated_iteration_carries_the_evaluation(
     run = make_run(max_env_steps=60)
     finish(run)
     write_metrics(run, tmp_path)
-    evaluation = run.store.last_evaluation(closing=False)
+    evaluation = run.store.last_evaluation(is_final=False)
     assert evaluation is not None
     found = lines(tmp_path)
     line = found[evaluation.iteration]

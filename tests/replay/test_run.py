@@ -453,8 +453,8 @@ def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) ->
 def test_closing_episode_delivered_again_is_a_duplicate(make_run: MakeRun) -> None:
     run = make_run(max_env_steps=20)
     until_closing(run)
-    closing = outstanding(run)
-    assert [deliver(run, c) for c in closing + closing] == ["accepted"] * 2 + ["duplicate"] * 2
+    final = outstanding(run)
+    assert [deliver(run, c) for c in final + final] == ["accepted"] * 2 + ["duplicate"] * 2
     assert run.progress.state == "ended"
 
 
@@ -481,7 +481,7 @@ def test_resumed_run_completes_what_had_arrived_before_its_end(
     *others, last = [c for c in outstanding(run) if c.iteration == 1]
     for command in [*others, *(c for c in outstanding(run) if c.iteration == 2), last]:
         deliver(run, command)
-    assert (run.progress.state, run.progress.iteration) == ("closing", 1)
+    assert (run.progress.state, run.progress.iteration) == ("finishing", 1)
     run = reopened(run, Budget(max_env_steps=budget + 40))
     assert (run.progress.state, run.progress.iteration) == ("running", 2)
 
@@ -489,7 +489,7 @@ def test_resumed_run_completes_what_had_arrived_before_its_end(
 def test_evaluation_that_reaches_the_stop_return_ends_the_run(make_run: MakeRun) -> None:
     run = make_run(stop_return=0.0)
     finish(run)
-    evaluation = run.store.last_evaluation(closing=False)
+    evaluation = run.store.last_evaluation(is_final=False)
     assert evaluation is not None
     assert evaluation.iteration == run.progress.iteration == 1
 
@@ -535,7 +535,7 @@ def test_best_version_is_kept(make_run: MakeRun) -> None:
     best: dict[int, float] = {}
     while run.progress.state != "ended":
         work(run)
-        last = run.store.last_evaluation(closing=False)
+        last = run.store.last_evaluation(is_final=False)
         if last is not None:
             best.setdefault(last.iteration, last.evaluation.mean)
     expected = min(best, key=lambda version: (-best[version], version))
@@ -614,14 +614,14 @@ def test_failed_run_tries_again_when_it_is_resumed(make_run: MakeRun, reopened: 
     assert result(run) == reference(0, 20)
 
 
-def test_failed_closing_evaluation_is_tried_again(make_run: MakeRun, reopened: MakeRun) -> None:
+def test_failed_final_evaluation_is_tried_again(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run(max_env_steps=20)
     until_closing(run)
     for actors in ("ab", "a"):
         fail(run, outstanding(run)[0].id, *actors)
     assert run.progress.state == "failed"
     run = reopened(run)
-    assert run.progress.state == "closing"
+    assert run.progress.state == "finishing"
     finish(run)
     assert result(run) == reference(0, 20)
 

@@ -193,7 +193,7 @@ def test_page_of_episodes_ends_before_one_that_is_not_kept(store: Store) -> None
 
 
 def test_last_evaluation_is_of_its_sort(store: Store) -> None:
-    assert store.last_evaluation(closing=False) is None
+    assert store.last_evaluation(is_final=False) is None
     rows = [
         EvaluationRow(iteration, closing, 10 * iteration, 1.5, 3, summarise([1.0, 2.0]))
         for iteration, closing in [(2, False), (7, False), (9, True)]
@@ -201,8 +201,8 @@ def test_last_evaluation_is_of_its_sort(store: Store) -> None:
     with store.transaction():
         for row in rows:
             store.add_evaluation(row)
-    assert store.last_evaluation(closing=False) == rows[1]
-    assert store.last_evaluation(closing=True) == rows[2]
+    assert store.last_evaluation(is_final=False) == rows[1]
+    assert store.last_evaluation(is_final=True) == rows[2]
 
 
 def test_forgotten_blobs_leave_digest_and_loss(store: Store) -> None:

@@ -32,7 +32,7 @@ STATUS = Status(
         iteration=5, env_steps=10_000, mean=42.0, std=3.0, ci95_low=41.0, ci95_high=43.0,
         episodes=100,
     ),
-    closing_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
+    final_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
     problem="", ended_because="", advice="",
     audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
@@ -236,11 +236,11 @@ def test_terminal_gets_a_panel() -> None:
     assert "\x1b" in output.getvalue()
 
 
-def test_panel_ends_with_the_closing_evaluation_and_takes_names_as_they_are() -> None:
+def test_panel_ends_with_the_final_evaluation_and_takes_names_as_they_are() -> None:
     assert STATUS.evaluation is not None
     closed = msgspec.structs.replace(
         STATUS,
-        closing_evaluation=msgspec.structs.replace(STATUS.evaluation, mean=77.0),
+        final_evaluation=msgspec.structs.replace(STATUS.evaluation, mean=77.0),
         waiting=(Waiting(who="actor [/x]", on="learner", why="[bold]", seconds=2.0),),
     )
     console = Console(width=100, file=io.StringIO())

@@ -26,7 +26,7 @@ FULL = msgspec.structs.replace(
                     last_seen_s=0.5),
     ),
     quarantined=(Quarantined(id="liar", why="lied"),),
-    closing_evaluation=STATUS.evaluation,
+    final_evaluation=STATUS.evaluation,
 )  # fmt: skip
 
 

@@ -133,8 +133,8 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
 def stored_evaluation(store: Store, agent: Agent) -> EvaluationRow | None:
     """Return the run's own evaluation of an agent; None if there was none."""
     # With a lead the same weights are evaluated in a later iteration.
-    return store.evaluation_of(agent.version, closing=True) or store.evaluation_of(
-        agent.version + agent.config.lead, closing=False
+    return store.evaluation_of(agent.version, is_final=True) or store.evaluation_of(
+        agent.version + agent.config.lead, is_final=False
     )
 
 

@@ -38,8 +38,8 @@ def caution(agent: Agent, run_dir: Path, command: Command, returns: Sequence[flo
     with closing(Store(run_dir, read_only=True)) as store:
         found = (
             stored_evaluation(store, agent)
-            or store.last_evaluation(closing=True)
-            or store.last_evaluation(closing=False)
+            or store.last_evaluation(is_final=True)
+            or store.last_evaluation(is_final=False)
         )
     if found is None:
         return ""

@@ -84,7 +84,7 @@ def read_status(run_dir: Path) -> Status:
     with closing(Store(run_dir, read_only=True)) as store:
         run = read_run(run_dir, store)
         found = status(run, Throughput(), Waits(), 0.0, 0.0)
-    if found.state in ("running", "closing") and served_at(run_dir) is None:
+    if found.state in ("running", "finishing") and served_at(run_dir) is None:
         return msgspec.structs.replace(
             found, state="stopped", time_left_s=None, ended_because=run.progress.why_stopped()
         )

@@ -5,7 +5,7 @@
     import udrl
 
     trained = udrl.train("CartPole-v1", max_env_steps=100_000, seed=7)
-    print(trained.status.closing_evaluation.mean)
+    print(trained.status.final_evaluation.mean)
     action = trained.policy.predict(observation, desired_return=400, desired_horizon=400)
 """
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-State = Literal["running", "closing", "ended", "failed"]
+State = Literal["running", "finishing", "ended", "failed"]
 
 #: Reasons why no process is running a run that has not ended.
 STOPPED = "stopped on request"
@@ -15,7 +15,7 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """One fact of the store, written at the end of every transaction that changes it.
 
     Attributes:
-        state: ``running`` up to the last iteration N; ``closing`` while the weights of version N
+        state: ``running`` up to the last iteration N; ``finishing`` while the weights of version N
             are trained and evaluated; then ``ended``. ``failed``: a command failed too often, or
             an actor lied.
         iteration: last completed iteration; -1: the warm-up is not complete.

@@ -344,7 +344,7 @@ class ReplayService:
                 return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
             here = [n for r, n in self._here if r == "actor"]
             why = f"iteration {request.version - 1}" + ("" if here else ": no actor is connected")
-            if run.progress.state == "closing":
+            if run.progress.state == "finishing":
                 why = "the final evaluation"
             return ChangesReply(wait=self._wait(who, "actors", why, now))
         self._waits.end(who)

@@ -168,7 +168,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         eval_env_steps=progress.eval_env_steps,
         env_steps_per_s=round(rate, 1),
         wall_s=round(
-            run.wall_s if progress.state in ("running", "closing") else progress.wall_s, 3
+            run.wall_s if progress.state in ("running", "finishing") else progress.wall_s, 3
         ),
         max_env_steps=run.budget.max_env_steps,
         stop_return=run.budget.stop_return,
@@ -198,8 +198,8 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         replay_sha256=replay_digest(run.digests[e.id] for e in run.buffer).hex(),
         weights_kept=tuple(run.store.versions_kept()),
         loss=latest.loss if latest else None,
-        evaluation=_evaluation(run.store.last_evaluation(closing=False)),
-        closing_evaluation=_evaluation(run.store.last_evaluation(closing=True))
+        evaluation=_evaluation(run.store.last_evaluation(is_final=False)),
+        final_evaluation=_evaluation(run.store.last_evaluation(is_final=True))
         if progress.state == "ended"
         else None,
         exact=progress.exact,

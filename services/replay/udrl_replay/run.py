@@ -69,13 +69,13 @@ class StoredRun(RunState):
 
     def save(self) -> None:
         """Write the progress; call it at the end of every transaction that changes it."""
-        if self.progress.state in ("running", "closing"):
+        if self.progress.state in ("running", "finishing"):
             self.progress.wall_s = self.wall_s
         self.store.set_fact("progress", self.progress)
 
     def stop(self) -> None:
         """Mark the run as stopped, for processes that read its file."""
-        if self.progress.state in ("running", "closing"):
+        if self.progress.state in ("running", "finishing"):
             self.progress.ended_because = STOPPED
         self.save()
 
@@ -113,7 +113,7 @@ class StoredRun(RunState):
         self.progress.accepted += 1
         self._advance()
         if (
-            self.progress.state == "closing"
+            self.progress.state == "finishing"
             and command_id % COMMANDS_PER_ITERATION >= FINAL_EVALUATION
         ):
             self._end_if_evaluated()
@@ -225,7 +225,7 @@ class StoredRun(RunState):
             del self.digests[gone]
 
         if evaluated:
-            self._note_evaluation(commands[evaluated[0].id], evaluated, closing=False)
+            self._note_evaluation(commands[evaluated[0].id], evaluated, is_final=False)
         version = weights_version(iteration, self.config.lead)
         best = self.buffer.best(self.config.buffer.replay_size)
         returns = [e.episode_return for e in best]
@@ -261,14 +261,14 @@ class StoredRun(RunState):
         if why := self._spent():
             self._begin_final_evaluation(why)
 
-    def _note_evaluation(self, command: Command, entries: list[Entry], *, closing: bool) -> None:
+    def _note_evaluation(self, command: Command, entries: list[Entry], *, is_final: bool) -> None:
         """Record the returns of an evaluation's episodes; ``command`` is one of its commands."""
         result = summarise([e.episode_return for e in entries])
         iteration, version = command.iteration, command.weights_version
-        source = self.progress.env_steps if closing else self.store.env_steps_after(version - 1)
+        source = self.progress.env_steps if is_final else self.store.env_steps_after(version - 1)
         self.store.add_evaluation(
             EvaluationRow(
-                iteration, closing, source, command.desired_return, command.desired_horizon, result
+                iteration, is_final, source, command.desired_return, command.desired_horizon, result
             )
         )
         log.info(
@@ -276,10 +276,10 @@ class StoredRun(RunState):
             iteration, source,
             *map(return_text, (result.mean, result.ci95_low, result.ci95_high)),
         )  # fmt: skip
-        if not closing:
+        if not is_final:
             self._evaluated.add(version)
         best = self.progress.best_mean
-        if not closing and (best is None or result.mean > best):
+        if not is_final and (best is None or result.mean > best):
             self.progress.best_mean, self.progress.best_version = result.mean, version
 
     def _issue(self, commands: list[Command]) -> None:
@@ -292,7 +292,7 @@ class StoredRun(RunState):
     def _spent(self) -> str:
         """Return which limit of the budget is reached; empty: none."""
         most, wanted = self.budget.max_env_steps, self.budget.stop_return
-        last = self.store.last_evaluation(closing=False)
+        last = self.store.last_evaluation(is_final=False)
         if (
             wanted is not None
             and last is not None
@@ -306,7 +306,7 @@ class StoredRun(RunState):
 
     def _begin_final_evaluation(self, why: str) -> None:
         """End at iteration N, now complete: cancel later commands and wait for version N."""
-        self.progress.state, self.progress.ended_because = "closing", why
+        self.progress.state, self.progress.ended_because = "finishing", why
         self._cancel(list(self.dealer.outstanding))
         self.store.remove_versions(self.progress.iteration)
         self.progress.latest_version = min(self.progress.latest_version, self.progress.iteration)
@@ -328,7 +328,7 @@ class StoredRun(RunState):
         commands = self._final_commands()
         entries = [p.entry for p in self.store.pending(final)]
         self.progress.eval_env_steps += sum(e.length for e in entries)
-        self._note_evaluation(commands[0], entries, closing=True)
+        self._note_evaluation(commands[0], entries, is_final=True)
         self.store.remove_episodes(e.id for e in entries)
         self.store.remove_commands(c.id for c in commands)
         self.progress.wall_s = self.wall_s
@@ -361,7 +361,7 @@ class StoredRun(RunState):
 
     def _clear_failure(self) -> None:
         """Continue after a failure; the command that failed is retried."""
-        self.progress.state = "closing" if self._final_commands() else "running"
+        self.progress.state = "finishing" if self._final_commands() else "running"
         self.progress.problem = ""
 
     # Weights.
@@ -377,7 +377,7 @@ class StoredRun(RunState):
         self.store.add_version(version, train_s)
         self.progress.latest_version = version.version
         self._keep_needed_weights()
-        if self.progress.state == "closing" and version.version == self.progress.iteration:
+        if self.progress.state == "finishing" and version.version == self.progress.iteration:
             self._issue_final_evaluation()
         return "accepted"
 

@@ -13,7 +13,7 @@ from msgspec import inspect
 
 from udrl_proto.reports import IterationStatus
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 def _declared(kind: type[msgspec.Struct]) -> str:
@@ -44,10 +44,10 @@ CREATE INDEX pending ON episodes (id) WHERE admitted IS NULL;
 CREATE INDEX evictions ON episodes (evicted) WHERE evicted IS NOT NULL;
 CREATE TABLE iterations ({_declared(IterationStatus)}, seal BLOB NOT NULL, PRIMARY KEY (iteration));
 CREATE TABLE evaluations (
-    iteration INTEGER NOT NULL, closing INTEGER NOT NULL, env_steps INTEGER NOT NULL,
+    iteration INTEGER NOT NULL, is_final INTEGER NOT NULL, env_steps INTEGER NOT NULL,
     desired_return REAL NOT NULL, desired_horizon INTEGER NOT NULL,
     mean REAL NOT NULL, std REAL NOT NULL, ci95_low REAL NOT NULL, ci95_high REAL NOT NULL,
-    episodes INTEGER NOT NULL, seal BLOB NOT NULL, PRIMARY KEY (closing, iteration)) WITHOUT ROWID;
+    episodes INTEGER NOT NULL, seal BLOB NOT NULL, PRIMARY KEY (is_final, iteration)) WITHOUT ROWID;
 CREATE TABLE versions (
     version INTEGER PRIMARY KEY, digest BLOB NOT NULL, loss REAL NOT NULL, train_s REAL NOT NULL,
     checksum BLOB NOT NULL, seal BLOB NOT NULL, weights BLOB, optimizer BLOB);
@@ -61,7 +61,7 @@ SEALED = {
     "commands": "id, cancelled, body",
     "episodes": "id, episode_return, length, digest, admitted, evicted, checksum",
     "iterations": ", ".join(IterationStatus.__struct_fields__),
-    "evaluations": "iteration, closing, env_steps, desired_return, desired_horizon, mean, std, "
+    "evaluations": "iteration, is_final, env_steps, desired_return, desired_horizon, mean, std, "
     "ci95_low, ci95_high, episodes",
     "versions": "version, digest, loss, train_s, checksum",
 }

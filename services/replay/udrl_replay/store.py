@@ -53,7 +53,7 @@ class EvaluationRow(NamedTuple):
     """A row of the table ``evaluations``."""
 
     iteration: int
-    closing: bool
+    is_final: bool
     env_steps: int
     desired_return: float
     desired_horizon: int
@@ -211,19 +211,19 @@ class Store(Database):
         """Add or replace an evaluation."""
         self._insert("evaluations", *row[:-1], *row.evaluation)
 
-    def last_evaluation(self, *, closing: bool) -> EvaluationRow | None:
+    def last_evaluation(self, *, is_final: bool) -> EvaluationRow | None:
         """Return the newest final evaluation, or the newest of the others."""
         rows = self._rows(
-            "SELECT * FROM evaluations WHERE closing = ? ORDER BY iteration DESC LIMIT 1",
-            (int(closing),),
+            "SELECT * FROM evaluations WHERE is_final = ? ORDER BY iteration DESC LIMIT 1",
+            (int(is_final),),
         )
         return _evaluation(rows[0]) if rows else None
 
-    def evaluation_of(self, iteration: int, *, closing: bool) -> EvaluationRow | None:
+    def evaluation_of(self, iteration: int, *, is_final: bool) -> EvaluationRow | None:
         """Return the evaluation of an iteration."""
         rows = self._rows(
-            "SELECT * FROM evaluations WHERE closing = ? AND iteration = ?",
-            (int(closing), iteration),
+            "SELECT * FROM evaluations WHERE is_final = ? AND iteration = ?",
+            (int(is_final), iteration),
         )
         return _evaluation(rows[0]) if rows else None
 
@@ -235,7 +235,7 @@ class Store(Database):
     def evaluations(self, after: int, until: int) -> list[EvaluationRow]:
         """Return the evaluations after ``after`` up to ``until``, without the final evaluation."""
         rows = self._rows(
-            "SELECT * FROM evaluations WHERE closing = 0 AND iteration > ? AND iteration <= ? "
+            "SELECT * FROM evaluations WHERE is_final = 0 AND iteration > ? AND iteration <= ? "
             "ORDER BY iteration",
             (after, until),
         )
@@ -246,7 +246,7 @@ class Store(Database):
         columns = [f"i.{c}" for c in _FIELDS] + [f"e.{c}" for c in EVALUATION_COLUMNS.values()]
         return self._rows(
             f"SELECT {', '.join(columns)} FROM iterations i "  # noqa: S608
-            "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.closing = 0 "
+            "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.is_final = 0 "
             "WHERE i.iteration > ? ORDER BY i.iteration",
             (after,),
         )
@@ -317,8 +317,8 @@ class Store(Database):
 
 
 def _evaluation(row: tuple[Any, ...]) -> EvaluationRow:
-    iteration, closing, env_steps, desired_return, desired_horizon, *found, _ = row
+    iteration, is_final, env_steps, desired_return, desired_horizon, *found, _ = row
     result = Evaluation(*found)
     return EvaluationRow(
-        iteration, bool(closing), env_steps, desired_return, desired_horizon, result
+        iteration, bool(is_final), env_steps, desired_return, desired_horizon, result
     )

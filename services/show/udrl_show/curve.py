@@ -173,7 +173,7 @@ def read(run_dir: Path) -> Curve:
         with closing(Store(run_dir, read_only=True)) as store:
             config = store.fact("hello", Hello).config
             settings = {n: v for n, v in flat(config).items() if n != "seed"}
-            return Curve(run_dir, rows, settings, store.last_evaluation(closing=True))
+            return Curve(run_dir, rows, settings, store.last_evaluation(is_final=True))
     except StoreError as error:
         log.debug("%s is drawn without its store: %s", run_dir, error)
         return Curve(run_dir, rows, {}, None)

@@ -25,7 +25,7 @@ _MOST_VERSIONS = 8
 #: Texts for the states.
 _STATES = {
     "running": "running",
-    "closing": "final evaluation",
+    "finishing": "final evaluation",
     "ended": "ended",
     "failed": "failed",
     "stopped": "stopped",
@@ -116,8 +116,8 @@ def panel(status: Status) -> Table:
     add("env steps", *_separated(steps))
     add("iteration", f"{status.iteration:,}")
     add("evaluation", *_evaluation(status.evaluation))
-    if status.closing_evaluation:
-        add("final evaluation", *_evaluation(status.closing_evaluation))
+    if status.final_evaluation:
+        add("final evaluation", *_evaluation(status.final_evaluation))
     add("replay buffer", *_separated(returns(status)))
     weights = [f"version {status.weights_version:,}"]
     if status.loss is not None:

@@ -6,7 +6,7 @@ from typing import Any
 from udrl.errors import ConfigError
 from udrl_proto.reports import EvaluationStatus, Status
 
-STATES = ("running", "closing", "ended", "failed", "stopped")
+STATES = ("running", "finishing", "ended", "failed", "stopped")
 
 #: Name, status field and description of each metric, and whether it is a counter.
 _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
@@ -82,7 +82,7 @@ class StatusCollector:
         )  # fmt: skip
         for name, found in (
             ("udrl_eval_return", status.evaluation),
-            ("udrl_closing_eval_return", status.closing_evaluation),
+            ("udrl_final_eval_return", status.final_evaluation),
         ):
             yield labelled(name, "Returns of the evaluation.", ["stat"], _stats(found))
         held = status.buffer

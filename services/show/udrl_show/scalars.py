@@ -80,7 +80,7 @@ class RowScalars:
 
 def final_scalars(status: Status) -> list[Scalar]:
     """Return the scalars of a run's final evaluation; none if it has not had one."""
-    final = status.closing_evaluation
+    final = status.final_evaluation
     if final is None:
         return []
     values = {

@@ -47,10 +47,10 @@ export class Learning {
   }
 
   showReturns(rows, evaluations, status) {
-    const closing = status?.closing_evaluation, target = status?.stop_return;
+    const final = status?.final_evaluation, target = status?.stop_return;
     legend($("curve-legend"), [
       ["evaluation, mean with 95 % interval", "line", "evaluation"],
-      ...(closing ? [["final evaluation", "dot", "evaluation hollow"]] : []),
+      ...(final ? [["final evaluation", "dot", "evaluation hollow"]] : []),
       [`exploratory episodes, mean of ${WINDOW} iterations`, "line", "explored"],
       ["exploratory episodes, each iteration", "line", "explored pale"],
       ["commanded returns", "band", "commanded band"],
@@ -62,11 +62,11 @@ export class Learning {
         most: (r) => r.commanded_max ?? undefined, least: (r) => r.commanded_min ?? undefined,
       }],
       [evaluations, "env_steps", { mean: (e) => e.mean, high: (e) => e.ci95_high, low: (e) => e.ci95_low }],
-      [closing ? [closing] : [], "env_steps", { closing: (e) => e.mean }],
+      [final ? [final] : [], "env_steps", { final: (e) => e.mean }],
     );
-    const columns = ["mean", "high", "low", "explored", "average", "most", "least", "closing"].map(column);
+    const columns = ["mean", "high", "low", "explored", "average", "most", "least", "finishing"].map(column);
     columns.push(xs.map(() => target ?? undefined));
-    const last = rows.at(-1), all = closing ? [...evaluations, closing] : evaluations;
+    const last = rows.at(-1), all = final ? [...evaluations, final] : evaluations;
     const best = all.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
     const explored = (row) => `exploratory episodes ${number(row.average)}${commanded(row)}`;
     const place = (name, e, x) => `${name} ${evaluated(e)}${e.env_steps < x ? ` (after ${number(e.env_steps)})` : ""}`;
@@ -75,7 +75,7 @@ export class Learning {
       (i) => {
         const until = (e) => e.env_steps <= xs[i], row = rows.findLast(until), made = evaluations.findLast(until);
         const parts = [
-          closing && until(closing) ? place("final evaluation", closing, xs[i]) : "",
+          final && until(final) ? place("final evaluation", final, xs[i]) : "",
           made ? place("evaluation", made, xs[i]) : "",
           row ? explored(row) : "",
         ];

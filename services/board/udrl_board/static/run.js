@@ -2,7 +2,7 @@
 import { count, evaluated, number, time } from "./format.js";
 import { $, facts, lines, made, setText } from "./page.js";
 
-export const STATES = { running: "Running", closing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
+export const STATES = { running: "Running", finishing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
 
 // Shell commands for this run, with its directory and endpoint if the board knows them.
 export function commands({ place, status }) {
@@ -35,7 +35,7 @@ export function showRun(known) {
     ["best evaluation", evaluated(best)],
     ["best return in the buffer", number(buffer.return_max)],
     ["mean return of the buffer", number(buffer.return_mean)],
-    ...(status.state === "running" || status.state === "closing" ? [["env steps/s", number(status.env_steps_per_s, 0)]] : []),
+    ...(status.state === "running" || status.state === "finishing" ? [["env steps/s", number(status.env_steps_per_s, 0)]] : []),
     ["actors", number(status.actors.length)],
   ]);
   const { commands: c, episodes: e } = status;
@@ -63,12 +63,12 @@ function showProgress({ env_steps, max_env_steps, wall_s, time_left_s, stop_retu
   setText($("progress-said"), `${number(env_steps)} of ${number(max_env_steps)} env steps in ${time(wall_s)}${left}`);
 }
 
-function showScore({ evaluation, closing_evaluation, stop_return }) {
-  const shown = closing_evaluation ?? evaluation;
+function showScore({ evaluation, final_evaluation, stop_return }) {
+  const shown = final_evaluation ?? evaluation;
   $("score").classList.toggle("reached", Boolean(shown && stop_return != null && shown.mean >= stop_return));
   setText($("score-value"), shown ? number(shown.mean) : "");
   const target = stop_return == null ? "" : `, target ${number(stop_return)}`;
-  const what = closing_evaluation ? "final evaluation" : "last evaluation";
+  const what = final_evaluation ? "final evaluation" : "last evaluation";
   setText($("score-said"), shown
     ? `mean return ± ${number((shown.ci95_high - shown.ci95_low) / 2)}, ${what} of ${count(shown.episodes, "episode")}${target}`
     : `no evaluation yet${target}`);
@@ -81,7 +81,7 @@ function showAlerts(known) {
     ended: `Continue training: ${resume(" --max-env-steps MORE")}`,
     failed: `Fix the cause, then resume the run: ${resume()}`,
   };
-  const isActive = status.state === "running" || status.state === "closing";
+  const isActive = status.state === "running" || status.state === "finishing";
   const isMissing = status.waiting.some((w) => w.why.includes("no learner is connected"));
   const hint = hints[status.state] ?? "";
   $("next").hidden = !hint;

@@ -19,7 +19,7 @@ function showTable(runs) {
     ...runs.map((run, k) => {
       const row = made("tr"), { status } = run, link = made("a", { href: `?number=${k}`, textContent: nameOf(run) });
       row.insertCell().append(String(k) === shown ? made("strong", { textContent: nameOf(run) }) : link);
-      const values = status ? [status.environment, STATES[status.state], number(status.env_steps), evaluated(status.closing_evaluation ?? status.evaluation)] : ["–", "unknown", "–", "–"];
+      const values = status ? [status.environment, STATES[status.state], number(status.env_steps), evaluated(status.final_evaluation ?? status.evaluation)] : ["–", "unknown", "–", "–"];
       for (const value of values) row.insertCell().textContent = value;
       return row;
     }),
@@ -27,7 +27,7 @@ function showTable(runs) {
 }
 
 function showChart(chart, runs) {
-  const made = runs.map(({ status, evaluations }) => (status?.closing_evaluation ? [...evaluations, status.closing_evaluation] : evaluations));
+  const made = runs.map(({ status, evaluations }) => (status?.final_evaluation ? [...evaluations, status.final_evaluation] : evaluations));
   const { xs, column } = merge(...made.map((all, k) => [all, "env_steps", { [k]: (e) => e.mean }]));
   legend($("all-legend"), runs.map((run, k) => [nameOf(run), "line", COLOURS[k % COLOURS.length]]));
   chart.show(xs, runs.map((_, k) => column(k)), "The last point of a run that has ended is its final evaluation.", (i) =>

@@ -161,16 +161,16 @@ def warn_of_idle_environments(settings: Settings) -> None:
 
 def _finish(run_dir: Path, status: Status, run_logs: Sequence[RunLog]) -> None:
     """Draw the learning curve, and print the result and the paths of all files."""
-    closing = status.closing_evaluation
+    final = status.final_evaluation
     lines = []
     if not status.problem:
         lines.append(("ended", status.ended_because))
-    if closing is not None:
+    if final is not None:
         lines.append((
             "final evaluation",
-            f"mean return {return_text(closing.mean)} (95 % interval "
-            f"{return_text(closing.ci95_low)} to {return_text(closing.ci95_high)}, "
-            f"{closing.episodes} episodes) after {status.env_steps:,} env steps, "
+            f"mean return {return_text(final.mean)} (95 % interval "
+            f"{return_text(final.ci95_low)} to {return_text(final.ci95_high)}, "
+            f"{final.episodes} episodes) after {status.env_steps:,} env steps, "
             f"{status.wall_s:.0f} s",
         ))  # fmt: skip
     if status.weights_version:
