@@ -43,9 +43,9 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
         for seed in plan.seeds_of_runs()
     ]
 
-    def report(place: StudyFolders) -> str:
-        said = report_curves(jobs, task, task.title, place)
-        report_wall_time(jobs, task, task.title, place)
+    def report(folders: StudyFolders) -> str:
+        said = report_curves(jobs, task, task.title, folders)
+        report_wall_time(jobs, task, task.title, folders)
         return said
 
     return Study(name, jobs, report)
@@ -83,18 +83,18 @@ def baseline(
     )
 
 
-def report_curves(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> str:
+def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> str:
     """Write all evaluations, their curves, and when returns were reached; draw the curves.
 
     Returns:
         A line for each curve: where it ends.
     """
-    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(place.root)]
+    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(folders.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
-    write(place.folder / "evaluations.csv", EvaluationRecord, rows)
-    write(place.folder / "curves.csv", CurvePoint, points)
-    write(place.folder / "reached.csv", Reached, reached(rows, task.thresholds))
-    draw_curves(place.folder, title, task.landmarks)
+    write(folders.folder / "evaluations.csv", EvaluationRecord, rows)
+    write(folders.folder / "curves.csv", CurvePoint, points)
+    write(folders.folder / "reached.csv", Reached, reached(rows, task.thresholds))
+    draw_curves(folders.folder, title, task.landmarks)
     last = {(point.algorithm, point.variant): point for point in points}
     return "\n".join(
         f"{title}: {' '.join(words).strip()}: mean return {end.mean:.1f} after {end.env_steps:,} "
@@ -103,22 +103,22 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, place: StudyFolde
     )
 
 
-def report_wall_time(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> None:
+def report_wall_time(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> None:
     """Write and draw the curves against wall time, of runs on one kind of machine.
 
     It is the one that most runs were made on, and the figure names it. Nothing is written if no
     run's machine is known.
     """
-    machines = {job.name: job.machine(place.root) for job in jobs}
+    machines = {job.name: job.machine(folders.root) for job in jobs}
     known = Counter(machine for machine in machines.values() if machine is not None)
     if not known:
         return
     ((machine, _),) = known.most_common(1)
     here = [job for job in jobs if machines[job.name] == machine]
-    rows = [row for job in here for row in job.evaluations(place.root)]
+    rows = [row for job in here for row in job.evaluations(folders.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
-    write(place.folder / "curves-wall-time.csv", CurvePoint, points)
-    draw_curves(place.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
+    write(folders.folder / "curves-wall-time.csv", CurvePoint, points)
+    draw_curves(folders.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
 
 
 def draw_curves(

@@ -36,7 +36,7 @@ def main(folder: Path, parent: int | None) -> None:
     log_to_stderr(logging.WARNING)
     try:
         job = read_job(folder)
-        code = run_service(lambda stop: carry_out(job, folder, stop))
+        code = run_service(lambda stop: run_job(job, folder, stop))
     except UdrlError as error:
         click.echo(f"udrl: error: {error}", err=True)
         code = error.exit_code
@@ -46,7 +46,7 @@ def main(folder: Path, parent: int | None) -> None:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from the run; the kernel lets go of it when this one ends."""
     with (folder / "lock").open("w") as lock:
         try:
@@ -58,7 +58,7 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
+def run_job(job: Job, folder: Path, stop: threading.Event) -> None:
     """Do the run and leave its evaluations and a note that it is done.
 
     Raises:
@@ -66,11 +66,11 @@ def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
         UdrlError: it failed.
         Interrupted: ``stop`` was set.
     """
-    with _alone(folder):
-        _carry_out(job, folder, stop)
+    with _locked(folder):
+        _run_job(job, folder, stop)
 
 
-def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
+def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
     if not (folder / "run").exists() and not (folder / "state.safetensors").exists():
         # If only the records of a shorter run were kept, it begins anew.
         (folder / "done.json").unlink(missing_ok=True)

@@ -95,10 +95,10 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         done = self._done(root)
         return None if done is None else done.machine
 
-    def _done(self, root: Path) -> "_Done | None":
+    def _done(self, root: Path) -> "_DoneRecord | None":
         try:
             return msgspec.json.decode(
-                (self.folder(root) / "done.json").read_bytes(), type=_Done, strict=False
+                (self.folder(root) / "done.json").read_bytes(), type=_DoneRecord, strict=False
             )
         except (OSError, msgspec.DecodeError):
             return None
@@ -117,7 +117,7 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         ]
 
 
-class _Done(msgspec.Struct, frozen=True):
+class _DoneRecord(msgspec.Struct, frozen=True):
     """What ``done.json`` says of a run."""
 
     max_env_steps: int
@@ -136,12 +136,12 @@ def read_job(folder: Path) -> Job:
         raise InvalidData(f"{folder / 'job.json'}: {error}; expected a study's run") from error
 
 
-def carry_out(
+def run_jobs(
     jobs: Iterable[Job],
     root: Path,
     side_by_side: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> None:
     """Do all runs that are not done, some side by side; the first that fails ends the others.
 
@@ -150,23 +150,23 @@ def carry_out(
         root: where runs live.
         side_by_side: how many at a time.
         stop: ends them early; they go on next time.
-        say: is told what begins and what ends.
+        echo: is told what begins and what ends.
 
     Raises:
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
-    waiting = [job for job in furthest(jobs) if not job.done(root)][::-1]
+    waiting = [job for job in merge_jobs(jobs) if not job.done(root)][::-1]
     jobs_by_name = {job.name: job for job in waiting}
     n, running = len(waiting), dict[str, subprocess.Popen[bytes]]()
     try:
         while waiting or running:
             while waiting and len(running) < side_by_side:
                 job = waiting.pop()
-                say(f"[{n - len(waiting)}/{n}] {job.described}")
+                echo(f"[{n - len(waiting)}/{n}] {job.described}")
                 running[job.name] = _start(job, root)
             if stop.wait(_POLL_S):
-                say(INTERRUPTED)  # before the runs get their time to end
+                echo(INTERRUPTED)  # before the runs get their time to end
                 raise Interrupted(INTERRUPTED)
             for name, process in list(running.items()):
                 code = process.poll()
@@ -182,29 +182,29 @@ def carry_out(
                         f"(--max-env-steps), or evaluate earlier (--set eval_every=STEPS)"
                     )
     finally:
-        _end(running.values())
+        _terminate(running.values())
 
 
-def furthest(jobs: Iterable[Job]) -> Sequence[Job]:
+def merge_jobs(jobs: Iterable[Job]) -> Sequence[Job]:
     """Return jobs of different runs, each as far as anyone asks, in order of first appearance."""
-    furthest: dict[str, Job] = {}
+    merged: dict[str, Job] = {}
     for job in jobs:
-        held = furthest.setdefault(job.name, job)
-        if job.max_env_steps > held.max_env_steps:
-            furthest[job.name] = job
-    return list(furthest.values())
+        kept = merged.setdefault(job.name, job)
+        if job.max_env_steps > kept.max_env_steps:
+            merged[job.name] = job
+    return list(merged.values())
 
 
 def copy_finished(
-    jobs: Iterable[Job], root: Path, sources: Sequence[Path], say: Callable[[str], None]
+    jobs: Iterable[Job], root: Path, sources: Sequence[Path], echo: Callable[[str], None]
 ) -> None:
     """Copy the records of runs that are done in other folders of studies, and not in this one.
 
     Args:
-        jobs: as for :func:`carry_out`.
+        jobs: as for :func:`run_jobs`.
         root: where runs live.
         sources: the other folders; the first that has a run counts.
-        say: receives a line for each run that is copied.
+        echo: receives a line for each run that is copied.
 
     Raises:
         ConfigError: a source has no runs.
@@ -215,11 +215,11 @@ def copy_finished(
                 f"--runs-from {source}: expected a folder of studies with the folder runs in it; "
                 f"name what was given to --folder"
             )
-    for job in furthest(jobs):
+    for job in merge_jobs(jobs):
         finished = next((source for source in sources if job.done(source)), None)
         if finished is None or job.done(root):
             continue
-        say(f"copied from {finished}: {job.described}")
+        echo(f"copied from {finished}: {job.described}")
         job.folder(root).mkdir(parents=True, exist_ok=True)
         for name in RECORDS:
             put(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
@@ -243,7 +243,7 @@ def _failure(folder: Path, code: int) -> RunFailed:
     return failure
 
 
-def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
+def _terminate(processes: Iterable[subprocess.Popen[bytes]]) -> None:
     for process in processes:
         process.terminate()
     for process in processes:

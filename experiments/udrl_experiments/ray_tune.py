@@ -17,14 +17,14 @@ from udrl_experiments.jobs import INTERRUPTED, Job
 _CORES = 2
 
 
-def carry_out(
+def run_jobs(
     planned: Iterable[Job],
     root: Path,
     side_by_side: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> None:
-    """Do all runs that are not done; as :func:`udrl_experiments.jobs.carry_out`, by Ray Tune.
+    """Do all runs that are not done; as :func:`udrl_experiments.jobs.run_jobs`, by Ray Tune.
 
     With ``RAY_ADDRESS`` set, the runs go to that cluster; ``root`` must be a folder that all its
     machines share. What was done is known by what lies there, so nothing of Ray's is kept.
@@ -47,7 +47,7 @@ def carry_out(
         raise ConfigError(
             'the search needs Ray Tune; install it with: pip install "udrl[studies]"'
         ) from error
-    waiting = {job.name: job for job in jobs.furthest(planned) if not job.done(root)}
+    waiting = {job.name: job for job in jobs.merge_jobs(planned) if not job.done(root)}
     if not waiting:
         return
 
@@ -57,20 +57,20 @@ def carry_out(
 
         def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
             if stop.is_set():
-                say(INTERRUPTED)
+                echo(INTERRUPTED)
                 raise Interrupted(INTERRUPTED)
 
         def on_trial_start(
             self, iteration: int, trials: list[Any], trial: Any, **info: Any
         ) -> None:
-            say(waiting[trial.config["name"]].described)
+            echo(waiting[trial.config["name"]].described)
 
     def trial(config: dict[str, str]) -> dict[str, float]:
         job = msgspec.json.decode(config["job"], type=Job)
-        jobs.carry_out([job], root, 1, threading.Event(), lambda text: None)
+        jobs.run_jobs([job], root, 1, threading.Event(), lambda text: None)
         return {"evaluations": len(job.evaluations(root))}
 
-    say(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
+    echo(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
     if address := os.environ.get("RAY_ADDRESS"):
         try:
             ray.init(logging_level=logging.WARNING)
@@ -95,7 +95,7 @@ def carry_out(
             ),
         ).fit()  # fmt: skip
         for failure in results.errors:
-            say(f"a run failed: {failure}")
+            echo(f"a run failed: {failure}")
         if len(results.errors) == len(waiting):
             raise RunFailed(f"no run succeeded; the first failed with: {results.errors[0]}")
     finally:

@@ -27,7 +27,7 @@ from udrl_experiments.protocol import (
     Task,
     shared,
 )
-from udrl_experiments.ray_tune import carry_out
+from udrl_experiments.ray_tune import run_jobs
 from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
@@ -186,26 +186,26 @@ def _study(
     }
     spaces = {subject.space.environment: subject.space for subject in subjects}
 
-    def report(place: StudyFolders) -> str:
+    def report(folders: StudyFolders) -> str:
         rows = [
             Scored(
                 environment=environment,
                 algorithm=algorithm,
                 configuration=number,
                 seeds=len(runs),
-                score=_score(runs, place.root),
+                score=_score(runs, folders.root),
                 settings=json.dumps(spaces[environment].draw(algorithm, number)),
             )
             for (environment, algorithm, number), runs in jobs.items()
         ]
-        write(place.folder / "scores.csv", Scored, rows)
+        write(folders.folder / "scores.csv", Scored, rows)
         return "\n".join(
-            _write_preset(place.folder, rows, subject, algorithm)
+            _write_preset(folders.folder, rows, subject, algorithm)
             for subject in subjects
             for algorithm in subject.algorithms
         )
 
-    return Study(name, [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",))
+    return Study(name, [run for runs in jobs.values() for run in runs], report, run_jobs, ("ray",))
 
 
 def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:

@@ -31,20 +31,22 @@ def sensitivity(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES
         task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
     }
 
-    def report(place: StudyFolders) -> str:
+    def report(folders: StudyFolders) -> str:
         said = []
         for task, runs in jobs.items():
-            table = place.folder / f"{task.title}.csv"
-            rows = [row for run in runs for row in _told(run, place.root, task, episodes)]
+            table = folders.folder / f"{task.title}.csv"
+            rows = [
+                row for run in runs for row in _evaluate_agent(run, folders.root, task, episodes)
+            ]
             write(table, Obtained, rows)
             draw(table, task.title)
-            said += _in_words(task, rows)
+            said += _summary(task, rows)
         return "\n".join(said)
 
     return Study("sensitivity", [run for runs in jobs.values() for run in runs], report)
 
 
-def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
+def _summary(task: Task, rows: Sequence[Obtained]) -> list[str]:
     """Return a line for each agent: how desired and obtained returns go together."""
     said = []
     for seed in dict.fromkeys(row.seed for row in rows):
@@ -57,7 +59,7 @@ def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
     return said
 
 
-def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
+def _evaluate_agent(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
     """Return what the agent of a run obtains; another study may have taken it further."""
     run_dir = run.folder(root) / "run"
     try:

@@ -10,7 +10,7 @@ import msgspec
 
 from udrl.errors import ConfigError, InvalidData
 from udrl.strategies import make_strategy
-from udrl_experiments.jobs import Job, carry_out, copy_finished
+from udrl_experiments.jobs import Job, copy_finished, run_jobs
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
 from udrl_inspect.csv_tables import put
@@ -36,7 +36,7 @@ class Study(NamedTuple):
         jobs: the runs that it needs.
         report: makes tables and pictures of them, once they are done; returns what came of them in
             words.
-        carry_out: does the runs.
+        run_jobs: does the runs.
         needs: modules that must be there besides those that its runs need.
         shares_runs: whether runs that other studies have made will do.
     """
@@ -44,21 +44,21 @@ class Study(NamedTuple):
     name: str
     jobs: Sequence[Job]
     report: Callable[[StudyFolders], str]
-    carry_out: Callable[
-        [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
-    ] = carry_out
+    run_jobs: Callable[[Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None] = (
+        run_jobs
+    )
     needs: Sequence[str] = ()
     shares_runs: bool = True
 
 
-def conduct(
+def run_study(
     study: Study,
     root: Path,
     *,
     side_by_side: int,
     resume: bool,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
     runs_from: Sequence[Path] = (),
 ) -> str:
     """Conduct a study, or go on with it where it stopped, and return what came of it in words.
@@ -69,7 +69,7 @@ def conduct(
         side_by_side: runs at a time.
         resume: go on if the folder holds this study already.
         stop: ends it early.
-        say: is told how it goes.
+        echo: is told how it goes.
         runs_from: folders of other studies; runs that are done there are not made again.
 
     Raises:
@@ -79,25 +79,25 @@ def conduct(
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
-    _require(study)
+    _check(study)
     root = root.resolve()
     folder = root / study.name
-    place = StudyFolders(root if study.shares_runs else folder, folder)
+    folders = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         sources = [one if study.shares_runs else one / study.name for one in runs_from]
-        copy_finished(study.jobs, place.root, sources, say)
-        _open(study, place, resume=resume)
-        study.carry_out(study.jobs, place.root, side_by_side, stop, say)
-        said = study.report(place)
+        copy_finished(study.jobs, folders.root, sources, echo)
+        _write_plan(study, folders, resume=resume)
+        study.run_jobs(study.jobs, folders.root, side_by_side, stop, echo)
+        said = study.report(folders)
     except OSError as error:
         raise ConfigError(
             f"--folder {root}: {error}; name a folder that you may write, on a disk with room"
         ) from error
-    say(f"tables and pictures are in {folder}")
+    echo(f"tables and pictures are in {folder}")
     return said
 
 
-def _require(study: Study) -> None:
+def _check(study: Study) -> None:
     """Refuse before the first run what would be missed after the last one."""
     modules = dict.fromkeys(("matplotlib", *study.needs))
     for job in study.jobs:
@@ -117,13 +117,13 @@ def _require(study: Study) -> None:
         make_strategy(config)
 
 
-def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
+def _write_plan(study: Study, folders: StudyFolders, *, resume: bool) -> None:
     """Write down what is about to be done; it may be more than what was begun, but not less."""
-    file = place.folder / "study.json"
+    file = folders.folder / "study.json"
     if file.exists():
         if not resume:
             raise ConfigError(
-                f"{place.folder} holds a study already; resume it with --resume; or name another "
+                f"{folders.folder} holds a study already; resume it with --resume; or name another "
                 f"--folder"
             )
         planned: dict[tuple[str, str], int] = {}
@@ -133,11 +133,11 @@ def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
         for job in read_study(file):
             if planned.get((job.name, job.variant), 0) < job.max_env_steps:
                 raise ConfigError(
-                    f"{place.folder} holds a study with the run {job.described}, which is not in "
+                    f"{folders.folder} holds a study with the run {job.described}, which is not in "
                     f"this one; give the options that it was begun with, or ones that ask for "
                     f"more, or name another --folder"
                 )
-    place.folder.mkdir(parents=True, exist_ok=True)
+    folders.folder.mkdir(parents=True, exist_ok=True)
     about = {"study": study.name, **provenance(), "runs": study.jobs}
     put(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
 

@@ -25,7 +25,7 @@ from udrl_experiments.search import search as make_search
 from udrl_experiments.search import search_environment
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
-from udrl_experiments.study import Study, conduct
+from udrl_experiments.study import Study, run_study
 from udrl_experiments.study_progress import studies, table
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
@@ -97,7 +97,7 @@ def _participants(command: Command) -> Command:
     )(command)  # fmt: skip
 
 
-def _conduct(
+def _run(
     make: Callable[[StudyPlan], Study],
     *,
     scale: Scale,
@@ -120,9 +120,9 @@ def _conduct(
     cores = len(os.sched_getaffinity(0))
 
     def service(stop: threading.Event) -> None:
-        said = conduct(
+        said = run_study(
             planned, folder, side_by_side=side_by_side or max(1, cores // 2), resume=resume,
-            stop=stop, say=lambda text: click.echo(text, err=True), runs_from=runs_from,
+            stop=stop, echo=lambda text: click.echo(text, err=True), runs_from=runs_from,
         )  # fmt: skip
         click.echo(said)
 
@@ -154,7 +154,7 @@ def lander(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study lander --algorithm UDRL --algorithm UDRL-paper
     """
-    return _conduct(lambda plan: comparison("lander", plan, participants), **options)
+    return _run(lambda plan: comparison("lander", plan, participants), **options)
 
 
 @study.command()
@@ -166,7 +166,7 @@ def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study takecover --algorithm UDRL
     """
-    return _conduct(lambda plan: comparison("takecover", plan, participants), **options)
+    return _run(lambda plan: comparison("takecover", plan, participants), **options)
 
 
 @study.command()
@@ -178,7 +178,7 @@ def sparse(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study sparse --scale paper
     """
-    return _conduct(lambda plan: comparison("sparse", plan, participants), **options)
+    return _run(lambda plan: comparison("sparse", plan, participants), **options)
 
 
 @study.command()
@@ -191,7 +191,7 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 
     Example: udrl study sensitivity --task lander --task sparse
     """
-    return _conduct(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
+    return _run(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
 
 
 @study.command()
@@ -203,7 +203,7 @@ def lead(names: tuple[str, ...], **options: Any) -> int:
 
     Example: udrl study lead --side-by-side 1
     """
-    return _conduct(lambda plan: make_lead(plan, tasks(names)), **options)
+    return _run(lambda plan: make_lead(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -215,7 +215,7 @@ def segments(names: tuple[str, ...], **options: Any) -> int:
 
     Example: udrl study segments --task sparse
     """
-    return _conduct(lambda plan: make_segments(plan, tasks(names)), **options)
+    return _run(lambda plan: make_segments(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -229,7 +229,7 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 
     Example: udrl study commands --strategy mine.strategies:Patient
     """
-    return _conduct(lambda plan: make_commands(plan, tasks(names), strategies), **options)
+    return _run(lambda plan: make_commands(plan, tasks(names), strategies), **options)
 
 
 @study.command()
@@ -262,12 +262,12 @@ def search(
         given, missing = ("--space", "ENV") if env is None else (f"ENV {env}", "--space FILE")
         raise ConfigError(f"{given} needs {missing}: udrl study search ENV --space FILE")
     if env is None or file is None:
-        return _conduct(
+        return _run(
             lambda plan: make_search(plan, tasks(names or ("lander",)), algorithms, configurations),
             **options,
         )
     if names:
         raise ConfigError(f"--task {names[0]}: leave it out, or leave out ENV and --space")
-    return _conduct(
+    return _run(
         lambda plan: search_environment(plan, env, file, algorithms, configurations), **options
     )

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
-from udrl_experiments.jobs import Job, furthest
+from udrl_experiments.jobs import Job, merge_jobs
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.study import read_study
 from udrl_inspect.csv_tables import read
@@ -77,7 +77,7 @@ def studies(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, list[JobP
     for name in names or found:
         own = folder / name / "runs"  # of a study that does not share its runs
         root = own.parent if own.is_dir() else folder
-        runs = furthest(read_study(folder / name / "study.json"))
+        runs = merge_jobs(read_study(folder / name / "study.json"))
         yield name, [job_progress(job, root) for job in runs]
 
 

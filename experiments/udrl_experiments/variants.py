@@ -70,12 +70,12 @@ def _variants(
         for task in tasks
     }
 
-    def report(place: StudyFolders) -> str:
+    def report(folders: StudyFolders) -> str:
         said = []
         for task, runs in jobs.items():
-            folder = place.folder if len(jobs) == 1 else place.folder / task.title
+            folder = folders.folder if len(jobs) == 1 else folders.folder / task.title
             folder.mkdir(exist_ok=True)
-            here = place._replace(folder=folder)
+            here = folders._replace(folder=folder)
             title = f"{task.title}: {name}"
             said.append(report_curves(runs, task, title, here))
             if wall_time:

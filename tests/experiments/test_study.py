@@ -15,7 +15,7 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.study import Study, StudyFolders, conduct
+from udrl_experiments.study import Study, StudyFolders, run_study
 from udrl_inspect.csv_tables import write
 
 
@@ -37,12 +37,14 @@ class World:
         return "all is well"
 
     def conduct(self, *jobs: Job, resume: bool = False) -> None:
-        def carry_out(planned: Sequence[Job], *others: Any) -> None:
+        def run_jobs(planned: Sequence[Job], *others: Any) -> None:
             self.done = list(planned)
 
-        study = Study("try", jobs, self.report, carry_out)
-        self.said = conduct(study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
-                say=lambda text: None)  # fmt: skip
+        study = Study("try", jobs, self.report, run_jobs)
+        self.said = run_study(
+            study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
+            echo=lambda text: None,
+        )  # fmt: skip
 
 
 @pytest.fixture
@@ -120,8 +122,8 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
 
     study = Study("try", [job(1)], world.report, fail)
     with pytest.raises(RunFailed):
-        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
-                say=lambda text: None)  # fmt: skip
+        run_study(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                echo=lambda text: None)  # fmt: skip
     assert not world.reported
 
 
@@ -142,16 +144,16 @@ def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: st
         return str(job(1).evaluations(place.root)[0].mean)
 
     study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
-    said = conduct(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
-                   say=lambda text: None, runs_from=[other])  # fmt: skip
+    said = run_study(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
+                   echo=lambda text: None, runs_from=[other])  # fmt: skip
     assert said == "2.0"
 
 
 def test_a_source_without_runs_leaves_no_study(world: World, tmp_path: Path) -> None:
     study = Study("try", [job(1)], world.report, lambda *_: None)
     with pytest.raises(ConfigError, match=r"--runs-from .*nowhere: expected a folder of studies"):
-        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
-                say=lambda text: None, runs_from=[tmp_path / "nowhere"])  # fmt: skip
+        run_study(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                echo=lambda text: None, runs_from=[tmp_path / "nowhere"])  # fmt: skip
     assert not (world.root / "try").exists()
 
 
