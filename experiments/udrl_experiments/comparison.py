@@ -15,7 +15,7 @@ from udrl_experiments.protocol import (
     StudyPlan,
     Task,
 )
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.records import PAPER, EvaluationRecord, agent_name
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
@@ -59,7 +59,7 @@ def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job
             algorithm="UDRL",
             settings=flat(plan.config(task, seed, paper=paper)),
             max_env_steps=plan.steps(task),
-            variant="paper" if paper else "",
+            variant=PAPER if paper else "",
         )
     chosen = tuned(participant, task.environment)
     steps = plan.steps(task, participant)
@@ -71,6 +71,7 @@ def baseline(
     config: Config,
     hyperparameters: dict[str, KeywordValue],
     max_env_steps: int,
+    variant: str = "",
 ) -> Job:
     """Return a run of an algorithm other than UDRL; DQN's exploration depends on its length."""
     exploration = float(hyperparameters.get("exploration_fraction", 0.0))
@@ -80,6 +81,7 @@ def baseline(
         hyperparameters=hyperparameters,
         exploration_steps=round(exploration * max_env_steps),
         max_env_steps=max_env_steps,
+        variant=variant,
     )
 
 
@@ -97,9 +99,9 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFol
     draw_curves(folders.folder, title, task.landmarks)
     last = {(point.algorithm, point.variant): point for point in points}
     return "\n".join(
-        f"{title}: {' '.join(words).strip()}: mean return {end.mean:.1f} after {end.env_steps:,} "
+        f"{title}: {agent_name(*agent)}: mean return {end.mean:.1f} after {end.env_steps:,} "
         f"env steps, seeds: {end.seeds}, 95 % interval {end.low:.1f} to {end.high:.1f}"
-        for words, end in last.items()
+        for agent, end in last.items()
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from udrl.errors import ConfigError
-from udrl_experiments.records import Obtained
+from udrl_experiments.records import Obtained, agent_name
 from udrl_experiments.statistics import CurvePoint
 from udrl_show.styles import line_style
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Lines that look the same in every figure, by algorithm and variant, or by algorithm alone. UDRL
 #: is green, as in the paper.
-_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL paper": 4}
+_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL-paper": 4}
 
 _AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
 
@@ -57,12 +57,13 @@ def learning_curves(
             textcoords="offset points", va="center", fontsize="small",
         )  # fmt: skip
     several = len({environment for environment, _, _ in lines}) > 1
-    agents = [(f"{algorithm} {variant}", algorithm) for _, algorithm, variant in lines]
+    agents = [(agent_name(algorithm, variant), algorithm) for _, algorithm, variant in lines]
     styles = _styles([name if name in _OWN_STYLES else algorithm for name, algorithm in agents])
     for (key, line), (rank, style) in zip(lines.items(), enumerate(styles), strict=True):
         seeds = line[0].seeds
-        words = [word for word in key[0 if several else 1 :] if word]
-        label = f"{' '.join(words)} ({seeds} {'seed' if seeds == 1 else 'seeds'})"
+        environment, algorithm, variant = key
+        name = f"{environment} " * several + agent_name(algorithm, variant)
+        label = f"{name} ({seeds} {'seed' if seeds == 1 else 'seeds'})"
         at = [getattr(point, x) / unit for point in line]
         low, mean, high = ([getattr(p, name) for p in line] for name in ("low", "mean", "high"))
         axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)

@@ -16,7 +16,7 @@ import msgspec
 from udrl.config import Budget
 from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
-from udrl_experiments.jobs import Job, read_job
+from udrl_experiments.jobs import ERROR_PREFIX, Job, read_job
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import put, read, write
@@ -38,7 +38,7 @@ def main(folder: Path, parent: int | None) -> None:
         job = read_job(folder)
         code = run_service(lambda stop: run_job(job, folder, stop))
     except UdrlError as error:
-        click.echo(f"udrl: error: {error}", err=True)
+        click.echo(f"{ERROR_PREFIX}{error}", err=True)
         code = error.exit_code
     sys.stdout.flush()
     sys.stderr.flush()

@@ -19,7 +19,7 @@ from udrl.config import Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import Machine
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.records import EvaluationRecord, agent_name
 from udrl_inspect.csv_tables import put, read
 
 #: What is said when a study is stopped.
@@ -28,6 +28,9 @@ INTERRUPTED = "stopped; resume with the same command and --resume"
 #: Files that say what a run was and what came of it. The others are its state: what it takes to
 #: extend the run, or to use its agent.
 RECORDS = "job.json", "evaluations.csv", "done.json"
+
+#: Begins the line of the log with the error of a failed run.
+ERROR_PREFIX = "udrl: error: "
 
 _PROGRAM = ("-m", "udrl_experiments.job")
 _POLL_S = 0.2
@@ -67,11 +70,10 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     @property
     def described(self) -> str:
-        """What it is, in a line."""
-        variant = f", {self.variant}" if self.variant else ""
+        """Description in one line."""
         return (
-            f"{self.algorithm}, {self.config.environment}, seed {self.config.seed}{variant}: "
-            f"{self.max_env_steps:,} env steps"
+            f"{agent_name(self.algorithm, self.variant)}, {self.config.environment}, "
+            f"seed {self.config.seed}: {self.max_env_steps:,} env steps"
         )
 
     def folder(self, root: Path) -> Path:
@@ -159,12 +161,13 @@ def run_jobs(
     waiting = [job for job in merge_jobs(jobs) if not job.done(root)][::-1]
     jobs_by_name = {job.name: job for job in waiting}
     n, running = len(waiting), dict[str, subprocess.Popen[bytes]]()
+    log_sizes: dict[str, int] = {}  # before this process of the run
     try:
         while waiting or running:
             while waiting and len(running) < side_by_side:
                 job = waiting.pop()
                 echo(f"[{n - len(waiting)}/{n}] {job.described}")
-                running[job.name] = _start(job, root)
+                running[job.name], log_sizes[job.name] = _start(job, root)
             if stop.wait(_POLL_S):
                 echo(INTERRUPTED)  # before the runs get their time to end
                 raise Interrupted(INTERRUPTED)
@@ -174,12 +177,13 @@ def run_jobs(
                     continue
                 del running[name]
                 if code != 0:
-                    raise _failure(root / "runs" / name, code)
+                    log = (root / "runs" / name / "log.txt").read_bytes()
+                    raise _failure(root / "runs" / name, code, log[log_sizes[name] :])
                 if not jobs_by_name[name].done(root):
                     raise RunFailed(
-                        f"the run in {root / 'runs' / name} has no evaluation within "
-                        f"{jobs_by_name[name].max_env_steps:,} env steps; ask for more "
-                        f"(--max-env-steps), or evaluate earlier (--set eval_every=STEPS)"
+                        f"the run in {root / 'runs' / name} ended without an evaluation within "
+                        f"{jobs_by_name[name].max_env_steps:,} env steps; raise --max-env-steps or "
+                        f"lower eval_every (--set eval_every=STEPS)"
                     )
     finally:
         _terminate(running.values())
@@ -225,21 +229,38 @@ def copy_finished(
             put(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
 
 
-def _start(job: Job, root: Path) -> subprocess.Popen[bytes]:
+def _start(job: Job, root: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """Start a process for a run; return it, and the size of the log so far in bytes."""
     folder = job.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
     put(folder / "job.json", msgspec.json.format(msgspec.json.encode(job)))
     with (folder / "log.txt").open("ab") as output:
-        return subprocess.Popen(  # noqa: S603 - our own program
+        size = output.tell()
+        process = subprocess.Popen(  # noqa: S603 - our own program
             [sys.executable, *_PROGRAM, str(folder), "--parent", str(os.getpid())],
             stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
         )  # fmt: skip
+    return process, size
 
 
-def _failure(folder: Path, code: int) -> RunFailed:
-    words = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
-    failure = RunFailed(f"the run in {folder} ended with code {code}:\n" + "\n".join(words))
-    failure.exit_code = code if code > 0 else failure.exit_code
+def _failure(folder: Path, code: int, output: bytes) -> RunFailed:
+    """Return the error of a failed run, in one line.
+
+    Args:
+        folder: folder of the run.
+        code: exit code of its process.
+        output: what the process wrote to the log.
+    """
+    log = folder / "log.txt"
+    if code < 0:
+        return RunFailed(f"the run in {folder} was killed by signal {-code}; see {log}")
+    lines = output.decode(errors="replace").split("\n")
+    # If there is no error of udrl, the last line is that of a traceback: the exception's message.
+    errors = [line for line in lines if line.startswith(ERROR_PREFIX)]
+    causes = errors or [line for line in lines if line.strip()] or ["no output"]
+    cause = causes[-1].removeprefix(ERROR_PREFIX)
+    failure = RunFailed(f"the run in {folder} failed with exit code {code}: {cause}; see {log}")
+    failure.exit_code = code
     return failure
 
 

@@ -2,6 +2,14 @@
 
 import msgspec
 
+#: Variant of the participant ``UDRL-paper``.
+PAPER = "paper"
+
+
+def agent_name(algorithm: str, variant: str) -> str:
+    """Return an agent's name in output: ``UDRL``, ``UDRL-paper``, ``UDRL lead 2``."""
+    return f"{algorithm}{'-' if variant == PAPER else ' '}{variant}".rstrip()
+
 
 class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
     """An evaluation of one agent in training (section 3.2).

@@ -12,7 +12,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
-from udrl.config import OPEN, Config, change, flat, preset
+from udrl.config import OPEN, Config, build, change, flat, preset
 from udrl.errors import ConfigError
 from udrl.fitting import fit
 from udrl.spaces import Image, Vector
@@ -138,6 +138,8 @@ def search_environment(
     drawn = {
         name: values[0] for name, values in space.lists.get("UDRL", {}).items() if name in OPEN
     }
+    with space.errors_of("UDRL"):
+        build(Config, {"environment": environment} | drawn)
     settings = gather(environment, options=own | drawn, assignments=plan.assignments)
     config = fit(settings.config, settings.left_open)
     others = [algorithm for algorithm in chosen if algorithm != "UDRL"]
@@ -222,14 +224,17 @@ def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> i
 
 def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
     steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_STEPS)
-    drawn = subject.space.draw(algorithm, number)
-    if algorithm == "UDRL":
-        config = change(subject.config, seed=seed, **drawn)
-        return Job(algorithm=algorithm, settings=flat(config), max_env_steps=steps)
-    networks = {name: drawn.pop(name) for name in subject.space.networks}
-    complete(algorithm, drawn)
-    config = shared(change(subject.config, seed=seed, **networks))
-    return baseline(algorithm, config, drawn, steps)
+    space, variant = subject.space, f"configuration {number}"
+    drawn = space.draw(algorithm, number)
+    networks = {name: drawn.pop(name) for name in space.networks}
+    with space.errors_of("networks"):
+        config = change(subject.config, seed=seed, **networks)
+    with space.errors_of(algorithm):
+        if algorithm == "UDRL":
+            settings = flat(change(config, **drawn))
+            return Job(algorithm=algorithm, settings=settings, max_env_steps=steps, variant=variant)
+        complete(algorithm, drawn)
+    return baseline(algorithm, shared(config), drawn, steps, variant)
 
 
 def _score(runs: Sequence[Job], root: Path) -> float | None:

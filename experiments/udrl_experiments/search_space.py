@@ -2,7 +2,8 @@
 
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
@@ -19,9 +20,10 @@ from udrl_experiments.protocol import NETWORKS, Algorithm
 
 
 class SearchSpace(NamedTuple):
-    """What the configurations of an environment are drawn from.
+    """Values from which the configurations of an environment are drawn.
 
     Attributes:
+        source: the file, as errors name it.
         environment: Gymnasium's id.
         configurations: how many are drawn at the paper's scale; None: as at the small scale.
         seeds: runs of each configuration at the paper's scale.
@@ -30,6 +32,7 @@ class SearchSpace(NamedTuple):
         lists: for each algorithm, values of its settings or hyperparameters.
     """
 
+    source: str
     environment: str
     configurations: int | None
     seeds: int
@@ -51,6 +54,14 @@ class SearchSpace(NamedTuple):
             key: values[int(u * len(values))]
             for (key, values), u in zip(sorted(lists.items()), numbers, strict=True)
         }
+
+    @contextmanager
+    def errors_of(self, table: str) -> Iterator[None]:
+        """Name the file and a table in each :class:`ConfigError` that is raised within."""
+        try:
+            yield
+        except ConfigError as error:
+            raise ConfigError(f"{self.source}: [{table}] {error}") from error
 
 
 def shipped_space(environment: str) -> SearchSpace:
@@ -95,18 +106,18 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     for name in values:
         if name not in (*_File.__struct_fields__, *algorithms):
             raise ConfigError(
-                f"{source}: {name}; expected configurations, seeds and the tables networks, "
-                f"{', '.join(algorithms)}"
+                f"{source}: unknown setting or table {name!r}: expected configurations, seeds, "
+                f"[networks], [{'], ['.join(algorithms)}]"
             )
     try:
         file = msgspec.convert(values, _File)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {error}; expected a number from 1, or a table") from error
+        raise ConfigError(f"{source}: {error}; see docs/studies.md") from error
     for name in file.networks:
         if name not in NETWORKS:
             raise ConfigError(
-                f"{source}: {name} in [networks]; expected settings that all algorithms have: "
-                f"{', '.join(NETWORKS)}; move it to the table of an algorithm"
+                f"{source}: [networks] {name}: expected one of {', '.join(NETWORKS)}, which all "
+                f"algorithms have; move it to the table of an algorithm"
             )
     lists = {
         name: _expanded(values[name], f"{source}: [{name}]")
@@ -115,16 +126,16 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     }
     if not lists:
         raise ConfigError(
-            f"{source}: no algorithm to search for; expected a table [{'] or ['.join(algorithms)}]"
+            f"{source}: no table of an algorithm; expected [{'] or ['.join(algorithms)}]"
         )
     for algorithm, settings in lists.items():
         if "environment" in settings:
             raise ConfigError(
-                f"{source}: environment in [{algorithm}]; the environment is the argument ENV, "
+                f"{source}: [{algorithm}] environment: the environment is the argument ENV, "
                 f"{environment!r}; leave it out"
             )
     networks = _expanded(file.networks, f"{source}: [networks]")
-    return SearchSpace(environment, file.configurations, file.seeds, networks, lists)
+    return SearchSpace(source, environment, file.configurations, file.seeds, networks, lists)
 
 
 def _expanded(table: Any, source: str) -> dict[str, list[Any]]:

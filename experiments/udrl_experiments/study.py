@@ -112,6 +112,13 @@ def _check(study: Study) -> None:
                 f"the study {study.name} needs the module {module}, which is not installed; "
                 f'install it with: pip install "udrl[box2d,doom,studies]"'
             )
+    for job in study.jobs:
+        every = job.config.evaluation.eval_every
+        if job.max_env_steps < every:
+            raise ConfigError(
+                f"a run of {job.max_env_steps:,} env steps has no evaluation, because eval_every = "
+                f"{every:,}; raise --max-env-steps or lower eval_every (--set eval_every=STEPS)"
+            )
     strategies = {job.config.commands.command_strategy: job.config for job in study.jobs}
     for config in strategies.values():
         make_strategy(config)
@@ -128,8 +135,9 @@ def _write_plan(study: Study, folders: StudyFolders, *, resume: bool) -> None:
             )
         planned: dict[tuple[str, str], int] = {}
         for job in study.jobs:
-            key = job.name, job.variant
-            planned[key] = max(planned.get(key, 0), job.max_env_steps)
+            for variant in (job.variant, ""):  # earlier searches have runs without a variant
+                key = job.name, variant
+                planned[key] = max(planned.get(key, 0), job.max_env_steps)
         for job in read_study(file):
             if planned.get((job.name, job.variant), 0) < job.max_env_steps:
                 raise ConfigError(

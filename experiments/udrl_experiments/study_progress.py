@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
 from udrl_experiments.jobs import Job, merge_jobs
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.records import EvaluationRecord, agent_name
 from udrl_experiments.study import read_study
 from udrl_inspect.csv_tables import read
 from udrl_inspect.inspection import read_status
@@ -99,11 +99,11 @@ def table(name: str, runs: Sequence[JobProgress]) -> list[str]:
 
 def _cells(run: JobProgress) -> tuple[str, ...]:
     job = run.job
-    parts = (job.algorithm, job.variant, job.config.environment, f"seed {job.config.seed}")
+    agent = agent_name(job.algorithm, job.variant)
     return (
         run.state,
         f"{run.env_steps:,} of {job.max_env_steps:,}",
         duration(run.wall_s) if run.wall_s else "",
         "" if run.mean is None else return_text(run.mean),
-        " ".join(part for part in parts if part),
+        f"{agent} {job.config.environment} seed {job.config.seed}",
     )

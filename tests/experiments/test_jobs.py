@@ -242,9 +242,33 @@ def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
     assert not is_running(WhenItRuns(lasting.folder(tmp_path)).pid)
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("raise ValueError('no luck')", r"failed with exit code 1: ValueError: no luck; see .*log"),
+        (
+            "print('udrl: error: full\\nlast lines of a service', file=sys.stderr); sys.exit(8)",
+            "failed with exit code 8: full; see",
+        ),
+        ("sys.exit(3)", "failed with exit code 3: no output; see"),
+        ("os.kill(os.getpid(), 9)", "was killed by signal 9; see"),
+    ],
+)
+def test_a_failure_is_one_line_with_its_cause(
+    tmp_path: Path, program: Callable[[str], None], line: str, message: str
+) -> None:
+    folder = job().folder(tmp_path)
+    folder.mkdir(parents=True)
+    (folder / "log.txt").write_text("udrl: error: of an earlier process\n", encoding="utf-8")
+    program(line)
+    with pytest.raises(RunFailed, match=message) as raised:
+        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+    assert "\n" not in str(raised.value)
+
+
 def test_a_run_without_evaluations_is_told(tmp_path: Path, program: Callable[[str], None]) -> None:
     program("")
-    with pytest.raises(RunFailed, match=r"no evaluation within 1,000 env steps; ask for more"):
+    with pytest.raises(RunFailed, match=r"without an evaluation within 1,000 env steps; raise"):
         run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
 
 

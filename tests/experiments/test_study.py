@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from udrl.config import Config, flat
+from udrl.config import Config, build, flat
 from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
@@ -19,9 +19,11 @@ from udrl_experiments.study import Study, StudyFolders, run_study
 from udrl_inspect.csv_tables import write
 
 
-def job(seed: int, max_env_steps: int = 100) -> Job:
-    return Job(algorithm="UDRL", settings=flat(Config(environment="CartPole-v1", seed=seed)),
-               max_env_steps=max_env_steps)  # fmt: skip
+def job(seed: int, max_env_steps: int = 100, variant: str = "") -> Job:
+    config = build(Config, {"environment": "CartPole-v1", "seed": seed, "eval_every": 5})
+    return Job(
+        algorithm="UDRL", settings=flat(config), max_env_steps=max_env_steps, variant=variant
+    )
 
 
 class World:
@@ -81,7 +83,7 @@ def test_what_is_missing_is_told_before_the_first_run(
     world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    settings = flat(Config(environment="LunarLander-v3"))
+    settings = flat(job(1).config) | {"environment": "LunarLander-v3"}
     needy = msgspec.structs.replace(job(1), algorithm=algorithm, settings=settings)
     with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[box2d,doom,studies\]"'):
         world.conduct(needy)
@@ -107,6 +109,22 @@ def test_it_does_not_go_on_with_less(world: World, jobs: tuple[Job, ...]) -> Non
     world.conduct(job(1))
     with pytest.raises(ConfigError, match=r"seed 1: 100 env steps, which is not in this one"):
         world.conduct(*jobs, resume=True)
+
+
+def test_a_search_begun_without_variants_is_resumed(world: World) -> None:
+    world.conduct(job(1))
+    world.conduct(job(1, variant="configuration 0"), resume=True)
+    with pytest.raises(ConfigError, match=r"configuration 0, .*which is not in this one"):
+        world.conduct(job(1), resume=True)
+
+
+def test_a_run_that_is_too_short_for_an_evaluation_is_refused(world: World) -> None:
+    world.conduct(job(1, 5))
+    with pytest.raises(
+        ConfigError, match=r"a run of 4 env steps has no evaluation, because eval_every = 5; raise"
+    ):
+        world.conduct(job(2, 4), resume=True)
+    assert world.done == [job(1, 5)]
 
 
 def test_a_damaged_book_is_told(world: World) -> None:

@@ -81,6 +81,17 @@ def test_the_table_has_a_summary_and_a_line_for_each_run() -> None:
     ]
 
 
+def test_runs_of_the_papers_preset_and_of_configurations_are_named() -> None:
+    runs = [
+        JobProgress(msgspec.structs.replace(job(1, variant=variant), algorithm="UDRL"), "not begun")
+        for variant in ("paper", "configuration 3")
+    ]
+    assert [line.split("  ")[-1].strip() for line in table("search", runs)[2:]] == [
+        "UDRL-paper CartPole-v1 seed 1",
+        "UDRL configuration 3 CartPole-v1 seed 1",
+    ]
+
+
 def test_the_command_starts_nothing(tmp_path: Path) -> None:
     plan(tmp_path, "lander", job(1))
     plan(tmp_path, "sparse", job(2))
