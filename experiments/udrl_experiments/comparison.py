@@ -21,7 +21,7 @@ from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
-#: Table and figure against each quantity, without suffix.
+#: Table and figure for each x axis, without suffix.
 _FILES = {
     "env_steps": ("curves", "learning-curves"),
     "wall_s": ("curves-wall-time", "learning-curves-wall-time"),
@@ -32,9 +32,9 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
 
     Args:
-        name: of the task.
+        name: name of the task.
         plan: seeds and steps.
-        participants: the lines of the figure.
+        participants: one line of the figure each; duplicates are ignored.
     """
     task = TASKS[name]
     jobs = [
@@ -44,9 +44,9 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
     ]
 
     def report(folders: StudyFolders) -> str:
-        said = report_curves(jobs, task, task.title, folders)
+        summary = report_curves(jobs, task, task.title, folders)
         report_wall_time(jobs, task, task.title, folders)
-        return said
+        return summary
 
     return Study(name, jobs, report)
 
@@ -73,7 +73,15 @@ def baseline(
     max_env_steps: int,
     variant: str = "",
 ) -> Job:
-    """Return a run of an algorithm other than UDRL; DQN's exploration depends on its length."""
+    """Return a run of an algorithm other than UDRL.
+
+    Args:
+        algorithm: the algorithm.
+        config: environment, networks, seed and evaluations.
+        hyperparameters: those that differ from the defaults.
+        max_env_steps: length of the run. DQN's exploration depends on it.
+        variant: as in :class:`~udrl_experiments.jobs.Job`.
+    """
     exploration = float(hyperparameters.get("exploration_fraction", 0.0))
     return Job(
         algorithm=algorithm,
@@ -86,10 +94,10 @@ def baseline(
 
 
 def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> str:
-    """Write all evaluations, their curves, and when returns were reached; draw the curves.
+    """Write the tables of evaluations, curves and reached thresholds, and draw the curves.
 
     Returns:
-        A line for each curve: where it ends.
+        One line for each curve, with its last point.
     """
     rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(folders.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
@@ -106,10 +114,9 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFol
 
 
 def report_wall_time(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> None:
-    """Write and draw the curves against wall time, of runs on one kind of machine.
+    """Write and draw the curves against wall time for runs on the most frequent kind of machine.
 
-    It is the one that most runs were made on, and the figure names it. Nothing is written if no
-    run's machine is known.
+    The figure names the machine. Nothing is written if no run's machine is known.
     """
     machines = {job.name: job.machine(folders.root) for job in jobs}
     known = Counter(machine for machine in machines.values() if machine is not None)
@@ -129,7 +136,7 @@ def draw_curves(
     landmarks: Mapping[str, float],
     x: Literal["env_steps", "wall_s"] = "env_steps",
 ) -> None:
-    """Draw the curves from their table alone."""
+    """Draw the curves from their table."""
     table, picture = _FILES[x]
     points = read(folder / f"{table}.csv", CurvePoint)
     figures.save(

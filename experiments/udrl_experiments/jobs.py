@@ -1,7 +1,7 @@
-"""Training runs, the unit of every study: a process each, side by side, resumed where they stopped.
+"""Jobs: the runs of a study. Each is a process; several run in parallel, and each can be resumed.
 
-A run is a function of its settings, so studies share runs: whoever asks for the same settings gets
-the same run, and asks only for as many of its steps as it wants.
+A run is a function of its settings, so studies share runs: jobs with equal settings are the same
+run. A study uses the evaluations of a run up to the number of steps that it needs.
 """
 
 import hashlib
@@ -22,11 +22,11 @@ from udrl_experiments.provenance import Machine
 from udrl_experiments.records import EvaluationRecord, agent_name
 from udrl_inspect.csv_tables import put, read
 
-#: What is said when a study is stopped.
+#: Message of an interrupted study.
 INTERRUPTED = "stopped; resume with the same command and --resume"
 
-#: Files that say what a run was and what came of it. The others are its state: what it takes to
-#: extend the run, or to use its agent.
+#: Files with a run's settings and results. The others are its state, which is needed to extend the
+#: run or to use its agent.
 RECORDS = "job.json", "evaluations.csv", "done.json"
 
 #: Begins the line of the log with the error of a failed run.
@@ -34,7 +34,7 @@ ERROR_PREFIX = "udrl: error: "
 
 _PROGRAM = ("-m", "udrl_experiments.job")
 _POLL_S = 0.2
-#: Seconds that a run gets to end when it is told to.
+#: Seconds between SIGTERM and SIGKILL.
 _END_S = 10.0
 
 
@@ -42,12 +42,12 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """A run that a study needs.
 
     Attributes:
-        algorithm: the learner.
-        settings: UDRL's; of another algorithm's, environment, networks and evaluations.
-        hyperparameters: of another algorithm than UDRL.
-        exploration_steps: over which DQN's part of random actions falls is a part of so many.
-        max_env_steps: how far.
-        variant: what sets it apart within the study; not a part of what the run is.
+        algorithm: the algorithm.
+        settings: settings of UDRL. Other algorithms use its environment, networks and evaluations.
+        hyperparameters: hyperparameters of other algorithms.
+        exploration_steps: env steps over which DQN's exploration rate decreases; 0 for others.
+        max_env_steps: length of the run.
+        variant: label that distinguishes agents of a study; not part of the run's identity.
     """
 
     algorithm: Algorithm
@@ -59,7 +59,7 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     @property
     def name(self) -> str:
-        """A name that only runs of equal settings have."""
+        """Name of the run, with a hash of its settings: equal settings, equal names."""
         identity = msgspec.json.encode(
             [self.algorithm, flat(self.config), self.hyperparameters, self.exploration_steps],
             order="sorted",
@@ -77,11 +77,11 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         )
 
     def folder(self, root: Path) -> Path:
-        """Return where the run lives."""
+        """Return the folder of the run."""
         return root / "runs" / self.name
 
     def done(self, root: Path) -> bool:
-        """Say whether the run has got as far as is asked."""
+        """Return whether the run is finished, with at least ``max_env_steps``."""
         done = self._done(root)
         try:
             return (
@@ -93,7 +93,7 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             return False
 
     def machine(self, root: Path) -> Machine | None:
-        """Return the kind of machine that did the run, or its last part; None if unknown."""
+        """Return the kind of machine of the run, or of its last part; None if unknown."""
         done = self._done(root)
         return None if done is None else done.machine
 
@@ -106,10 +106,12 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             return None
 
     def evaluations(self, root: Path) -> list[EvaluationRecord]:
-        """Return the run's evaluations up to the last multiple of ``eval_every`` asked for.
+        """Return the run's evaluations up to ``max_env_steps``.
+
+        An evaluation counts at the multiple of ``eval_every`` that it was due at.
 
         Raises:
-            InvalidData: they cannot be read.
+            InvalidData: the table cannot be read.
         """
         every = self.config.evaluation.eval_every
         return [
@@ -120,22 +122,22 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class _DoneRecord(msgspec.Struct, frozen=True):
-    """What ``done.json`` says of a run."""
+    """The fields of ``done.json`` that are read."""
 
     max_env_steps: int
     machine: Machine | None = None
 
 
 def read_job(folder: Path) -> Job:
-    """Return the job of a folder.
+    """Return the job in a folder.
 
     Raises:
-        InvalidData: there is none.
+        InvalidData: ``job.json`` is missing or invalid.
     """
     try:
         return msgspec.json.decode((folder / "job.json").read_bytes(), type=Job)
     except (OSError, msgspec.DecodeError, ConfigError) as error:
-        raise InvalidData(f"{folder / 'job.json'}: {error}; expected a study's run") from error
+        raise InvalidData(f"{folder / 'job.json'}: {error}; expected the job of a study") from error
 
 
 def run_jobs(
@@ -145,14 +147,14 @@ def run_jobs(
     stop: threading.Event,
     echo: Callable[[str], None],
 ) -> None:
-    """Do all runs that are not done, some side by side; the first that fails ends the others.
+    """Run all jobs that are not done, several at a time. A failure ends the others.
 
     Args:
-        jobs: equal runs are done once, as far as the one that asks for most.
-        root: where runs live.
-        side_by_side: how many at a time.
-        stop: ends them early; they go on next time.
-        echo: is told what begins and what ends.
+        jobs: the jobs. Those of the same run are merged (:func:`merge_jobs`).
+        root: folder of the folder ``runs``.
+        side_by_side: number of simultaneous runs.
+        stop: ends the runs early. They can be resumed.
+        echo: called with each line of progress.
 
     Raises:
         RunFailed: a run failed.
@@ -169,7 +171,7 @@ def run_jobs(
                 echo(f"[{n - len(waiting)}/{n}] {job.described}")
                 running[job.name], log_sizes[job.name] = _start(job, root)
             if stop.wait(_POLL_S):
-                echo(INTERRUPTED)  # before the runs get their time to end
+                echo(INTERRUPTED)  # now, because the runs may take seconds to end
                 raise Interrupted(INTERRUPTED)
             for name, process in list(running.items()):
                 code = process.poll()
@@ -190,7 +192,7 @@ def run_jobs(
 
 
 def merge_jobs(jobs: Iterable[Job]) -> Sequence[Job]:
-    """Return jobs of different runs, each as far as anyone asks, in order of first appearance."""
+    """Return one job per run, the longest, in the order of first appearance."""
     merged: dict[str, Job] = {}
     for job in jobs:
         kept = merged.setdefault(job.name, job)
@@ -202,22 +204,22 @@ def merge_jobs(jobs: Iterable[Job]) -> Sequence[Job]:
 def copy_finished(
     jobs: Iterable[Job], root: Path, sources: Sequence[Path], echo: Callable[[str], None]
 ) -> None:
-    """Copy the records of runs that are done in other folders of studies, and not in this one.
+    """Copy the records of runs that are finished in other folders of studies but not in this one.
 
     Args:
         jobs: as for :func:`run_jobs`.
-        root: where runs live.
-        sources: the other folders; the first that has a run counts.
-        echo: receives a line for each run that is copied.
+        root: folder of the folder ``runs``.
+        sources: the other folders. The first with the finished run is used.
+        echo: called with a line for each copied run.
 
     Raises:
-        ConfigError: a source has no runs.
+        ConfigError: a source has no folder ``runs``.
     """
     for source in sources:
         if not (source / "runs").is_dir():
             raise ConfigError(
-                f"--runs-from {source}: expected a folder of studies with the folder runs in it; "
-                f"name what was given to --folder"
+                f"--runs-from {source}: expected a folder of studies, which contains the folder "
+                f"runs; name the --folder of another study"
             )
     for job in merge_jobs(jobs):
         finished = next((source for source in sources if job.done(source)), None)

@@ -1,4 +1,4 @@
-"""The spaces that a search draws from: those of Appendix B.1 (``spaces/``), and users' files."""
+"""Search spaces: those of Appendix B (``spaces/``), and files of users."""
 
 import hashlib
 import tomllib
@@ -25,11 +25,12 @@ class SearchSpace(NamedTuple):
     Attributes:
         source: the file, as errors name it.
         environment: Gymnasium's id.
-        configurations: how many are drawn at the paper's scale; None: as at the small scale.
-        seeds: runs of each configuration at the paper's scale.
-        networks: values of settings that all algorithms have, among
-            :data:`~udrl_experiments.protocol.NETWORKS`.
-        lists: for each algorithm, values of its settings or hyperparameters.
+        configurations: number of configurations per algorithm at the paper's scale; None: the
+            number at the small scale.
+        seeds: runs per configuration at the paper's scale.
+        networks: values of settings that all algorithms have
+            (:data:`~udrl_experiments.protocol.NETWORKS`), by setting.
+        lists: for each algorithm, values of its settings or hyperparameters, by name.
     """
 
     source: str
@@ -40,11 +41,11 @@ class SearchSpace(NamedTuple):
     lists: dict[Algorithm, dict[str, list[Any]]]
 
     def draw(self, algorithm: Algorithm, configuration: int) -> dict[str, Any]:
-        """Return the settings of a configuration: a value of every list, each as likely.
+        """Return the settings of a configuration: from each list a value, uniformly drawn.
 
         Args:
-            algorithm: one that the space has.
-            configuration: its number, from 0; the settings are a function of it.
+            algorithm: an algorithm in the space.
+            configuration: number of the configuration, from 0; it determines the settings.
         """
         lists = self.networks | self.lists[algorithm]
         name = f"udrl/search/1|{self.environment}|{algorithm}|{configuration}"
@@ -65,7 +66,7 @@ class SearchSpace(NamedTuple):
 
 
 def shipped_space(environment: str) -> SearchSpace:
-    """Return the space of Appendix B.1 for one of the paper's environments."""
+    """Return the space of Appendix B for one of the paper's environments."""
     name = f"{environment}.toml"
     text = (resources.files("udrl_experiments") / "spaces" / name).read_text(encoding="utf-8")
     return _space(environment, tomllib.loads(text), name)
@@ -75,13 +76,13 @@ def read_space(environment: str, file: Path) -> SearchSpace:
     """Return the space in a file.
 
     Raises:
-        ConfigError: it cannot be read, or it is no space.
+        ConfigError: the file cannot be read, or is not a valid space.
     """
     return _space(environment, read_toml(file), str(file))
 
 
 class _Logspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers from 10^low to 10^high in equal ratios: ``[low, high, how many]``."""
+    """``[low, high, n]``: n numbers from 10^low to 10^high, in equal ratios."""
 
     logspace: tuple[
         Annotated[float, Meta(ge=-300, le=300)],
@@ -94,7 +95,7 @@ _Values = Annotated[list[Any], Meta(min_length=1)] | _Logspace
 
 
 class _File(msgspec.Struct, frozen=True):
-    """What a file says besides the tables of algorithms."""
+    """The content of a file, except for the tables of algorithms."""
 
     configurations: PositiveInt | None = None
     seeds: PositiveInt = 1
@@ -139,7 +140,7 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
 
 
 def _expanded(table: Any, source: str) -> dict[str, list[Any]]:
-    """Return the lists of a table, with those written as ``logspace`` expanded."""
+    """Return the lists of a table, with ``logspace`` expanded."""
     if not isinstance(table, dict):
         raise ConfigError(f"{source} = {table!r}: expected a table of lists")
     lists = {}

@@ -276,5 +276,5 @@ def test_nobody_else_works_on_a_run(tmp_path: Path) -> None:
     dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=10)
     with (tmp_path / "lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(RunInUse, match="another study works on the run"):
+        with pytest.raises(RunInUse, match="another process is running"):
             run_job(dqn, tmp_path, threading.Event())

@@ -93,7 +93,7 @@ def test_what_is_missing_is_told_before_the_first_run(
 
 def test_a_study_is_not_done_over_another(world: World) -> None:
     world.conduct(job(1))
-    with pytest.raises(ConfigError, match=r"holds a study already; resume it with --resume"):
+    with pytest.raises(ConfigError, match=r"already contains a study; pass --resume to resume it"):
         world.conduct(job(1))
 
 
@@ -184,5 +184,5 @@ def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World)
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"--folder .*file.*name a folder that you may write"):
+    with pytest.raises(ConfigError, match=r"--folder .*file.*choose a writable folder"):
         World(tmp_path / "file").conduct(job(1))

@@ -61,10 +61,10 @@ def test_a_study_that_does_not_share_its_runs_has_them_in_its_folder(tmp_path: P
 
 
 def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"holds no study; begin one with"):
+    with pytest.raises(ConfigError, match=r"contains no study; start one"):
         list(studies(tmp_path, ()))
     plan(tmp_path, "lander", job(1))
-    with pytest.raises(ConfigError, match=r"holds no study moon; there are lander"):
+    with pytest.raises(ConfigError, match=r"contains no study moon; expected one of lander"):
         list(studies(tmp_path, ("moon",)))
 
 

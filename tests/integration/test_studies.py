@@ -67,10 +67,10 @@ def test_a_comparison_is_interrupted_and_goes_on(
 
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), *SETTINGS, *whole).finish()
     assert code == 2
-    assert "holds a study already; resume it with --resume" in error
+    assert "already contains a study; pass --resume to resume it" in error
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), "--resume").finish()
     assert code == 2
-    assert "which is not in this one; give the options that it was begun with" in error
+    assert "which is not in this one; pass the original options" in error
 
     folder = study("lander", *whole, "--resume", root=tmp_path)
     assert first.stat().st_mtime_ns == done_at
