@@ -1,6 +1,6 @@
-# Everything starts here: `make train` and `make test` set up what they need.
+# All targets install what they need; see CONTRIBUTING.md.
 #
-# People without a GPU can name an index of CPU-only torch wheels, which saves gigabytes:
+# Without a GPU, an index of CPU-only torch wheels saves gigabytes:
 #   make train TORCH_INDEX=...
 
 VENV ?= .venv
@@ -16,46 +16,46 @@ PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --qu
 
 .PHONY: train test test-slow test-browser test-compose lint format types docs bench chaos soak fuzz setup setup-dev clean
 
-train: setup  ## Train LunarLander until it is solved: a mean return of 200.
+train: setup  ## Train LunarLander to a mean return of 200.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 200 $(ARGS)
 
-test: setup-dev  ## The tests, except the slow ones.
+test: setup-dev  ## Run the tests, except the slow ones.
 	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 2 $(ARGS)
 
-test-slow: setup-dev  ## What is too slow for `make test`.
+test-slow: setup-dev  ## Run the slow tests.
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)
 
-test-browser: setup-dev  ## The board in Chromium; skipped where there is none.
+test-browser: setup-dev  ## Test the board in Chromium; skipped if there is none.
 	$(VENV)/bin/python -m pytest -m browser $(ARGS)
 
-test-compose: setup-dev  ## The containers, with a real Docker engine; skipped where there is none.
+test-compose: setup-dev  ## Test the containers with Docker; skipped if there is no engine.
 	$(VENV)/bin/python -m pytest -m compose $(ARGS)
 
-lint: setup-dev  ## Linter, formatter, and the direction of imports.
+lint: setup-dev  ## Run ruff (rules and format) and import-linter.
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/lint-imports
 
-format: setup-dev  ## Format the code.
+format: setup-dev  ## Format the code and fix what ruff can fix.
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
 
-types: setup-dev  ## The type checker.
+types: setup-dev  ## Run mypy.
 	$(VENV)/bin/mypy
 
-docs: $(VENV)/.installed-docs  ## The documentation as a site, in build/site; a broken link is an error.
+docs: $(VENV)/.installed-docs  ## Build the documentation in build/site; broken links are errors.
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict $(ARGS)
 
-bench: setup-dev  ## Speed: the whole system beside the limit of its parts (docs/performance.md).
+bench: setup-dev  ## Measure speed (docs/performance.md).
 	$(VENV)/bin/python benchmarks/speed.py $(ARGS)
 
-chaos: setup-dev  ## Faults in real runs, and what they cost (docs/reliability.md).
+chaos: setup-dev  ## Inject faults into real runs (docs/reliability.md).
 	$(VENV)/bin/python benchmarks/chaos.py $(ARGS)
 
-soak: setup-dev  ## Half an hour of a run: memory, descriptors, threads (docs/reliability.md).
+soak: setup-dev  ## Check a run of half an hour for growing memory (docs/reliability.md).
 	$(VENV)/bin/python benchmarks/soak.py $(ARGS)
 
-fuzz: setup-dev  ## A million inputs for every decoder and queryable (SECURITY.md).
+fuzz: setup-dev  ## Fuzz every decoder and queryable (SECURITY.md).
 	$(PIP_INSTALL) --editable '.[$(EXTRAS),dev,fuzz]'
 	$(VENV)/bin/python -m tests.fuzz coverage $(ARGS)
 	$(VENV)/bin/python -m tests.fuzz hypothesis $(ARGS)

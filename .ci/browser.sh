@@ -1,7 +1,6 @@
-# Sourced by .ci/run: Chromium, if this machine can have it.
+# Sourced by .ci/run: installs Chromium if it is missing, on Debian as root.
 #
-# Where there is none and this is Debian with root's rights, the distribution's package gives one. Sets
-# NO_BROWSER to the reason if there is none in the end.
+# Sets NO_BROWSER to the reason if there is no Chromium afterwards.
 
 browser() {
     command -v chromium >/dev/null && return

@@ -1,10 +1,9 @@
-# Sourced by .ci/run: a Docker engine, if this machine can have one.
+# Sourced by .ci/run: installs and starts a Docker engine if none is running, on Debian as root.
 #
-# Where none answers and this is Debian with root's rights, the distribution's packages give one. Where the
-# usual base image cannot be pulled, one is made of the distribution's own packages; the certificates and
-# folders of wheels that pip is configured with here go into the image that is only built in.
-# Sets BASE_IMAGE, BUILD_IMAGE if it made them, ENGINE to the process that it started, and NO_DOCKER to
-# the reason if nothing can be tested.
+# If the base image cannot be pulled, base and build images are made from Debian packages. The build image
+# gets pip's certificates and wheel folders of this machine.
+# Sets BASE_IMAGE and BUILD_IMAGE if it made images, ENGINE to the process if it started the engine, and
+# NO_DOCKER to the reason if the containers cannot be tested.
 
 docker_log=${TMPDIR:-/tmp}/udrl-docker.log
 
@@ -14,7 +13,7 @@ answers() {
 
 engine() {
     answers && return
-    NO_DOCKER="no Docker engine with Compose answers"
+    NO_DOCKER="no Docker engine with Compose is running"
     [ "$(id -u)" = 0 ] && grep -qx ID=debian /etc/os-release || return 1
     NO_DOCKER="the engine cannot be installed; see $docker_log"
     export DEBIAN_FRONTEND=noninteractive
@@ -22,7 +21,7 @@ engine() {
     timeout 600 apt-get -qq install --no-install-recommends docker.io docker-compose debootstrap iptables \
         >>"$docker_log" 2>&1 || return 1
     unset NO_DOCKER
-    answers && return  # the package has started it
+    answers && return  # started by the package
     NO_DOCKER="the engine does not start; see $docker_log"
     setsid dockerd >>"$docker_log" 2>&1 &
     ENGINE=$!
@@ -34,7 +33,7 @@ engine() {
 }
 
 images() (
-    # A subshell of its own, since what stands before || does not end at the first failure.
+    # `set -e` has no effect before ||, so each step exits on failure, in a subshell.
     docker image inspect udrl-ci-base udrl-ci-build >/dev/null 2>&1 && exit
     exec >>"$docker_log" 2>&1
     made=$(mktemp -d)
@@ -62,5 +61,5 @@ if engine; then
     docker image inspect python:3.11-slim-bookworm >/dev/null 2>&1 ||
         timeout 300 docker pull --quiet python:3.11-slim-bookworm >>"$docker_log" 2>&1 ||
         { images && export BASE_IMAGE=udrl-ci-base BUILD_IMAGE=udrl-ci-build; } ||
-        NO_DOCKER="there is no image to build on; see $docker_log"
+        NO_DOCKER="there is no base image; see $docker_log"
 fi

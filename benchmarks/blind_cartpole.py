@@ -1,4 +1,4 @@
-"""CartPole without its velocities, so that one observation does not tell where the pole falls."""
+"""CartPole without velocities, so that a single observation is not enough to act well."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
 
 class BlindCartPole(gym.ObservationWrapper[Any, Any, Any]):
-    """Shows the cart's position and the pole's angle."""
+    """Observes only the cart's position and the pole's angle."""
 
     def __init__(self, **kwargs: Any) -> None:
         env = CartPoleEnv(**kwargs)
@@ -19,7 +19,7 @@ class BlindCartPole(gym.ObservationWrapper[Any, Any, Any]):
         self.observation_space = gym.spaces.Box(space.low[kept], space.high[kept], dtype=np.float32)
 
     def observation(self, observation: Any) -> Any:
-        """Leave the velocities out."""
+        """Remove the velocities."""
         return observation[[0, 2]]
 
 

@@ -1,12 +1,12 @@
-"""What a board costs the run that it shows: the same run with and without one that is looked at.
+"""The board's effect on the speed of a run: the same run with and without a board in use.
 
 ::
 
     .venv/bin/python benchmarks/board.py
 
-Runs with and without take turns; all are equal, so the same iterations are compared. A client asks
-the board for news once a second, as a page does. The board starts while the run goes on: what it
-costs is told with and without its start.
+Runs with and without a board alternate. All have the same settings, so the same iterations are
+compared. A client requests news from the board once a second, as a page does. The board starts
+during the run; figures are printed with and without its start.
 """
 
 import argparse
@@ -26,14 +26,14 @@ UDRL = [sys.executable, "-m", "udrl_launch"]
 
 
 class Run(NamedTuple):
-    """What a run came to.
+    """Figures of a run.
 
     Attributes:
-        speed: env steps per second, of the whole run.
-        later: of its second half, when the board has started.
-        asked: how often the board was asked.
-        cpu_s: seconds that the board computed, its start included.
-        start_s: its start alone.
+        speed: env steps per second of the whole run.
+        later: env steps per second of the second half, when the board has started.
+        asked: number of requests to the board.
+        cpu_s: CPU seconds of the board, including its start.
+        start_s: CPU seconds of the board's start.
     """
 
     speed: float
@@ -44,7 +44,7 @@ class Run(NamedTuple):
 
 
 def train(folder: Path, env_steps: int, *, watched: bool) -> Run:
-    """Train, and return how fast it was."""
+    """Train, and return the figures of the run."""
     run_dir = folder / "run"
     training = subprocess.Popen(
         [*UDRL, "train", "LunarLander-v3", "--run-dir", str(run_dir), "--json",
@@ -63,7 +63,7 @@ def train(folder: Path, env_steps: int, *, watched: bool) -> Run:
 
 
 def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float, float]:
-    """Look at a board until the training ends; return how often, and what it computed."""
+    """Poll a board until training ends; return requests, CPU seconds, and those of its start."""
     while not (run_dir / "run.sqlite").exists():
         time.sleep(0.1)
     board = subprocess.Popen([*UDRL, "board", str(run_dir)], stdout=subprocess.PIPE, text=True)
@@ -71,7 +71,7 @@ def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float
     address = board.stdout.readline().split()[1]
     start_s = _cpu_s(board.pid)
     asked, after, run_id = 0, -1, ""
-    while _goes_on(training, 1.0):
+    while _is_running(training, 1.0):
         url = f"{address}news?after={after}&run={run_id}"
         with urllib.request.urlopen(url, timeout=20) as answer:  # noqa: S310 - our own
             news = json.load(answer)
@@ -84,8 +84,8 @@ def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float
     return asked, cpu_s, start_s
 
 
-def _goes_on(training: subprocess.Popen[bytes], seconds: float) -> bool:
-    """Wait, and say whether the training still goes on."""
+def _is_running(training: subprocess.Popen[bytes], seconds: float) -> bool:
+    """Wait, and return whether training is still in progress."""
     try:
         training.wait(seconds)
     except subprocess.TimeoutExpired:
@@ -94,7 +94,7 @@ def _goes_on(training: subprocess.Popen[bytes], seconds: float) -> bool:
 
 
 def _cpu_s(pid: int) -> float:
-    """Return the seconds that a process has computed (Linux)."""
+    """Return the CPU seconds of a process (Linux)."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -111,13 +111,13 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 run = train(Path(folder), options.env_steps, watched=watched)
             runs[watched].append(run)
-            said = f"{run.speed:,.0f} env steps/s, of the second half {run.later:,.0f}"
+            figures = f"{run.speed:,.0f} env steps/s, second half {run.later:,.0f}"
             if watched:
-                said += (
-                    f"; a board asked {run.asked} times computed {run.cpu_s:.1f} s, "
+                figures += (
+                    f"; {run.asked} requests to the board, which used {run.cpu_s:.1f} s of CPU, "
                     f"{run.start_s:.1f} s of them to start"
                 )
-            print(f"{number + 1}: {'with' if watched else 'without'}: {said}", flush=True)
+            print(f"{number + 1}: {'with' if watched else 'without'}: {figures}", flush=True)
     for watched, found in runs.items():
         for name in ("speed", "later"):
             speeds = [getattr(run, name) for run in found]

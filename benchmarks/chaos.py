@@ -1,11 +1,11 @@
-"""Faults survived, result unchanged: disturb real runs at random moments, compare their results.
+"""Fault injection: disturb real runs at random moments, and compare their results.
 
-For each fault a run of its own is disturbed ``--repeats`` times, at moments drawn from ``--seed``,
-and compared with a run that nobody disturbed (``docs/reliability.md`` explains the columns)::
+For each fault, a run is disturbed ``--repeats`` times, at moments drawn from ``--seed``, and
+compared with an undisturbed run (``docs/reliability.md`` explains the columns)::
 
     .venv/bin/python benchmarks/chaos.py --repeats 3
 
-Exit code 1: a digest differs, a ledger does not balance, or a run did not end as it should.
+Exit code 1: a digest differs, a ledger does not balance, or a run did not end as expected.
 """
 
 import argparse
@@ -39,10 +39,10 @@ from udrl_launch.settings import Settings, gather
 from udrl_proto.reports import Status
 
 _HERE = Path(__file__).parent
-#: ``--hang-timeout`` where environments hang; elsewhere it must not notice a stopped actor.
+#: ``--hang-timeout`` of runs with hanging environments. In other runs it must exceed the stops.
 _HANG_S = 4.0
 _NEVER_S = 60.0
-#: Seconds after a disturbance in which it is noticed, if ever.
+#: Seconds after a disturbance in which log lines count as its detection.
 _NOTICED_S = 4.0
 _OPTIONS: dict[str, dict[str, Any]] = {
     # Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
@@ -56,7 +56,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 
 
 class Injection(msgspec.Struct):
-    """What followed one disturbance, in seconds; None: not measured."""
+    """Times until the effects of a disturbance, in seconds; None: not measured."""
 
     detected: float | None = None
     reported_by: str = ""
@@ -66,7 +66,7 @@ class Injection(msgspec.Struct):
 
 
 class Row(msgspec.Struct):
-    """What became of a run under one fault."""
+    """The result of a run with one fault."""
 
     fault: str
     equal: bool
@@ -82,20 +82,20 @@ class Row(msgspec.Struct):
 
     @property
     def passed(self) -> bool:
-        """Whether the fault left no trace in the result."""
+        """Whether the fault did not affect the result."""
         return self.equal and self.balanced and self.as_expected and not self.lost
 
 
 def main() -> int:
-    """Disturb, compare, print."""
+    """Disturb the runs, compare them and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="CartPole-v1", choices=sorted(_OPTIONS))
     parser.add_argument("--faults", nargs="+", metavar="NAME", choices=[f.name for f in FAULTS])
-    parser.add_argument("--repeats", type=int, default=3, help="disturbances in a run, at most 5")
+    parser.add_argument("--repeats", type=int, default=3, help="disturbances per run, at most 5")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--limit", type=float, default=240.0, help="seconds that a run may take")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the runs there")
+    parser.add_argument("--limit", type=float, default=240.0, help="time limit of a run in seconds")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the runs in FOLDER")
     options = parser.parse_args()
     os.environ["PYTHONPATH"] = os.pathsep.join([str(_HERE), *sys.path])
     os.environ["UDRL_CHAOS_SEED"] = str(options.seed)
@@ -146,7 +146,7 @@ def _undisturbed(options: argparse.Namespace, run_dir: Path) -> tuple[Status, fl
 
 
 def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed: Status) -> Row:
-    """Run under one fault."""
+    """Return the result of a run with one fault."""
     name = fault.name.replace(" ", "-")
     os.environ[SLOW_ONE] = str(folder / f"{name}.slow")
     chance = random.Random(f"{options.seed}-{fault.name}")  # noqa: S311
@@ -161,13 +161,13 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     try:
         with run.going():
             for number in range(options.repeats if fault.begin else 0):
-                # Each in a slice of its own between a tenth and nine tenths of the run.
+                # One in each of equal slices between 10 % and 90 % of the run.
                 part = 0.1 + 0.8 * (number + chance.random()) / options.repeats
                 moment = max(int(part * undisturbed.commands.accepted), run.accepted + 1)
                 run.wait(lambda m=moment: run.accepted >= m or run.is_over, f"episode {moment}")  # type: ignore[misc]
                 run.pass_by(chance.uniform(0.0, 0.1))
                 if run.is_over:
-                    remarks.append("the run was over before it was disturbed as often as wanted")
+                    remarks.append("the run ended before its last disturbances")
                     break
                 start = time.time()
                 fault.begin(run)  # type: ignore[misc]
@@ -188,7 +188,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
         "restarts": sum(c.starts - 1 for c in run.children("actor", "learner", "replay")),
     }
     if fault.shows_in is not None and not counts[fault.shows_in]:
-        remarks.append(f"WRONG: it never happened, {fault.shows_in} is 0")
+        remarks.append(f"WRONG: the fault did not occur, {fault.shows_in} is 0")
     return Row(
         fault=fault.name,
         equal=digests(status) == digests(undisturbed) and status.exact,
@@ -204,8 +204,8 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
 
 
 def _curse(config: Config, chance: random.Random) -> int:
-    """Return the environment seed of an exploratory command, early in a run."""
-    any_buffer = ReplayBuffer(config.buffer)  # the seeds do not depend on what is in it
+    """Return the environment seed of an exploratory command early in a run."""
+    any_buffer = ReplayBuffer(config.buffer)  # seeds do not depend on its content
     any_buffer.admit([Entry(0.0, 0, 1)])
     with closing(make_environment(config)) as env:
         sampler = CommandSampler(config, specify(env, config))
@@ -214,23 +214,23 @@ def _curse(config: Config, chance: random.Random) -> int:
 
 
 def _check_failure(failure: RunFailed | None, run: DisturbedRun) -> str:
-    """Return what a run said that had to fail, and whether that is true."""
+    """Check the error of a run that must fail, and its reproduction; return a remark."""
     text = str(failure)
     match = re.search(r"command (\d+) .*udrl reproduce RUN_DIR \1", text, flags=re.DOTALL)
     if failure is None or failure.exit_code != RunFailed.exit_code or match is None:
-        return f"WRONG: no exit code 9 that names a reproduction: {text}"
+        return f"WRONG: expected exit code 9 and a command to reproduce it: {text}"
     reproduction = [sys.executable, "-m", "udrl_launch", "reproduce", str(run.run_dir), match[1]]
     try:
         tried = subprocess.run(reproduction, capture_output=True, timeout=3 * _HANG_S, check=False)
     except subprocess.TimeoutExpired:
-        return f"code 9, command {match[1]}; its reproduction hangs"
+        return f"code 9, command {match[1]}; the reproduction hangs"
     if tried.returncode == 0:
-        return f"WRONG: command {match[1]} succeeds in its reproduction"
-    return f"code 9, command {match[1]}; its reproduction ends with code {tried.returncode}"
+        return f"WRONG: command {match[1]} does not fail in the reproduction"
+    return f"code 9, command {match[1]}; the reproduction ends with code {tried.returncode}"
 
 
 def _heal_and_finish(run: DisturbedRun, options: argparse.Namespace) -> None:
-    """Mend the environment and go on with ``--resume``, as the documentation says."""
+    """Repair the environment and continue with ``--resume``, as the documentation says."""
     command = [
         sys.executable, "-m", "udrl_launch", "train", run.settings.config.environment,
         "--run-dir", str(run.run_dir), "--resume",
@@ -242,7 +242,7 @@ def _heal_and_finish(run: DisturbedRun, options: argparse.Namespace) -> None:
 
 
 def _measure(run: DisturbedRun, fault: Fault, start: float, end: float) -> Injection:
-    """Find in the logs and observations what followed a disturbance."""
+    """Return the effects of a disturbance from logs and observations."""
     found = Injection()
     gone = "actor|learner" if "replay" in fault.lose else "|".join(fault.lose)
     waits = "has been waiting|waiting for a replay service"

@@ -1,4 +1,4 @@
-"""Two machines and a cable between them, as Linux network namespaces: needs root, iproute2."""
+"""Two machines and a switch as Linux network namespaces. Needs root and iproute2."""
 
 import contextlib
 import os
@@ -12,16 +12,16 @@ _IP = shutil.which("ip")
 
 
 class CutCable:
-    """A network of its own for the replay service, one switch away from everybody else.
+    """A network namespace for the replay service, connected to the others by a switch.
 
-    Cutting it is pulling the replay service's plug out of the switch: both sides keep their
-    carrier, so packets vanish and nobody is told.
+    A cut disconnects the replay service from the switch. Both sides keep their carrier, so packets
+    are lost without an error.
     """
 
     def __init__(self) -> None:
         tag = f"u{os.getpid()}"
         self._machine, self._switch = f"{tag}-replay", f"{tag}-switch"
-        self._near, self._far = f"{tag}a", f"{tag}b"  # of the two cables: outer ends
+        self._near, self._far = f"{tag}a", f"{tag}b"  # outer ends of the two cables
         self.listen = self.endpoint = f"tcp/{_THERE}:{_PORT}"
         self.listen_options: tuple[str, ...] = ("--insecure",)
         self.prefix: tuple[str, ...] = ("ip", "netns", "exec", self._machine)
@@ -33,12 +33,12 @@ class CutCable:
 
     @staticmethod
     def is_possible() -> bool:
-        """Say whether this machine allows it."""
+        """Return whether this machine supports it."""
         return os.geteuid() == 0 and _IP is not None
 
     @contextlib.contextmanager
     def cut(self) -> Iterator[None]:
-        """Let every packet vanish."""
+        """Drop every packet."""
         self._in_switch("link", "set", "plug", "nomaster")
         try:
             yield
@@ -46,7 +46,7 @@ class CutCable:
             self._in_switch("link", "set", "plug", "master", "switch")
 
     def close(self) -> None:
-        """Take the network away; its cables go with the namespaces."""
+        """Delete the namespaces, and the cables with them."""
         for name in (self._machine, self._switch):
             _ip("netns", "delete", name, check=False)
 

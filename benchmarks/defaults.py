@@ -1,12 +1,12 @@
-"""What a preset learns in environments of different kinds (docs/results.md).
+"""Learning with one preset in different kinds of environments (docs/results.md).
 
 ::
 
     .venv/bin/python benchmarks/defaults.py
     .venv/bin/python benchmarks/defaults.py --tasks MountainCar Taxi --seeds 1 2 --set last_few=10
 
-Algorithm 1 in one process for each run, as many at a time as there are cores. A row of the table is
-a run: what random actions obtain, and the mean returns of evaluations during training.
+Each run is Algorithm 1 in one process, with one run per core at a time. Each row of the table is a
+run: the mean return of random actions, and those of evaluations during training.
 """
 
 import argparse
@@ -36,7 +36,7 @@ class Task(NamedTuple):
 TASKS = {
     "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
     "FrozenLakeSlippery": Task("FrozenLake-v1", 200_000, {}),
-    # One return says little here.
+    # Returns vary greatly, so an evaluation needs many episodes.
     "Blackjack": Task("Blackjack-v1", 60_000, {"eval_episodes": 5_000}),
     "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
     "Taxi": Task("Taxi-v4", 200_000, {}),
@@ -54,7 +54,7 @@ TASKS = {
 
 
 class Curve(NamedTuple):
-    """A run: mean returns of random episodes and of evaluations by env steps; seconds of CPU."""
+    """A run: mean return of random actions, those of evaluations by env steps, CPU seconds."""
 
     random: float
     evaluations: list[tuple[int, float]]
@@ -62,7 +62,7 @@ class Curve(NamedTuple):
 
 
 def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
-    """Train in one task."""
+    """Train on one task."""
     task = TASKS[name]
     given = {"seed": seed, "lead": 0, "max_env_steps": task.max_env_steps, "eval_episodes": 200}
     given["eval_every"] = task.max_env_steps // _EVALUATIONS
@@ -87,7 +87,7 @@ def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
 
 
 def _random_return(config: Config) -> float:
-    """Return the mean return of episodes in which every action is random."""
+    """Return the mean return of random actions."""
     config = change(config, n_warm_up_episodes=200)
     with closing(EpisodeGenerator(config, 16)) as generator:
         commands = CommandSampler(config, generator.spec).warm_up()
@@ -96,7 +96,7 @@ def _random_return(config: Config) -> float:
 
 
 def main() -> None:
-    """Train in all tasks and print a table."""
+    """Train on all tasks and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])

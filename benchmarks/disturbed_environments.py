@@ -1,9 +1,9 @@
-"""Environments around another one that misbehave: ``disturbed_environments:Raising-v0`` and so on.
+"""Faulty wrappers of environments, e.g. ``disturbed_environments:Raising-v0``.
 
-Those that misbehave now and then do so by a chance of the process, whatever the command, so that
-the same command succeeds elsewhere or later. The others do it always, under one command.
-``UDRL_HEALED`` in the process' environment cures all of them. They spare the probes that services
-run before they join, whose seeds come first.
+Some fail at random, independently of the command, so that the same command succeeds in another
+process or later. The others always fail, but only for one command. If the environment variable
+``UDRL_HEALED`` is set, none fails. None fails in the probes that services run before they join,
+whose seeds are the lowest.
 """
 
 import ctypes
@@ -18,11 +18,12 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
+#: Environment variable; if it is set, no environment fails.
 HEALED = "UDRL_HEALED"
-#: A file; the process that creates it is the slow one.
+#: Environment variable with the path of a file. The process that creates it is the slow one.
 SLOW_ONE = "UDRL_SLOW_ONE"
 
-#: The seed of the command that fails always.
+#: Environment variable with the seed of the command that always fails.
 CURSED = "UDRL_CURSED"
 
 _FIRST_OF_A_RUN = 1_000_100
@@ -31,33 +32,33 @@ _chance = random.Random(f"{os.environ.get('UDRL_CHAOS_SEED', '0')}-{os.getpid()}
 
 
 class Disturbed(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment that is well until an episode of a run begins."""
+    """Base of environments that fail in some episodes of a run."""
 
-    #: Chance that an episode is disturbed; None: always, under one command.
+    #: Probability that an episode fails. None: always, for one command.
     chance: ClassVar[float | None] = None
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self._sick = False
+        self._fails = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode and decide its fate."""
+        """Begin an episode, and decide whether it fails."""
         in_run = (seed or 0) > _FIRST_OF_A_RUN and HEALED not in os.environ
-        self._sick = in_run and self.is_doomed(seed or 0)
+        self._fails = in_run and self.is_faulty(seed or 0)
         return super().reset(seed=seed, options=options)
 
-    def is_doomed(self, seed: int) -> bool:
-        """Say whether the episode that begins is a bad one."""
+    def is_faulty(self, seed: int) -> bool:
+        """Return whether the episode fails."""
         return _is_cursed(seed) if self.chance is None else _draw() < self.chance
 
     def step(self, action: Any) -> Any:
-        """Advance, or misbehave in about one of ten steps of a doomed episode."""
-        if self._sick and _draw() < 0.1:
-            return self.misbehave(super().step(action))
+        """Advance; fail at about one in ten steps of a failing episode."""
+        if self._fails and _draw() < 0.1:
+            return self.fail(super().step(action))
         return super().step(action)
 
-    def misbehave(self, outcome: Any) -> Any:
-        """Do what this environment is for."""
+    def fail(self, outcome: Any) -> Any:
+        """Raise, hang, or return an invalid outcome."""
         raise NotImplementedError
 
 
@@ -70,65 +71,65 @@ def _draw() -> float:
 
 
 class Raising(Disturbed):
-    """Raises in one of twenty episodes."""
+    """Raises in one of 20 episodes."""
 
     chance: ClassVar[float | None] = 0.05
 
-    def misbehave(self, outcome: Any) -> Any:
+    def fail(self, outcome: Any) -> Any:
         """Raise."""
-        raise RuntimeError("the simulator lost its mind")
+        raise RuntimeError("injected fault")
 
 
 class Nan(Disturbed):
-    """Observes NaN in one of twenty episodes."""
+    """Observes NaN in one of 20 episodes."""
 
     chance: ClassVar[float | None] = 0.05
 
-    def misbehave(self, outcome: Any) -> Any:
-        """Return NaN for every number observed."""
+    def fail(self, outcome: Any) -> Any:
+        """Return an observation of NaN."""
         observation, *others = outcome
         return np.full_like(observation, np.nan), *others
 
 
 class Hanging(Disturbed):
-    """Hangs in native code, holding the interpreter's lock, in every 150th episode of a process.
+    """Hangs in native code and holds the GIL, in every 150th episode of a process.
 
-    Counted, not by chance: `udrl train` gives up what dies more than five times within a minute.
+    Not at random: ``udrl train`` ends a run if a service dies more than five times within a minute.
     """
 
     _episodes = itertools.count(1)
 
-    def is_doomed(self, seed: int) -> bool:
-        """Count."""
+    def is_faulty(self, seed: int) -> bool:
+        """Return whether this is a 150th episode."""
         return next(self._episodes) % 150 == 0
 
-    def misbehave(self, outcome: Any) -> Any:
-        """Sleep in C without letting go of the lock: no Python code of this process runs again."""
+    def fail(self, outcome: Any) -> Any:
+        """Sleep in C with the GIL held: no Python code of this process runs again."""
         ctypes.PyDLL(None).sleep(3600)
         return outcome
 
 
 class AlwaysRaising(Raising):
-    """Raises under one command every time."""
+    """Always raises, for one command."""
 
     chance = None
 
 
 class AlwaysHanging(Hanging):
-    """Hangs under one command every time."""
+    """Always hangs, for one command."""
 
-    def is_doomed(self, seed: int) -> bool:
-        """Decide by the command."""
+    def is_faulty(self, seed: int) -> bool:
+        """Return whether this is the command that always fails."""
         return _is_cursed(seed)
 
 
 class Slow(gym.Wrapper[Any, Any, Any, Any]):
-    """Takes twenty times as long for a step, in one actor process of a run."""
+    """Makes steps 20 times as slow, in one actor process of a run."""
 
     _slow: ClassVar[bool | None] = None
 
     def step(self, action: Any) -> Any:
-        """Advance, and be slow about it."""
+        """Advance slowly."""
         began = time.perf_counter()
         outcome = super().step(action)
         if self._is_slow():

@@ -1,7 +1,7 @@
-"""A real run in processes of its own, to be disturbed, and an observer that sees what comes of it.
+"""A real run in separate processes, to inject faults into, and an observer of its progress.
 
-The observer reads the store's file beside the service that writes it, so it sees the run also while
-nobody answers; when services noticed something is in their logs.
+The observer reads the store while the replay service writes it, so it also works when no service
+replies. Logs show when services detected a fault.
 """
 
 import os
@@ -28,7 +28,7 @@ _LINE = re.compile(r"(\d{4}-\S+ [\d:]+,\d+) (\w+) +(.*)")
 
 
 class Moment(NamedTuple):
-    """What the observer saw of a run."""
+    """The progress of a run at one moment."""
 
     at: float
     accepted: int
@@ -44,17 +44,17 @@ class Line(NamedTuple):
 
 
 class TooLate(UdrlError):
-    """A run did not do in time what it should have done."""
+    """A run did not reach a state within the time limit."""
 
 
 class Link(Protocol):
-    """What lies between the replay service and the others.
+    """The connection between the replay service and other services.
 
     Attributes:
-        listen: where the replay service listens.
-        listen_options: more of its command line.
-        prefix: what runs it.
-        endpoint: where the others connect to.
+        listen: endpoint that the replay service listens on.
+        listen_options: further options of the replay service.
+        prefix: command that runs the replay service's command.
+        endpoint: endpoint that other services connect to.
     """
 
     listen: str
@@ -63,18 +63,18 @@ class Link(Protocol):
     endpoint: str
 
     def close(self) -> None:
-        """Take it away."""
+        """Close the connection."""
 
 
 class DisturbedRun:
-    """A run of ``udrl replay``, ``udrl learner`` and ``udrl actor``, started again as they die.
+    """A run with ``udrl replay``, ``udrl learner`` and ``udrl actor``, which restart when they die.
 
     Args:
-        settings: what to train.
-        run_dir: a directory that is not there yet.
-        link: that actors and learner reach the replay service through; closed in the end.
-        limit_s: seconds after which waiting for anything is given up.
-        hang_s: the actors' ``--hang-timeout``.
+        settings: settings of the run.
+        run_dir: run directory, which must not exist.
+        link: connection to the replay service; closed at the end.
+        limit_s: time limit of the run in seconds.
+        hang_s: ``--hang-timeout`` of the actors.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class DisturbedRun:
 
     @contextmanager
     def going(self) -> Iterator["DisturbedRun"]:
-        """Start the services; end them however this ends."""
+        """Start the services, and end them on exit."""
         environment = self.settings.config.environment
         start = self._supervisor.start
         try:
@@ -120,7 +120,7 @@ class DisturbedRun:
         return [c for c in self._supervisor.children if c.name.split("-")[0] in roles]
 
     def send(self, number: signal.Signals, *roles: str) -> None:
-        """Send a signal to all services of some roles, or to some of their names."""
+        """Send a signal to services by role or by name."""
         for child in self._supervisor.children:
             if child.name in roles or child.name.split("-")[0] in roles:
                 self._signal(child, number)
@@ -132,27 +132,27 @@ class DisturbedRun:
     # Watching.
 
     def wait(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait for a condition, observing the run and restarting what dies."""
+        """Wait for a condition while the run is observed and services that die are restarted."""
         while not condition():
             if time.monotonic() > self._deadline:
-                raise TooLate(f"{self.run_dir}: gave up waiting for {what}")
+                raise TooLate(f"{self.run_dir}: timed out waiting for {what}")
             self._supervisor.check()
             self._observe()
             time.sleep(_POLL_S)
 
     def pass_by(self, seconds: float) -> None:
-        """Let time pass."""
+        """Wait for some seconds while the run is observed."""
         until = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() >= until, f"{seconds} s")
 
     @property
     def accepted(self) -> int:
-        """Episodes accepted when the observer last looked."""
+        """Accepted episodes at the last observation."""
         return self.moments[-1].accepted if self.moments else 0
 
     @property
     def is_over(self) -> bool:
-        """Whether the replay service has ended because the run has."""
+        """Whether the run is over, so that the replay service has ended."""
         return all(child.done for child in self.children("replay"))
 
     def _observe(self) -> None:
@@ -172,21 +172,21 @@ class DisturbedRun:
             self.unbalanced.append(f"{progress}, outstanding {len(waiting)}")
 
     def status(self) -> Status:
-        """Return the status of the run as its file says it."""
+        """Return the status of the run from its store."""
         return read_status(self.run_dir)
 
     def failure(self) -> RunFailed | None:
-        """Run until the end; return how the run failed, or None if it did not."""
+        """Wait for the end of the run; return its error, or None."""
         try:
             self.wait(lambda: self.is_over, "the end of the run")
         except RunFailed as error:
             return error
         return None
 
-    # What services noticed.
+    # Logs.
 
     def lines(self, pattern: str, after: float) -> list[Line]:
-        """Return lines of all logs that match, from a time on, in the order of time."""
+        """Return the lines of all logs that match a pattern, from a time on, by time."""
         found = []
         for path in sorted((self.run_dir / "logs").glob("*.log")):
             for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -199,12 +199,12 @@ class DisturbedRun:
 
 
 def digests(status: Status) -> tuple[int, str, str]:
-    """Return what must not depend on what happened."""
+    """Return the results that faults must not change."""
     return status.iteration, status.weights_sha256, status.replay_sha256
 
 
 def is_balanced(status: Status) -> bool:
-    """Say whether both ledgers of a status balance."""
+    """Return whether both ledgers of a status balance."""
     commands, episodes = status.commands, status.episodes
     return (
         commands.issued == commands.accepted + commands.cancelled + commands.outstanding

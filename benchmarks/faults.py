@@ -1,7 +1,7 @@
-"""What can go wrong with a run, one function for each disturbance.
+"""The faults that ``chaos.py`` injects, one function per disturbance.
 
-A disturbance begins when its function is called and is over when it returns, be it that what was
-stopped goes on, that a cut network is whole again, or, for a kill, at once.
+A disturbance lasts from the call of its function to its return: until stopped services continue or
+a cut network is restored. A kill returns immediately.
 """
 
 import os
@@ -17,23 +17,23 @@ from cut_cable import CutCable
 from disturbed_run import DisturbedRun, Link
 from severed_link import SeveredLink
 
-#: Seconds of a stop or cut: longer than the lease (2 s) and than a query (3 s).
+#: Seconds of a stop or cut: more than the lease (2 s) and the timeout of a query (3 s).
 OUTAGE_S = 5.0
 
 ROLES = ("actor", "learner", "replay")
 
 
 class Fault(NamedTuple):
-    """A disturbance.
+    """A fault.
 
     Attributes:
-        name: for ``--faults``.
-        begin: what is done at random moments; None: the environment does it by itself.
+        name: name for ``--faults``.
+        begin: disturbance at random moments; None: the environment causes the fault.
         lose: roles of the services that lose contact.
-        link: what is between the replay service and the others.
-        environment: the class of :mod:`disturbed_environments` around the run's own; None: none.
-        shows_in: the counter of a run that must not be zero afterwards.
-        stops_the_run: it must end with exit code 9 and name a reproduction.
+        link: connection between the replay service and the others.
+        environment: wrapper of the environment in :mod:`disturbed_environments`; None: none.
+        shows_in: counter of the run that must not be zero afterwards.
+        stops_the_run: whether the run must end with exit code 9 and a command to reproduce it.
     """
 
     name: str
@@ -74,7 +74,7 @@ def _cut(run: DisturbedRun) -> None:
 
 
 def _twins(run: DisturbedRun) -> None:
-    """Let two more actors join under one name, and take them away again."""
+    """Start two more actors with the same name, and kill them after a while."""
     twin = [
         sys.executable,
         str(Path(__file__).with_name("twin.py")),

@@ -1,7 +1,7 @@
-"""A fleet of logical actors in one process: it makes nothing, asks for commands, and delivers.
+"""A fleet of logical actors in one process, with synthetic episodes. ``scale.py`` starts it.
 
-Each logical actor asks for commands, answers every one with an episode that was made up beforehand,
-and has one episode in flight at a time, like a real one. ``scale.py`` starts it.
+Each logical actor requests commands, delivers a prepared episode for each, and has one episode in
+flight at a time, like a real actor.
 """
 
 import contextlib
@@ -36,13 +36,13 @@ from udrl_proto.messages import (
 from udrl_proto.zenoh_transport import ZenohTransport
 
 RUN = "scale"
-#: Made-up episodes that an actor chooses from.
+#: Number of different synthetic episodes.
 _VARIETY = 64
 _WANTED = 16
 
 
 class Load(msgspec.Struct, frozen=True):
-    """What a fleet process is told."""
+    """The task of a fleet process."""
 
     endpoint: str
     actors: int
@@ -52,7 +52,7 @@ class Load(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """What a fleet process found; latencies in seconds, arrivals by weights version."""
+    """The results of a fleet process: latencies in seconds, arrivals by weights version."""
 
     acknowledged: float
     episode_s: list[float]
@@ -63,7 +63,7 @@ class Measured(msgspec.Struct, frozen=True):
 
 @dataclass
 class Actor:
-    """A logical actor: what it holds, and what it is waiting for an answer to."""
+    """A logical actor: its commands, and its current request."""
 
     name: str
     session: zenoh.Session
@@ -76,7 +76,7 @@ class Actor:
 
 
 class Fleet:
-    """All logical actors, driven by one thread; answers come through one queue."""
+    """All logical actors, driven by one thread. Replies come through one queue."""
 
     def __init__(self, load: Load) -> None:
         self._load = load
@@ -92,7 +92,7 @@ class Fleet:
         self._news = False
 
     def run(self) -> Measured:
-        """Join, then work for the time that the load says."""
+        """Join, then run for the load's duration."""
         subscribers = [
             s.declare_subscriber(
                 key_expressions.key(RUN, key_expressions.NEW_WEIGHTS), self._note_weights
@@ -116,7 +116,7 @@ class Fleet:
                 began = now
                 self._episode_s.clear()
                 self._command_s.clear()
-            if self._news:  # new weights mean new commands: nobody waits any longer
+            if self._news:  # new weights mean new commands, so waiting ends
                 self._news = False
                 pauses = [(now, actor) for _, actor in pauses]
             for _, actor in [p for p in pauses if p[0] <= now]:
@@ -149,18 +149,18 @@ class Fleet:
 
     def _note_weights(self, sample: zenoh.Sample) -> None:
         version = decode(sample.payload.to_bytes(), Weights, LARGEST).version
-        self._arrivals[str(version)] = time.monotonic()  # the last session's counts
+        self._arrivals[str(version)] = time.monotonic()  # that of the last session
         self._news = True
 
     def _go_on(self, actor: Actor) -> None:
-        """Ask again what got no answer, or else the next thing."""
+        """Repeat a request without a reply, or send the next one."""
         if actor.answered:
             self._next(actor)
         else:
             self._ask(actor)
 
     def _next(self, actor: Actor) -> None:
-        """Deliver the next episode, or ask for commands."""
+        """Deliver the next episode, or request commands."""
         if actor.commands:
             command_id = actor.commands[0].id
             made_up = self._episodes[command_id % _VARIETY]
@@ -183,8 +183,8 @@ class Fleet:
             if answer.ok is not None:
                 self._answers.put((actor, query, answer.ok.payload.to_bytes()))
 
-        # On Zenoh's own thread, which only fills the queue: another thread for every query would
-        # cost more than the query.
+        # The callback runs on Zenoh's thread and only fills the queue. A thread per query, the
+        # default, would cost more than the query.
         actor.session.get(
             key_expressions.key(RUN, actor.verb),
             zenoh.handlers.Callback(
@@ -197,10 +197,10 @@ class Fleet:
         )
 
     def _take(self, actor: Actor, query: int, answer: bytes | None) -> tuple[Actor, float] | None:
-        """Handle an answer; return when an actor has to wait, and for how long."""
+        """Handle a reply; return the actor and the seconds to wait if it has to wait."""
         if query != actor.query:
-            return None  # the end of a query that has had its answer
-        if answer is None:  # dropped, or too late: as a real actor, ask again after a pause
+            return None  # the end of a query that had a reply
+        if answer is None:  # dropped or late: repeat after a pause, like a real actor
             self._retries += 1
             actor.query += 1
             return actor, 0.5
@@ -239,5 +239,5 @@ def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
 
 
 if __name__ == "__main__":
-    told = msgspec.json.decode(sys.argv[1], type=Load)
-    Path(sys.argv[2]).write_bytes(msgspec.json.encode(Fleet(told).run()))
+    load = msgspec.json.decode(sys.argv[1], type=Load)
+    Path(sys.argv[2]).write_bytes(msgspec.json.encode(Fleet(load).run()))

@@ -1,11 +1,11 @@
-"""Learning curves of the shipped presets over seeds: the figures of ``docs/results.md``.
+"""Learning curves of the shipped presets over several seeds (``docs/results.md``).
 
 ::
 
     .venv/bin/python benchmarks/learning.py runs/learning --seeds 1 2 3
 
-Runs that are in the directory already are not trained again. At the end stand a table, one picture
-and one CSV file per environment.
+Runs that are already in the directory are not repeated. The result is a table, and a figure and a
+CSV file per environment.
 """
 
 import argparse
@@ -27,7 +27,7 @@ ENVIRONMENTS = ("LunarLander-v3", "LunarLanderSparse-v3", "CartPole-v1")
 
 
 class Trained(NamedTuple):
-    """One run: its last status, its evaluations, and what it does when it acts greedily."""
+    """A run: its last status, its evaluations, and an evaluation with greedy actions."""
 
     seed: int
     status: Status
@@ -36,7 +36,7 @@ class Trained(NamedTuple):
 
 
 def main() -> None:
-    """Train, evaluate, draw and print."""
+    """Train, evaluate, draw figures and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--envs", nargs="+", default=ENVIRONMENTS)
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def train(env: str, seed: int, run_dir: Path) -> Trained:
-    """Train with the preset, unless that was done already."""
+    """Train with the preset, unless the run exists."""
     if not (run_dir / "weights.safetensors").exists():
         command = [sys.executable, "-m", "udrl_launch", "train", env, "--seed", str(seed)]
         subprocess.run([*command, "--run-dir", str(run_dir), "--resume", "--json"], check=True,
@@ -83,7 +83,7 @@ def row(env: str, run: Trained) -> str:
 
 
 def write(path: Path, runs: list[Trained]) -> None:
-    """Write all evaluations, tidy: a line each."""
+    """Write all evaluations as a tidy table."""
     names = ("eval_at_env_steps", "wall_s", "eval_mean", "eval_std", "eval_ci95_low",
              "eval_ci95_high", "eval_desired_return", "eval_desired_horizon")  # fmt: skip
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -94,7 +94,7 @@ def write(path: Path, runs: list[Trained]) -> None:
 
 
 def draw(path: Path, env: str, runs: list[Trained]) -> None:
-    """Draw a thin line for each seed and a thick one for their mean."""
+    """Draw a thin line per seed and a thick one for their mean."""
     figure = Figure(figsize=(7, 4.3), layout="constrained")
     axes = figure.add_subplot()
     for run, style in zip(runs, ("-", "--", ":", "-."), strict=False):

@@ -1,8 +1,7 @@
-"""What an actor on another machine sends and receives, and what a slow link costs.
+"""An actor's network traffic, and its speed over slow links.
 
-Replay service and learner run here; one actor reaches them through a proxy that counts the bytes,
-lets only so many pass in a second, and holds each for a while. Counted is what TCP carries, without
-its own headers. With mutual TLS some percent are added.
+An actor connects to the replay service through a proxy that counts bytes, limits the bandwidth and
+delays the data. The counts are of TCP's payload. Mutual TLS adds a few percent.
 
 ::
 
@@ -33,24 +32,25 @@ _CHUNK = 16 * 1024
 
 
 class Link(NamedTuple):
-    """Mbit/s in each direction, 0: not limited; and the milliseconds of one way."""
+    """Mbit/s in each direction (0: unlimited), and the one-way delay in milliseconds."""
 
     mbit_s: float
     delay_ms: float
 
     @classmethod
     def parse(cls, text: str) -> "Link":
-        """Return a link written as ``MBIT_S:DELAY_MS``."""
+        """Return a link from ``MBIT_S:DELAY_MS``."""
         mbit_s, delay_ms = text.split(":")
         return cls(float(mbit_s), float(delay_ms))
 
 
 class Proxy:
-    """Forwards connections to a port of loopback, in a thread.
+    """Forwards connections to a port on this machine, in a thread.
 
     Attributes:
-        port: where it listens.
-        up, down: bytes that clients have sent and were sent.
+        port: port that the proxy listens on.
+        up: bytes sent by clients.
+        down: bytes sent to clients.
     """
 
     def __init__(self, link: Link, target: int) -> None:
@@ -76,8 +76,8 @@ class Proxy:
     async def _pump(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool
     ) -> None:
-        """Forward one direction: a queue of what is on its way, and who takes it out in time."""
-        # What the sender may have on its way is what the link holds, and no more.
+        """Forward one direction, through a queue of data and its times of arrival."""
+        # The queue holds what fits on the link: bandwidth times delay.
         mbit_s = self._link.mbit_s or 1000
         held = int(mbit_s * 125 * self._link.delay_ms / _CHUNK) + 4
         way: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(held)
@@ -88,7 +88,7 @@ class Proxy:
                 await asyncio.sleep(due - self._loop.time())
                 if not data:
                     break
-                with contextlib.suppress(OSError):  # the receiver is gone; empty the queue
+                with contextlib.suppress(OSError):  # the receiver is gone; still empty the queue
                     writer.write(data)
                     await writer.drain()
 
@@ -130,10 +130,10 @@ def _status(run_dir: Path) -> Status | None:
 
 
 def _completed(run_dir: Path, iteration: int) -> Status:
-    """Return the status when an iteration is complete.
+    """Wait until an iteration is complete, and return the status.
 
     Raises:
-        TimeoutError: it takes more than ten minutes.
+        TimeoutError: the iteration took more than ten minutes.
     """
     deadline = time.monotonic() + 600
     while time.monotonic() < deadline:
@@ -145,7 +145,7 @@ def _completed(run_dir: Path, iteration: int) -> Status:
 
 
 def measure(environment: str, link: Link, seconds: float, run_dir: Path) -> dict[str, float]:
-    """Return what one actor did over a link, from the first iterations on."""
+    """Return the figures of one actor over a link, after the first iterations."""
     port = free_port()
     proxy = Proxy(link, port)
     coordinator = _started(

@@ -1,15 +1,15 @@
-"""How long a run takes on a machine that is not here: a simulation of actors, replay and learner.
+"""The duration of a run on other machines, by simulation of actors, replay service and learner.
 
 A run is a function of its configuration, so its episodes, their lengths and the order of versions
-do not depend on the hardware; only time does. One run is made here and its episode lengths are
-recorded; the costs of its parts are measured, that of a version in a run with services; then the
-same run is simulated with any number of cores and actors (``simulation.py``). ``--check`` makes the
-same run with real services and prints both::
+do not depend on the hardware; only time does. The episode lengths of one run are recorded, and the
+costs of its parts are measured, that of a version in a run with services. Then the same run is
+simulated with any number of cores and actors (``simulation.py``). ``--check`` also runs the
+services, and prints both::
 
     python benchmarks/pipeline.py --max-env-steps 100000 --actors 1 2 4 --check
 
-Instead, ``--table`` prints how long presets take to so many env steps on machines of 2 to 256
-cores, for environments of different speed, and what bounds each of these times::
+``--table`` instead prints the time that presets need for a number of env steps on machines with 2
+to 256 cores, for environments of different speed, and the bottleneck of each::
 
     python benchmarks/pipeline.py --table LunarLander-v3=350000
 """
@@ -45,27 +45,25 @@ from udrl_launch.settings import Settings, gather
 from udrl_launch.training_run import train
 from udrl_replay.run import StoredRun
 
-#: Seconds on this machine, in runs (docs/performance.md): CPU of the replay service for an episode;
-#: between a question and its answer; from an episode's end to its acknowledgement, besides; from an
-#: iteration's end to its episodes at the learner; from a version trained to commands that name it.
+#: Seconds on the machine of docs/performance.md, measured in runs; see :class:`Costs`.
 _MESSAGES = {"replay": 0.002, "answer": 0.001, "sync": 0.003, "fetch": 0.010, "delivery": 0.0126}
-#: From the first commands to a learner that has loaded torch.
+#: Seconds from the first commands until the learner has loaded torch.
 _START_S = 1.9
 
 _CORES = (2, 4, 8, 16, 32, 64, 128, 256)
-#: Seconds of an environment step in the table.
+#: Durations of an environment step in the table, in seconds.
 _STEPS = (30e-6, 1e-3, 20e-3)
 
 
 class Real(NamedTuple):
-    """A run with services: env steps per second after the warm-up, seconds of a version."""
+    """A run with services: env steps per second after the warm-up, seconds per version."""
 
     speed: float
     version: float
 
 
 def record(settings: Settings) -> Recorded:
-    """Make a run in this process."""
+    """Train in this process, and record episode lengths."""
     found: dict[int, dict[int, int]] = defaultdict(dict)
     accept = StoredRun.accept
 
@@ -85,7 +83,7 @@ def record(settings: Settings) -> Recorded:
 
 
 def measure(config: Config, version_s: float) -> Costs:
-    """Time rounds of 1 to 8 rows alone; a version has been timed in a run."""
+    """Return the costs of a run; rounds of 1 to 8 rows are timed here."""
     sizes = (1, 2, 4, 8)
     cpu, wall = zip(*(_round(config, n) for n in sizes), strict=True)
     row, beside = statistics.linear_regression(sizes, cpu)
@@ -101,7 +99,7 @@ def measure(config: Config, version_s: float) -> Costs:
 
 
 def _round(config: Config, rows: int) -> tuple[float, float]:
-    """Return the seconds of a round: of CPU, and all."""
+    """Return the CPU seconds and the duration of a round."""
     with closing(EpisodeGenerator(config, rows)) as generator:
         graph = acting_graph(config.network, generator.spec)
         behavior = ActingFunction(graph, probe_weights(graph))
@@ -130,7 +128,7 @@ def _command(number: int, max_steps: int) -> Command:
 
 
 def real(options: argparse.Namespace, preset: str | None, steps: int, actors: int) -> Real:
-    """Make the run with services."""
+    """Train with services, and measure."""
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
         command = [
@@ -148,7 +146,7 @@ def real(options: argparse.Namespace, preset: str | None, steps: int, actors: in
 
 
 def check(options: argparse.Namespace) -> None:
-    """Print what the simulation says, and what the services do if that is wanted."""
+    """Print the speed in the simulation, and with ``--check`` that of the services."""
     settings = _settings(options, options.preset, options.max_env_steps)
     actors = options.actors if options.check else [2]
     found = {n: real(options, options.preset, options.max_env_steps, n) for n in actors}
@@ -164,7 +162,7 @@ def check(options: argparse.Namespace) -> None:
 
 
 def table(options: argparse.Namespace) -> None:
-    """Print how long presets take to so many env steps, and what bounds them."""
+    """Print the time and the bottleneck of presets by cores and environment speed."""
     for entry in options.table:
         preset, _, steps = entry.partition("=")
         settings = _settings(options, preset, int(steps))
@@ -182,7 +180,7 @@ def table(options: argparse.Namespace) -> None:
 
 
 def _bounded(recorded: Recorded, costs: Costs, cores: int) -> str:
-    """Return the seconds of a run, and what it would be shortened most by if that were halved."""
+    """Return the seconds of a run, and its bottleneck: the part that saves most when halved."""
     seconds = _seconds(recorded, costs, cores)
     saved = {
         "actors": seconds - _seconds(recorded, costs, 2 * cores),
@@ -199,7 +197,7 @@ def _halved(costs: Costs, *names: str) -> Costs:
 
 
 def _seconds(recorded: Recorded, costs: Costs, cores: int) -> float:
-    """Return the seconds of a run with an actor for every core but the learner's."""
+    """Return the seconds of a run with one actor per core, except for the learner's cores."""
     config = recorded.config
     actors = max(1, cores - config.arithmetic.training_threads)
     environments = math.ceil(config.commands.n_episodes_per_iter * (config.lead + 1) / actors)
@@ -216,7 +214,7 @@ def _settings(options: argparse.Namespace, preset: str | None, steps: int) -> Se
 
 
 def main() -> None:
-    """Simulate, and compare if that is wanted."""
+    """Simulate, and print speeds or the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="LunarLander-v3")
     parser.add_argument("--preset")
@@ -225,11 +223,11 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=os.cpu_count())
     parser.add_argument("--actors", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--envs-per-actor", type=int, default=16)
-    parser.add_argument("--check", action="store_true", help="make the same runs with services")
+    parser.add_argument("--check", action="store_true", help="also run the services")
     parser.add_argument("--table", nargs="+", metavar="PRESET=ENV_STEPS", help="2 to 256 cores")
     options = parser.parse_args()
     logging.getLogger("udrl").setLevel(logging.ERROR)
-    # Environments of this folder can be named.
+    # So that --env can name environments in this folder.
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
     if options.table:
         table(options)

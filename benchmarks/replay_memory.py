@@ -1,11 +1,11 @@
-"""What a full replay buffer of images costs in memory: in the learner, and when a learner joins.
+"""Memory of a full replay buffer of images: in the learner, and when a learner joins.
 
 ::
 
     .venv/bin/python benchmarks/replay_memory.py               # 500 episodes of 800 steps
 
-Episodes are noise, of TakeCover's size, all of the same length. A run fills its buffer in the
-warm-up; then its learner is killed, and the next one has everything to fetch at once.
+Episodes are noise in the size of TakeCover's frames, all of the same length. The warm-up fills the
+buffer. Then the learner is killed, and the next one has to fetch the whole buffer at once.
 """
 
 import argparse
@@ -29,7 +29,7 @@ _SIZE = (1, 32, 32)
 
 
 class NoisyImages(gym.Env[Any, Any]):
-    """Noise that looks like TakeCover's frames, 1 a step, until the time limit."""
+    """Noise in the shape of TakeCover's frames; a reward of 1 per step, up to the time limit."""
 
     observation_space = gym.spaces.Box(0, 255, _SIZE, np.uint8)
     action_space = gym.spaces.Discrete(2)
@@ -51,7 +51,7 @@ gym.register("NoisyImages-v0", f"{__name__}:NoisyImages")
 
 
 class Memory(NamedTuple):
-    """One process: its role and id, what it holds and the most it ever held, in MB."""
+    """A process: its role and id, its resident memory and the peak of it, in MB."""
 
     role: str
     pid: int
@@ -60,7 +60,7 @@ class Memory(NamedTuple):
 
 
 def main() -> None:
-    """Fill, kill, look and print."""
+    """Fill the buffer, kill the learner, and print memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--steps", type=int, default=800)
@@ -106,7 +106,7 @@ def _follow(process: "subprocess.Popen[bytes]", run_dir: Path) -> None:
 
 
 def _report(what: str, process: "subprocess.Popen[bytes]", run_dir: Path, empty_mb: float) -> None:
-    """Print what the learner holds once it has trained three more versions."""
+    """Print memory after the learner has trained three more versions."""
     version = _version(run_dir)
     _wait(process, lambda: _version(run_dir) >= version + 3)
     learner, replay = _find(process, "learner"), _find(process, "replay")
@@ -117,7 +117,7 @@ def _report(what: str, process: "subprocess.Popen[bytes]", run_dir: Path, empty_
 
 
 def _idle_learner(process: "subprocess.Popen[bytes]") -> float:
-    """Return the MB of a learner that has joined: they have not changed for two seconds."""
+    """Return the MB of an idle learner, when they have not changed for two seconds."""
     seen: list[float] = []
 
     def is_steady() -> bool:
@@ -149,7 +149,7 @@ def _children(parent: "subprocess.Popen[bytes]") -> list[Memory]:
             now, peak = (int(status[n].split()[0]) * 1024 / 1e6 for n in ("VmRSS", "VmHWM"))
             found.append(Memory(role, int(path.name), now, peak))
         except (FileNotFoundError, ProcessLookupError, ValueError, KeyError):
-            continue  # it ended, or is no service
+            continue  # it ended, or is not a service
     return found
 
 
@@ -164,7 +164,7 @@ def _wait(process: "subprocess.Popen[bytes]", done: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 600
     while not done():
         if process.poll() is not None or time.monotonic() > deadline:
-            raise SystemExit(f"the run ended with code {process.poll()}, or takes too long")
+            raise SystemExit(f"the run ended with code {process.poll()}, or timed out")
         time.sleep(0.2)
 
 

@@ -1,12 +1,12 @@
-"""Fleets of logical actors with synthetic episodes: what one replay service carries.
+"""Throughput of one replay service, with fleets of logical actors and synthetic episodes.
 
 ::
 
     .venv/bin/python benchmarks/scale.py --actors 1 10 100 1000 --kilobytes 20 1000
 
-A real replay service runs in a process of its own; ``fleet.py``, in another, is the actors. A
-learner that does not train delivers the same weights as every version. Printed is the median of
-the repeats, and in brackets their range.
+The replay service is real; the actors are a process of ``fleet.py``. A learner that does not train
+delivers the same weights as every version. The table has the median of the repeats, and in brackets
+their range.
 """
 
 import argparse
@@ -52,7 +52,7 @@ _TICK = os.sysconf("SC_CLK_TCK")
 
 
 def spec_of(kilobytes: int) -> EnvironmentSpec:
-    """Return an environment whose longest episode has so many kilobytes."""
+    """Return an environment whose longest episode has a number of kilobytes."""
     size = 8 if kilobytes < 100 else 256
     return EnvironmentSpec(
         observation_space=Vector(size=size),
@@ -65,7 +65,7 @@ def spec_of(kilobytes: int) -> EnvironmentSpec:
 
 
 class Announced(NamedTuple):
-    """When a weights version was published."""
+    """The time at which a weights version was published."""
 
     version: int
     at: float
@@ -74,12 +74,12 @@ class Announced(NamedTuple):
 def deliver_versions(
     endpoint: str, hello: Hello, stop: threading.Event, announced: list[Announced]
 ) -> None:
-    """Deliver the same weights as every version until ``stop`` is set, and note when."""
+    """Deliver the same weights as every version until ``stop`` is set; record the times."""
     use_one_thread()
     state = untrained(hello.config, hello.environment)
     for parameter in state.behavior.parameters():
         parameter.grad = parameter.new_zeros(parameter.shape)
-    state.optimizer.step()  # gives Adam the state that a delivery must have
+    state.optimizer.step()  # a delivery needs the state of Adam
     weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
         asker = Asker(ZenohTransport(session), RUN, "learner scale", stop)
@@ -271,7 +271,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--actors", nargs="+", type=int, default=[1, 10, 100, 1000])
     parser.add_argument("--kilobytes", nargs="+", type=int, default=[20, 1000])
-    parser.add_argument("--sessions", type=int, default=64, help="the most Zenoh sessions")
+    parser.add_argument("--sessions", type=int, default=64, help="maximum number of Zenoh sessions")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--replay-size", type=int, default=500)

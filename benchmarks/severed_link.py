@@ -1,4 +1,4 @@
-"""A link between services and their router that can be stalled and severed: a small TCP proxy."""
+"""A TCP proxy between services and their router, which can be stalled and severed."""
 
 import contextlib
 import socket
@@ -12,7 +12,7 @@ _TRY_AGAIN_S = 0.2
 
 
 class SeveredLink:
-    """Forwards connections to the replay service on this machine, unless told otherwise."""
+    """Forwards connections to the replay service, unless it is stalled or severed."""
 
     def __init__(self) -> None:
         self._target = free_port()
@@ -30,7 +30,7 @@ class SeveredLink:
 
     @contextlib.contextmanager
     def stalled(self) -> Iterator[None]:
-        """Let nothing through and tell nobody, as an unplugged cable does."""
+        """Forward nothing, without an error, like an unplugged cable."""
         self._flows.clear()
         try:
             yield
@@ -39,7 +39,7 @@ class SeveredLink:
 
     @contextlib.contextmanager
     def severed(self) -> Iterator[None]:
-        """Close all connections and refuse new ones, as a firewall or a dead router does."""
+        """Close all connections and refuse new ones, like a firewall or a dead router."""
         self._refuses = True
         self._close_all()
         try:
@@ -48,7 +48,7 @@ class SeveredLink:
             self._refuses = False
 
     def close(self) -> None:
-        """Forward nothing any more."""
+        """Close the proxy and all connections."""
         self._ends.set()
         self._flows.set()
         self._listener.close()
@@ -76,7 +76,7 @@ class SeveredLink:
             try:
                 there = socket.create_connection(("127.0.0.1", self._target), timeout=_TRY_AGAIN_S)
             except OSError:
-                here.close()  # the router is dead: so is the connection
+                here.close()  # the router is dead, so the connection is too
                 continue
             there.settimeout(None)
             self._sockets |= {here, there}
@@ -89,7 +89,7 @@ class SeveredLink:
                 self._flows.wait()
                 sink.sendall(chunk)
         except OSError:
-            pass  # severed, or one side died; the other must learn of it
+            pass  # severed, or one side died; close the other side too
         finally:
             self._close(source)
             self._close(sink)

@@ -13,24 +13,24 @@ from udrl.schedule import opened_by, weights_version
 #: Iteration and index of a command.
 CommandId = tuple[int, int]
 
-#: The least share of a core that actors are left with.
+#: Minimum number of cores for actors.
 _LEAST_CORES = 0.1
 
 
 class Costs(NamedTuple):
-    """Seconds that the parts of a run take.
+    """Durations of the parts of a run, in seconds.
 
     Attributes:
-        round: CPU of an actor's round besides its rows.
-        row: CPU of a row in a round: the environment's step, and the network's.
-        sleep: of a row, without CPU.
-        version: from the buffer to a version trained, and what the learner does besides.
-        replay: CPU of the replay service for an episode.
-        answer: between a question and its answer.
-        sync: from an episode's end to its acknowledgement, besides ``replay``.
-        fetch: from an iteration's end to its episodes at the learner.
-        delivery: from a version trained to commands that name it.
-        start: from the first commands to a learner that can train.
+        round: CPU time of an actor's round, without its rows.
+        row: CPU time of a row in a round: environment step and inference.
+        sleep: time of a row without CPU.
+        version: time to train a version, including other work of the learner.
+        replay: CPU time of the replay service per episode.
+        answer: from a request to its reply.
+        sync: from an episode's end to its acknowledgement, without ``replay``.
+        fetch: from an iteration's end until the learner has its episodes.
+        delivery: from a trained version to the commands with this version.
+        start: from the first commands until the learner can train.
     """
 
     round: float
@@ -46,14 +46,14 @@ class Costs(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """A run: the lengths of each iteration's episodes, by index, and its settings."""
+    """A run: the episode lengths of each iteration, by index, and the settings."""
 
     lengths: list[list[int]]
     config: Config
 
 
 class Timing(NamedTuple):
-    """Seconds at which the warm-up and the last iteration end, and the steps between."""
+    """Times at which warm-up and last iteration end, in seconds, and the steps in between."""
 
     warm_up: float
     end: float
@@ -67,13 +67,13 @@ class Timing(NamedTuple):
 
 @dataclass
 class Actor:
-    """Environments, what runs in them, and what is under way.
+    """The state of an actor.
 
     Attributes:
-        free: environments without an episode.
-        running: steps left of each episode.
-        held: commands that are not acknowledged.
-        load: cores that its round takes; 0: none is under way.
+        free: number of environments without an episode.
+        running: remaining steps of each episode.
+        held: number of unacknowledged commands.
+        load: cores that the current round uses; 0: no round is in progress.
         asking: whether it waits for commands.
     """
 
@@ -85,14 +85,14 @@ class Actor:
 
 
 class Simulation:
-    """Plays a recorded run.
+    """Simulates a recorded run.
 
     Args:
         recorded: the run.
-        costs: of its parts.
-        cores: for all; the replay service and the learner go first.
-        actors: how many.
-        environments: of each actor.
+        costs: durations of its parts.
+        cores: number of cores; replay service and learner have priority.
+        actors: number of actors.
+        environments: environments per actor.
     """
 
     def __init__(
@@ -106,8 +106,8 @@ class Simulation:
         self._events: list[tuple[float, int, str, Any]] = []
         self._tie = itertools.count()
         self._now = 0.0
-        # Commands by the version that they wait for, those that nobody carries out yet, and how
-        # many are neither waiting nor done.
+        # Commands that wait for a version; those that no actor has; the number of commands that
+        # are neither waiting nor done.
         self._awaiting: dict[int, list[CommandId]] = defaultdict(list)
         self._undealt: list[CommandId] = []
         self._in_play = 0
@@ -119,7 +119,7 @@ class Simulation:
         self._replay_free = 0.0
 
     def run(self) -> Timing:
-        """Play until the last iteration is complete; those opened beyond it resemble it."""
+        """Simulate until the last iteration is complete. Later iterations have its lengths."""
         self._open(0)
         self._delivered(0)
         while len(self._ends) <= self._last:
@@ -162,7 +162,7 @@ class Simulation:
         self._load += actor.load
         others = self._training_threads * self._is_training + (self._now < self._replay_free)
         cores = max(self._cores - others, _LEAST_CORES)
-        # Each gets its part of the cores: whoever sleeps most of the time does not need one.
+        # Actors share the cores in proportion to their load: those that sleep need less.
         self._at((cpu + sleep) * max(1.0, self._load / cores), "stepped", actor)
 
     def _stepped(self, actor: Actor) -> None:

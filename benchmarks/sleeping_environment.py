@@ -7,11 +7,11 @@ import gymnasium as gym
 
 
 class Sleeping(gym.Wrapper[Any, Any, Any, Any]):
-    """Sleeps after every step, as if a simulator on another machine were asked.
+    """Sleeps after every step, like an environment that waits for a remote simulator.
 
     Args:
-        env: what is stepped.
-        seconds: of sleep.
+        env: the environment.
+        seconds: duration of the sleep.
     """
 
     def __init__(self, env: gym.Env[Any, Any], seconds: float) -> None:

@@ -1,12 +1,12 @@
-"""Half an hour of a real run: memory, descriptors, threads, and the cost of an iteration.
+"""Half an hour of a real run: memory, file descriptors, threads and speed.
 
 ::
 
     make soak                                        # 30 minutes
     .venv/bin/python benchmarks/soak.py --minutes 5
 
-CartPole with its preset: iterations are short, so there are as many as possible, and with them
-everything that is done once an iteration, an episode or a message. Exit code 1: something grew.
+CartPole with its preset has short iterations, and therefore as many iterations, episodes and
+messages as possible. Exit code 1: memory, descriptors or threads grew.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 ROLES = ("replay", "learner", "actor")
-#: Growth that counts, from the second to the last quarter of the run.
+#: Permitted relative growth from the second to the last quarter of the run.
 _GROWTH = {"MiB": 0.03, "descriptors": 0.0, "threads": 0.0}
 
 
@@ -53,12 +53,12 @@ class Pace(NamedTuple):
 
 
 def main() -> int:
-    """Run, look, and print."""
+    """Train, sample and print a report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--every", type=float, default=10.0, help="seconds between two looks")
-    parser.add_argument("--csv", type=Path, help="write all samples here")
+    parser.add_argument("--every", type=float, default=10.0, help="seconds between samples")
+    parser.add_argument("--csv", type=Path, help="write all samples to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
@@ -108,7 +108,7 @@ def _look(parent: int, now: float) -> Iterator[Sample]:
             descriptors = len(list((path / "fd").iterdir()))
             yield Sample(now, role, int(path.name), mib, descriptors, int(status["Threads"]))
         except (FileNotFoundError, ProcessLookupError, ValueError, KeyError):
-            continue  # it ended, or is no service
+            continue  # it ended, or is not a service
 
 
 def _pace(run_dir: Path, now: float) -> Iterator[Pace]:

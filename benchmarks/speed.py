@@ -1,21 +1,20 @@
-"""The whole system's env steps per second beside the limit that its parts set.
+"""The env steps per second of the whole system, compared with the limit that its parts set.
 
-One training run with the shipped preset, budget included, is measured from the end of its warm-up
-on, evaluation steps counted too. Then its parts are timed alone, on the same machine: a bare
-environment step (replaying actions that the run recorded), a row of batched inference, an update.
-From these::
+A training run with the preset and its budget is measured from the end of the warm-up on; evaluation
+steps count. Then its parts are timed separately on the same machine: a bare environment step (with
+the recorded actions of the run), a row of batched inference, an update. From these::
 
     limit = min(
         cores / (step + inference + update x updates per env step),
         1 / (update x updates per env step),
     )
 
-The second is the learner's: version v needs version v-1, so that one core bounds it.
+The second is the learner's: version v needs version v-1, so training cannot use more cores.
 
-The same parts are then timed in one process per core at once: cores may share caches, memory, clock
-or execution units, and then all of them together do less than so many times one.
+Then the same parts are timed in one process per core simultaneously. Cores may share caches, memory
+bandwidth, clock or execution units, so together they may do less than n times the work of one.
 
-Run it on an otherwise idle machine: ``make bench``.
+Needs an idle machine: ``make bench``.
 """
 
 import argparse
@@ -58,13 +57,13 @@ from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
 _TICK = os.sysconf("SC_CLK_TCK")
-#: Rows of the call whose time is measured.
+#: Rows of the call that is timed.
 _ROWS = 16
 _ROLES = ("actor", "learner", "replay", "train")
 
 
 class Window(NamedTuple):
-    """What happened in a part of a run."""
+    """A part of a run."""
 
     seconds: float
     steps: int
@@ -72,14 +71,14 @@ class Window(NamedTuple):
 
 
 class Usage(NamedTuple):
-    """Env steps after the warm-up, and CPU seconds by role since the processes began."""
+    """Env steps after the warm-up, and CPU seconds by role since the processes started."""
 
     steps: int
     cpu: dict[str, float]
 
 
 class Parts(NamedTuple):
-    """Seconds of each part alone: in one thread, a chained update in as many as the run's."""
+    """Seconds of each part, in one thread; a chained update has the threads of the run."""
 
     step: float
     inference: float
@@ -98,7 +97,9 @@ def main() -> None:
     parser.add_argument("--actors", type=int)
     parser.add_argument("--envs-per-actor", type=int)
     parser.add_argument("--reference-steps", type=int, default=300_000)
-    parser.add_argument("--parts", type=Path, metavar="RUN_DIR", help="time a run's parts only")
+    parser.add_argument(
+        "--parts", type=Path, metavar="RUN_DIR", help="only time the parts of a run"
+    )
     options = parser.parse_args()
     if options.parts:
         keep_freed_memory()
@@ -186,7 +187,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, float]:
 
 
 def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], list[Usage]]:
-    """Train; return the last status and what the processes used by and by after the warm-up."""
+    """Train; return the last status, and samples of the CPU usage after the warm-up."""
     command = [
         sys.executable, "-m", "udrl_launch", "train", options.env,
         "--run-dir", str(run_dir), "--json",
@@ -213,14 +214,14 @@ def _train(options: argparse.Namespace, run_dir: Path) -> tuple[dict[str, Any], 
 
 
 def _usage(run_dir: Path, parent: int) -> Usage:
-    """Return how far a run is and what its processes have used."""
+    """Return the progress of a run and the CPU usage of its processes."""
     try:
         window = _window(run_dir)
     except (FileNotFoundError, IndexError, ValueError):
         window = Window(0.0, 0, 0)
     cpu = dict.fromkeys(_ROLES, 0.0)
     for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError):  # the process has ended
             words = (process / "cmdline").read_text().split("\0")
             ours = process.name == str(parent) or str(parent) in words
             role = next((word for word in words if word in _ROLES), None)
@@ -231,7 +232,7 @@ def _usage(run_dir: Path, parent: int) -> Usage:
 
 
 def _window(run_dir: Path) -> Window:
-    """Return the run after its warm-up."""
+    """Return the part of a run after its warm-up."""
     lines = (run_dir / "metrics.csv").read_text().splitlines()
     names = lines[0].split(",")
     rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
@@ -253,7 +254,7 @@ def _recorded(run_dir: Path) -> tuple[Config, list[Episode]]:
 
 
 def _time_parts(run_dir: Path, processes: int) -> Parts:
-    """Return the mean of what so many processes find that time the parts at once."""
+    """Return the means of the parts' times in processes that time them simultaneously."""
     command = [sys.executable, __file__, "--parts", str(run_dir)]
     running = [
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)
@@ -288,16 +289,16 @@ def _parts(config: Config, episodes: list[Episode]) -> Parts:
         state, n = untrained(settings, spec), settings.training.n_updates_per_iter
         return _seconds(lambda: train(state, ranked, settings), 5) / n
 
-    # The bound of the cores counts the time of one; that of the chain, the time that passes.
+    # The cores' limit depends on the CPU time in one thread, the learner's on the elapsed time.
     update = seconds_per_update(change(config, training_threads=1))
     chained = seconds_per_update(config)
     return Parts(step, inference, update, chained, _bare_update(config, spec))
 
 
 def _bare_update(config: Config, spec: EnvironmentSpec) -> float:
-    """Return the seconds of forward, backward and step on tensors that are in memory already.
+    """Return the seconds of forward pass, backward pass and step, on tensors in memory.
 
-    With a value function, of its update too.
+    With a value function, its update is included.
     """
     state, n = untrained(config, spec), config.training.batch_size
     seen = spec.observation_space

@@ -1,4 +1,4 @@
-"""An actor with a name that is not its own: ``twin.py ENDPOINT PARENT_PID``."""
+"""An actor with the fixed name ``twin``: ``twin.py ENDPOINT PARENT_PID``."""
 
 import sys
 import threading

@@ -36,6 +36,16 @@ from udrl_replay.database import FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import COLUMNS, Store
 
+# Studies.
+
+
+def test_studies_name_what_other_algorithms_need() -> None:
+    text = " ".join(section("docs/studies.md", "## Participants").split())
+    needs = text[text.index("DQN, A2C and PPO are") :]
+    for words in ('pip install "udrl[studies]"', "discrete actions and one vector or image"):
+        assert words in needs
+
+
 # Settings.
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.markdown import ROOT, text_of
 from udrl_experiments.jobs import read_job
-from udrl_experiments.records import EvaluationRecord, Obtained
+from udrl_experiments.records import EvaluationRecord, Obtained, agent_name
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_inspect.csv_tables import read
 
@@ -46,8 +46,7 @@ def test_pictures_show_every_line(folder: Path) -> None:
     points = read(folder / "curves.csv", CurvePoint)
     picture = (folder / "learning-curves.svg").read_text(encoding="utf-8")
     for algorithm, variant, seeds in {(p.algorithm, p.variant, p.seeds) for p in points}:
-        words = " ".join(word for word in (algorithm, variant) if word)
-        assert f"{words} ({seeds} seed" in picture
+        assert f"{agent_name(algorithm, variant)} ({seeds} seed" in picture
 
 
 @pytest.mark.parametrize("table", sorted(RESULTS.glob("sensitivity*/*.csv")), ids=lambda p: p.stem)

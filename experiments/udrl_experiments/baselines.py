@@ -1,7 +1,7 @@
 """Algorithms of Stable-Baselines3 under UDRL's protocol (section 3.2).
 
-Networks, reset seeds and evaluations are UDRL's: an evaluation is Algorithm 2, with commands that
-nobody hears.
+Networks, reset seeds and evaluations are the same as UDRL's. An evaluation is Algorithm 2 with
+commands that the policy ignores.
 """
 
 import contextlib
@@ -30,22 +30,22 @@ from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
 from udrl_inspect.csv_tables import write
 
-#: Environments that an evaluation runs in at the same time; its result does not depend on it.
+#: Number of environments of an evaluation. The result does not depend on it.
 _ENVIRONMENTS = 16
 
 
 class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a baseline's run is.
+    """Specification of a baseline's run.
 
     Attributes:
-        algorithm: the learner.
-        config: environment and its time limit, ``frame_stack``, ``convolutions`` and ``hidden``,
-            seed, evaluations (DQN's are greedy always) and device; what else it says is UDRL's.
+        algorithm: the algorithm.
+        config: environment and its time limit, ``frame_stack``, ``convolutions``, ``hidden``, seed,
+            evaluations (DQN always acts greedily in them) and device. Other settings are ignored.
         hyperparameters: those of the algorithm's class in :mod:`udrl_experiments.tuned` that differ
             from their defaults.
 
     Raises:
-        ConfigError: a hyperparameter is unknown or impossible.
+        ConfigError: a hyperparameter is unknown or invalid.
     """
 
     algorithm: BaselineAlgorithm
@@ -61,12 +61,12 @@ class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True):
-    """How far a run is, besides what lies in tensors.
+    """State of a run, except for tensors.
 
     Attributes:
-        exploration_steps: env steps in which DQN's part of random actions falls; 0 for others.
-        counters: the model's.
-        rows: the evaluations.
+        exploration_steps: env steps over which DQN's exploration rate decreases; 0 for others.
+        counters: counters of the model.
+        rows: the evaluations so far.
     """
 
     exploration_steps: int
@@ -82,28 +82,27 @@ def run(
     exploration_steps: int | None = None,
     stop: threading.Event | None = None,
 ) -> list[EvaluationRecord]:
-    """Train, or go on with the training in a folder, and evaluate every ``eval_every`` env steps.
+    """Train, or resume the run in a folder, with an evaluation every ``eval_every`` env steps.
 
-    Who asks for more env steps than a run has made extends it. What is resumed goes on from its
-    last evaluation, but is not bit-identical to what was never stopped: episodes in progress begin
-    anew, and random numbers are others.
+    A larger ``max_env_steps`` extends a finished run. A run is resumed from its last evaluation,
+    without bit-identical results: episodes in progress are lost, and random numbers differ.
 
     Args:
-        baseline: what to train.
-        max_env_steps: the training ends at the first update that reaches them, with an evaluation.
-        folder: of this run alone. ``evaluations.csv`` grows with every evaluation.
-        exploration_steps: env steps in which DQN's part of random actions falls; None: its
-            ``exploration_fraction`` of ``max_env_steps``. A resumed run keeps what it began with.
-        stop: ends the training early; it goes on from its last evaluation.
+        baseline: specification of the run.
+        max_env_steps: training ends at the first update that reaches it, with an evaluation.
+        folder: folder of this run only. Each evaluation adds a row to ``evaluations.csv``.
+        exploration_steps: env steps over which DQN's exploration rate decreases. None:
+            ``exploration_fraction`` of ``max_env_steps``. A resumed run keeps its original value.
+        stop: ends training early. Steps since the last evaluation are lost.
 
     Returns:
-        All evaluations.
+        All evaluations of the run.
 
     Raises:
         ConfigError: Stable-Baselines3 is not installed.
         UnsupportedEnvironment: the environment cannot be made or is not supported.
         EnvironmentFault: the environment failed repeatedly in an evaluation.
-        InvalidData: what the folder holds is damaged.
+        InvalidData: the state in the folder is damaged.
         Interrupted: ``stop`` was set.
     """
     stop = stop or threading.Event()
@@ -114,13 +113,12 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     config, hyperparameters = settle(baseline.config), baseline.complete()
     path = folder / "state.safetensors"
-    held: dict[str, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
     if path.exists():
         with _reading(path):
-            state, held = _load(path)
-        write(
-            folder / "evaluations.csv", EvaluationRecord, state.rows
-        )  # it may have stopped before that
+            state, tensors = _load(path)
+        # The process may have ended after it saved the state, and before it wrote the table.
+        write(folder / "evaluations.csv", EvaluationRecord, state.rows)
     else:
         if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
             exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
@@ -134,11 +132,11 @@ def run(
         )
         assert model.env is not None
         opened.callback(model.env.close)
-        if held:
+        if tensors:
             with _reading(path):
-                policies.restore(model, held, state.counters)
-        held.clear()
-        policies.explore_for(model, state.exploration_steps)
+                policies.restore(model, tensors, state.counters)
+        tensors.clear()
+        policies.set_exploration(model, state.exploration_steps)
         generator = EpisodeGenerator(config, min(_ENVIRONMENTS, config.evaluation.eval_episodes))
         opened.callback(generator.close)
         (shape,) = FrameStack(generator.spec.observation_space, config.network.frame_stack).shapes
@@ -152,7 +150,7 @@ def run(
             )
             if stop.is_set():
                 raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
-            behavior = policies.InPlaceOfBehavior(model, shape)
+            behavior = policies.ModelPolicy(model, shape)
             commands = _commands(baseline, generator, len(rows) + 1)
             episodes = generate_episodes(generator, commands, behavior)
             evaluation = summarise([episode.episode_return for episode in episodes])
@@ -171,29 +169,30 @@ def run(
 
 def _require_stable_baselines3() -> None:
     try:
-        import stable_baselines3  # noqa: F401 - whether it can be
+        import stable_baselines3  # noqa: F401 - only checks that it is installed
     except ImportError as error:
         raise ConfigError(
-            f"algorithms other than UDRL are Stable-Baselines3's: {error}; "
-            f'pip install "udrl[studies]"'
+            f"algorithms other than UDRL need Stable-Baselines3: {error}; "
+            f'install it with: pip install "udrl[studies]"'
         ) from error
 
 
 def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> list[Command]:
-    """Return the commands of an evaluation: the seeds of UDRL's in the iteration ``number``."""
+    """Return the commands of an evaluation, with the seeds of UDRL's in iteration ``number``."""
     config = baseline.config
     if baseline.algorithm == "DQN":
         config = change(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec)
-    unheard = ReplayBuffer(config.buffer, [Entry(0.0, 0, 1)])  # nobody hears these
-    return sampler.evaluate(number, unheard)
+    # Desired returns and horizons come from the buffer. The policy ignores them.
+    buffer = ReplayBuffer(config.buffer, [Entry(0.0, 0, 1)])
+    return sampler.evaluate(number, buffer)
 
 
 def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:
-    aside = path.with_name(path.name + ".part")
+    part = path.with_name(path.name + ".part")
     metadata = {"state": msgspec.json.encode(state).decode()}
-    safetensors.torch.save_file(tensors, aside, metadata)
-    os.replace(aside, path)
+    safetensors.torch.save_file(tensors, part, metadata)
+    os.replace(part, path)
 
 
 def _load(path: Path) -> tuple[_State, dict[str, Tensor]]:
@@ -204,7 +203,7 @@ def _load(path: Path) -> tuple[_State, dict[str, Tensor]]:
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what reading a file raises into :class:`InvalidData`."""
+    """Raise :class:`InvalidData` in place of errors that a damaged file causes."""
     try:
         yield
     except (
@@ -212,5 +211,5 @@ def _reading(path: Path) -> Iterator[None]:
     ) as error:  # fmt: skip
         raise InvalidData(
             f"{path}: {type(error).__name__}: {error}; "
-            f"delete the folder {path.parent} to have the run made again"
+            f"delete the folder {path.parent} to repeat the run"
         ) from error

@@ -15,13 +15,13 @@ from udrl_experiments.protocol import (
     StudyPlan,
     Task,
 )
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.records import PAPER, EvaluationRecord, agent_name
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
-#: Table and figure against each quantity, without suffix.
+#: Table and figure for each x axis, without suffix.
 _FILES = {
     "env_steps": ("curves", "learning-curves"),
     "wall_s": ("curves-wall-time", "learning-curves-wall-time"),
@@ -32,9 +32,9 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
 
     Args:
-        name: of the task.
+        name: name of the task.
         plan: seeds and steps.
-        participants: the lines of the figure.
+        participants: one line of the figure each; duplicates are ignored.
     """
     task = TASKS[name]
     jobs = [
@@ -43,10 +43,10 @@ def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) 
         for seed in plan.seeds_of_runs()
     ]
 
-    def report(place: StudyFolders) -> str:
-        said = report_curves(jobs, task, task.title, place)
-        report_wall_time(jobs, task, task.title, place)
-        return said
+    def report(folders: StudyFolders) -> str:
+        summary = report_curves(jobs, task, task.title, folders)
+        report_wall_time(jobs, task, task.title, folders)
+        return summary
 
     return Study(name, jobs, report)
 
@@ -59,7 +59,7 @@ def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job
             algorithm="UDRL",
             settings=flat(plan.config(task, seed, paper=paper)),
             max_env_steps=plan.steps(task),
-            variant="paper" if paper else "",
+            variant=PAPER if paper else "",
         )
     chosen = tuned(participant, task.environment)
     steps = plan.steps(task, participant)
@@ -71,8 +71,17 @@ def baseline(
     config: Config,
     hyperparameters: dict[str, KeywordValue],
     max_env_steps: int,
+    variant: str = "",
 ) -> Job:
-    """Return a run of an algorithm other than UDRL; DQN's exploration depends on its length."""
+    """Return a run of an algorithm other than UDRL.
+
+    Args:
+        algorithm: the algorithm.
+        config: environment, networks, seed and evaluations.
+        hyperparameters: those that differ from the defaults.
+        max_env_steps: length of the run. DQN's exploration depends on it.
+        variant: as in :class:`~udrl_experiments.jobs.Job`.
+    """
     exploration = float(hyperparameters.get("exploration_fraction", 0.0))
     return Job(
         algorithm=algorithm,
@@ -80,45 +89,45 @@ def baseline(
         hyperparameters=hyperparameters,
         exploration_steps=round(exploration * max_env_steps),
         max_env_steps=max_env_steps,
+        variant=variant,
     )
 
 
-def report_curves(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> str:
-    """Write all evaluations, their curves, and when returns were reached; draw the curves.
+def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> str:
+    """Write the tables of evaluations, curves and reached thresholds, and draw the curves.
 
     Returns:
-        A line for each curve: where it ends.
+        One line for each curve, with its last point.
     """
-    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(place.root)]
+    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(folders.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
-    write(place.folder / "evaluations.csv", EvaluationRecord, rows)
-    write(place.folder / "curves.csv", CurvePoint, points)
-    write(place.folder / "reached.csv", Reached, reached(rows, task.thresholds))
-    draw_curves(place.folder, title, task.landmarks)
+    write(folders.folder / "evaluations.csv", EvaluationRecord, rows)
+    write(folders.folder / "curves.csv", CurvePoint, points)
+    write(folders.folder / "reached.csv", Reached, reached(rows, task.thresholds))
+    draw_curves(folders.folder, title, task.landmarks)
     last = {(point.algorithm, point.variant): point for point in points}
     return "\n".join(
-        f"{title}: {' '.join(words).strip()}: mean return {end.mean:.1f} after {end.env_steps:,} "
+        f"{title}: {agent_name(*agent)}: mean return {end.mean:.1f} after {end.env_steps:,} "
         f"env steps, seeds: {end.seeds}, 95 % interval {end.low:.1f} to {end.high:.1f}"
-        for words, end in last.items()
+        for agent, end in last.items()
     )
 
 
-def report_wall_time(jobs: Sequence[Job], task: Task, title: str, place: StudyFolders) -> None:
-    """Write and draw the curves against wall time, of runs on one kind of machine.
+def report_wall_time(jobs: Sequence[Job], task: Task, title: str, folders: StudyFolders) -> None:
+    """Write and draw the curves against wall time for runs on the most frequent kind of machine.
 
-    It is the one that most runs were made on, and the figure names it. Nothing is written if no
-    run's machine is known.
+    The figure names the machine. Nothing is written if no run's machine is known.
     """
-    machines = {job.name: job.machine(place.root) for job in jobs}
+    machines = {job.name: job.machine(folders.root) for job in jobs}
     known = Counter(machine for machine in machines.values() if machine is not None)
     if not known:
         return
     ((machine, _),) = known.most_common(1)
     here = [job for job in jobs if machines[job.name] == machine]
-    rows = [row for job in here for row in job.evaluations(place.root)]
+    rows = [row for job in here for row in job.evaluations(folders.root)]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
-    write(place.folder / "curves-wall-time.csv", CurvePoint, points)
-    draw_curves(place.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
+    write(folders.folder / "curves-wall-time.csv", CurvePoint, points)
+    draw_curves(folders.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
 
 
 def draw_curves(
@@ -127,7 +136,7 @@ def draw_curves(
     landmarks: Mapping[str, float],
     x: Literal["env_steps", "wall_s"] = "env_steps",
 ) -> None:
-    """Draw the curves from their table alone."""
+    """Draw the curves from their table."""
     table, picture = _FILES[x]
     points = read(folder / f"{table}.csv", CurvePoint)
     figures.save(

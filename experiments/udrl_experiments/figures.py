@@ -1,6 +1,6 @@
-"""The pictures of the studies, drawn from tidy tables alone, in the layout of the paper's figures.
+"""Figures of the studies, drawn from tidy tables, in the layout of the paper's figures.
 
-They can be read in grey and by the colour-blind (:mod:`udrl_show.styles`).
+Lines can be told apart in greyscale and with colour blindness (:mod:`udrl_show.styles`).
 """
 
 import itertools
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from udrl.errors import ConfigError
-from udrl_experiments.records import Obtained
+from udrl_experiments.records import Obtained, agent_name
 from udrl_experiments.statistics import CurvePoint
 from udrl_show.styles import line_style
 
@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Lines that look the same in every figure, by algorithm and variant, or by algorithm alone. UDRL
-#: is green, as in the paper.
-_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL paper": 4}
+#: Styles that are the same in every figure, by agent or algorithm. UDRL is green, as in the paper.
+_OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL-paper": 4}
 
 _AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
 
@@ -33,13 +32,13 @@ def learning_curves(
     x: Literal["env_steps", "wall_s"] = "env_steps",
     references: Mapping[str, float] | None = None,
 ) -> "Figure":
-    """Draw mean returns with their 95 % bootstrap bands (Figures 4 and 5), a line for each agent.
+    """Draw mean returns with 95 % bootstrap intervals (Figures 4 and 5), one line per agent.
 
     Args:
-        points: at least one; those of an agent in the order of env steps.
-        title: of the figure.
-        x: what the returns are drawn against.
-        references: horizontal lines, from the label to the return.
+        points: at least one point; those of an agent in the order of env steps.
+        title: title of the figure.
+        x: quantity on the x axis.
+        references: returns of horizontal lines, by label.
 
     Raises:
         ConfigError: there are no points, or matplotlib is not installed.
@@ -57,16 +56,17 @@ def learning_curves(
             textcoords="offset points", va="center", fontsize="small",
         )  # fmt: skip
     several = len({environment for environment, _, _ in lines}) > 1
-    agents = [(f"{algorithm} {variant}", algorithm) for _, algorithm, variant in lines]
+    agents = [(agent_name(algorithm, variant), algorithm) for _, algorithm, variant in lines]
     styles = _styles([name if name in _OWN_STYLES else algorithm for name, algorithm in agents])
     for (key, line), (rank, style) in zip(lines.items(), enumerate(styles), strict=True):
         seeds = line[0].seeds
-        words = [word for word in key[0 if several else 1 :] if word]
-        label = f"{' '.join(words)} ({seeds} {'seed' if seeds == 1 else 'seeds'})"
+        environment, algorithm, variant = key
+        name = f"{environment} " * several + agent_name(algorithm, variant)
+        label = f"{name} ({seeds} {'seed' if seeds == 1 else 'seeds'})"
         at = [getattr(point, x) / unit for point in line]
         low, mean, high = ([getattr(p, name) for p in line] for name in ("low", "mean", "high"))
         axes.fill_between(at, low, high, color=style["color"], alpha=0.2, lw=0)
-        # Ten markers, each line's at other places, lest they hide each other.
+        # Ten markers per line, shifted so that they do not hide each other.
         step = max(1, len(line) // 10)
         axes.plot(at, mean, label=label, markevery=(step * rank // len(lines), step), **style)
     _legend(figure, axes, "mean over seeds, 95 % bootstrap interval")
@@ -74,13 +74,13 @@ def learning_curves(
 
 
 def sensitivity(rows: Sequence[Obtained], title: str) -> "Figure":
-    """Draw obtained against desired returns (section 3.5, Figure 6), a line for each run.
+    """Draw obtained against desired returns (section 3.5, Figure 6), one line per run.
 
-    The error bars are the standard deviation of the episodes' returns, as the paper's.
+    As in the paper, error bars are the standard deviation of the episodes' returns.
 
     Args:
-        rows: at least one, in any order.
-        title: of the figure.
+        rows: at least one row, in any order.
+        title: title of the figure.
 
     Raises:
         ConfigError: there are no rows, or matplotlib is not installed.
@@ -108,27 +108,28 @@ def sensitivity(rows: Sequence[Obtained], title: str) -> "Figure":
 
 
 def save(figure: "Figure", path: Path) -> list[Path]:
-    """Write a figure as PNG and SVG, the same bytes for the same figure; return the two files.
+    """Write a figure as PNG and SVG, and return the two files.
 
-    Each file is there whole or not at all. Text in the SVG stays text.
+    Equal figures give identical bytes. Each file is replaced atomically. Text in the SVG remains
+    text.
 
     Args:
-        figure: of this module; its layout is settled by saving it.
-        path: without suffix.
+        figure: a figure of this module; saving it fixes its layout.
+        path: path without suffix.
     """
     from matplotlib import rc_context
 
-    # Every drawing would move the layout a little further, and the SVG comes after the PNG.
+    # Each drawing changes the layout slightly, so the SVG would differ from the PNG.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     saved = []
-    # Matplotlib would write its version, the time and random ids.
-    for suffix, unwanted in ((".png", "Software"), (".svg", "Date")):
+    # By default, Matplotlib writes its version, the time and random ids.
+    for suffix, omitted in ((".png", "Software"), (".svg", "Date")):
         picture = path.with_name(path.name + suffix)
-        aside = path.with_name(picture.name + ".part")
+        part = path.with_name(picture.name + ".part")
         with rc_context({"svg.hashsalt": "udrl", "svg.fonttype": "none"}):
-            figure.savefig(aside, format=suffix[1:], dpi=130, metadata={unwanted: None})
-        os.replace(aside, picture)
+            figure.savefig(part, format=suffix[1:], dpi=130, metadata={omitted: None})
+        os.replace(part, picture)
         saved.append(picture)
     return saved
 
@@ -139,10 +140,10 @@ def _empty(title: str, xlabel: str, ylabel: str, *, rows: int) -> "tuple[Figure,
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise ConfigError(
-            'the figures need matplotlib; install it with: pip install "udrl[studies]"'
+            'figures need matplotlib; install it with: pip install "udrl[studies]"'
         ) from error
     if not rows:
-        raise ConfigError(f"{title}: a figure of an empty table; expected at least one row")
+        raise ConfigError(f"{title}: the table of the figure is empty; expected at least one row")
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
@@ -152,7 +153,7 @@ def _empty(title: str, xlabel: str, ylabel: str, *, rows: int) -> "tuple[Figure,
 
 
 def _styles(names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield a style for each line; the first line of a known name has that name's."""
+    """Yield a style for each line. The first line of a name in ``_OWN_STYLES`` has its style."""
     own = {name: rank for name, rank in _OWN_STYLES.items() if name in names}
     taken = set(own.values())
     others = (rank for rank in itertools.count() if rank not in taken)
@@ -162,9 +163,9 @@ def _styles(names: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _legend(figure: "Figure", axes: "Axes", title: str) -> None:
-    """Put the legend below the axes, where it hides nothing."""
+    """Add a legend below the axes, where it covers no lines."""
     _, labels = axes.get_legend_handles_labels()
-    # A line of small print across the figure has some 110 characters, a handle takes twelve.
+    # At this font size the figure is about 110 characters wide; a legend handle takes 12.
     columns = min(len(labels), max(1, 110 // (max(map(len, labels)) + 12)))
     figure.set_figheight(4.6 + 0.17 * math.ceil(len(labels) / columns))
     figure.legend(

@@ -1,4 +1,4 @@
-"""One run of a study in a process of its own: ``python -m udrl_experiments.job FOLDER``."""
+"""The process of a study's run: ``python -m udrl_experiments.job FOLDER``."""
 
 import contextlib
 import csv
@@ -16,7 +16,7 @@ import msgspec
 from udrl.config import Budget
 from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
-from udrl_experiments.jobs import Job, read_job
+from udrl_experiments.jobs import ERROR_PREFIX, Job, read_job
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import put, read, write
@@ -30,49 +30,49 @@ from udrl_proto.reports import Status
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--parent", type=int)
 def main(folder: Path, parent: int | None) -> None:
-    """Do the run that FOLDER/job.json describes, or go on with it."""
+    """Run the job in FOLDER/job.json, or resume it."""
     if parent is not None:
         die_with_parent(parent)
     log_to_stderr(logging.WARNING)
     try:
         job = read_job(folder)
-        code = run_service(lambda stop: carry_out(job, folder, stop))
+        code = run_service(lambda stop: run_job(job, folder, stop))
     except UdrlError as error:
-        click.echo(f"udrl: error: {error}", err=True)
+        click.echo(f"{ERROR_PREFIX}{error}", err=True)
         code = error.exit_code
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # as the command `udrl` ends, for the same reason
+    os._exit(code)  # as the command `udrl` does, for the same reason
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keep other processes from the run; the kernel lets go of it when this one ends."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock the run. The kernel releases the lock when the process ends."""
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise RunInUse(
-                f"another study works on the run in {folder}; wait for it, or name another --folder"
+                f"another process is running {folder}; wait for it, or choose another --folder"
             ) from error
         yield
 
 
-def carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
-    """Do the run and leave its evaluations and a note that it is done.
+def run_job(job: Job, folder: Path, stop: threading.Event) -> None:
+    """Run a job, and write ``evaluations.csv`` and ``done.json``.
 
     Raises:
-        RunInUse: somebody does it already.
-        UdrlError: it failed.
+        RunInUse: another process is running this job.
+        UdrlError: the run failed.
         Interrupted: ``stop`` was set.
     """
-    with _alone(folder):
-        _carry_out(job, folder, stop)
+    with _locked(folder):
+        _run_job(job, folder, stop)
 
 
-def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
+def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
     if not (folder / "run").exists() and not (folder / "state.safetensors").exists():
-        # If only the records of a shorter run were kept, it begins anew.
+        # Only the records of a shorter run were kept. It cannot be extended, so it starts again.
         (folder / "done.json").unlink(missing_ok=True)
     if job.algorithm == "UDRL":
         settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
@@ -80,7 +80,7 @@ def _carry_out(job: Job, folder: Path, stop: threading.Event) -> None:
         if status.problem:
             raise RunFailed(status.problem)
         table = folder / "evaluations.csv"
-        # What closed a run that goes on now was an evaluation too, and stays.
+        # The final evaluation before an extension is only in the table, and is kept.
         rows = {row.env_steps: row for row in _evaluations(job, folder / "run", status)}
         if (folder / "done.json").exists():
             rows |= {row.env_steps: row for row in read(table, EvaluationRecord)}

@@ -1,7 +1,7 @@
-"""Training runs, the unit of every study: a process each, side by side, resumed where they stopped.
+"""Jobs: the runs of a study. Each is a process; several run in parallel, and each can be resumed.
 
-A run is a function of its settings, so studies share runs: whoever asks for the same settings gets
-the same run, and asks only for as many of its steps as it wants.
+A run is a function of its settings, so studies share runs: jobs with equal settings are the same
+run. A study uses the evaluations of a run up to the number of steps that it needs.
 """
 
 import hashlib
@@ -19,19 +19,22 @@ from udrl.config import Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import Machine
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.records import EvaluationRecord, agent_name
 from udrl_inspect.csv_tables import put, read
 
-#: What is said when a study is stopped.
+#: Message of an interrupted study.
 INTERRUPTED = "stopped; resume with the same command and --resume"
 
-#: Files that say what a run was and what came of it. The others are its state: what it takes to
-#: extend the run, or to use its agent.
+#: Files with a run's settings and results. The others are its state, which is needed to extend the
+#: run or to use its agent.
 RECORDS = "job.json", "evaluations.csv", "done.json"
+
+#: Begins the line of the log with the error of a failed run.
+ERROR_PREFIX = "udrl: error: "
 
 _PROGRAM = ("-m", "udrl_experiments.job")
 _POLL_S = 0.2
-#: Seconds that a run gets to end when it is told to.
+#: Seconds between SIGTERM and SIGKILL.
 _END_S = 10.0
 
 
@@ -39,12 +42,12 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """A run that a study needs.
 
     Attributes:
-        algorithm: the learner.
-        settings: UDRL's; of another algorithm's, environment, networks and evaluations.
-        hyperparameters: of another algorithm than UDRL.
-        exploration_steps: over which DQN's part of random actions falls is a part of so many.
-        max_env_steps: how far.
-        variant: what sets it apart within the study; not a part of what the run is.
+        algorithm: the algorithm.
+        settings: settings of UDRL. Other algorithms use its environment, networks and evaluations.
+        hyperparameters: hyperparameters of other algorithms.
+        exploration_steps: env steps over which DQN's exploration rate decreases; 0 for others.
+        max_env_steps: length of the run.
+        variant: label that distinguishes agents of a study; not part of the run's identity.
     """
 
     algorithm: Algorithm
@@ -56,7 +59,7 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     @property
     def name(self) -> str:
-        """A name that only runs of equal settings have."""
+        """Name of the run, with a hash of its settings: equal settings, equal names."""
         identity = msgspec.json.encode(
             [self.algorithm, flat(self.config), self.hyperparameters, self.exploration_steps],
             order="sorted",
@@ -67,19 +70,18 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     @property
     def described(self) -> str:
-        """What it is, in a line."""
-        variant = f", {self.variant}" if self.variant else ""
+        """Description in one line."""
         return (
-            f"{self.algorithm}, {self.config.environment}, seed {self.config.seed}{variant}: "
-            f"{self.max_env_steps:,} env steps"
+            f"{agent_name(self.algorithm, self.variant)}, {self.config.environment}, "
+            f"seed {self.config.seed}: {self.max_env_steps:,} env steps"
         )
 
     def folder(self, root: Path) -> Path:
-        """Return where the run lives."""
+        """Return the folder of the run."""
         return root / "runs" / self.name
 
     def done(self, root: Path) -> bool:
-        """Say whether the run has got as far as is asked."""
+        """Return whether the run is finished, with at least ``max_env_steps``."""
         done = self._done(root)
         try:
             return (
@@ -91,23 +93,25 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             return False
 
     def machine(self, root: Path) -> Machine | None:
-        """Return the kind of machine that did the run, or its last part; None if unknown."""
+        """Return the kind of machine of the run, or of its last part; None if unknown."""
         done = self._done(root)
         return None if done is None else done.machine
 
-    def _done(self, root: Path) -> "_Done | None":
+    def _done(self, root: Path) -> "_DoneRecord | None":
         try:
             return msgspec.json.decode(
-                (self.folder(root) / "done.json").read_bytes(), type=_Done, strict=False
+                (self.folder(root) / "done.json").read_bytes(), type=_DoneRecord, strict=False
             )
         except (OSError, msgspec.DecodeError):
             return None
 
     def evaluations(self, root: Path) -> list[EvaluationRecord]:
-        """Return the run's evaluations up to the last multiple of ``eval_every`` asked for.
+        """Return the run's evaluations up to ``max_env_steps``.
+
+        An evaluation counts at the multiple of ``eval_every`` that it was due at.
 
         Raises:
-            InvalidData: they cannot be read.
+            InvalidData: the table cannot be read.
         """
         every = self.config.evaluation.eval_every
         return [
@@ -117,56 +121,57 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         ]
 
 
-class _Done(msgspec.Struct, frozen=True):
-    """What ``done.json`` says of a run."""
+class _DoneRecord(msgspec.Struct, frozen=True):
+    """The fields of ``done.json`` that are read."""
 
     max_env_steps: int
     machine: Machine | None = None
 
 
 def read_job(folder: Path) -> Job:
-    """Return the job of a folder.
+    """Return the job in a folder.
 
     Raises:
-        InvalidData: there is none.
+        InvalidData: ``job.json`` is missing or invalid.
     """
     try:
         return msgspec.json.decode((folder / "job.json").read_bytes(), type=Job)
     except (OSError, msgspec.DecodeError, ConfigError) as error:
-        raise InvalidData(f"{folder / 'job.json'}: {error}; expected a study's run") from error
+        raise InvalidData(f"{folder / 'job.json'}: {error}; expected the job of a study") from error
 
 
-def carry_out(
+def run_jobs(
     jobs: Iterable[Job],
     root: Path,
     side_by_side: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> None:
-    """Do all runs that are not done, some side by side; the first that fails ends the others.
+    """Run all jobs that are not done, several at a time. A failure ends the others.
 
     Args:
-        jobs: equal runs are done once, as far as the one that asks for most.
-        root: where runs live.
-        side_by_side: how many at a time.
-        stop: ends them early; they go on next time.
-        say: is told what begins and what ends.
+        jobs: the jobs. Those of the same run are merged (:func:`merge_jobs`).
+        root: folder of the folder ``runs``.
+        side_by_side: number of simultaneous runs.
+        stop: ends the runs early. They can be resumed.
+        echo: called with each line of progress.
 
     Raises:
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
-    waiting = [job for job in furthest(jobs) if not job.done(root)][::-1]
+    waiting = [job for job in merge_jobs(jobs) if not job.done(root)][::-1]
     jobs_by_name = {job.name: job for job in waiting}
     n, running = len(waiting), dict[str, subprocess.Popen[bytes]]()
+    log_sizes: dict[str, int] = {}  # before this process of the run
     try:
         while waiting or running:
             while waiting and len(running) < side_by_side:
                 job = waiting.pop()
-                say(f"[{n - len(waiting)}/{n}] {job.described}")
-                running[job.name] = _start(job, root)
+                echo(f"[{n - len(waiting)}/{n}] {job.described}")
+                running[job.name], log_sizes[job.name] = _start(job, root)
             if stop.wait(_POLL_S):
-                say(INTERRUPTED)  # before the runs get their time to end
+                echo(INTERRUPTED)  # now, because the runs may take seconds to end
                 raise Interrupted(INTERRUPTED)
             for name, process in list(running.items()):
                 code = process.poll()
@@ -174,76 +179,94 @@ def carry_out(
                     continue
                 del running[name]
                 if code != 0:
-                    raise _failure(root / "runs" / name, code)
+                    log = (root / "runs" / name / "log.txt").read_bytes()
+                    raise _failure(root / "runs" / name, code, log[log_sizes[name] :])
                 if not jobs_by_name[name].done(root):
                     raise RunFailed(
-                        f"the run in {root / 'runs' / name} has no evaluation within "
-                        f"{jobs_by_name[name].max_env_steps:,} env steps; ask for more "
-                        f"(--max-env-steps), or evaluate earlier (--set eval_every=STEPS)"
+                        f"the run in {root / 'runs' / name} ended without an evaluation within "
+                        f"{jobs_by_name[name].max_env_steps:,} env steps; raise --max-env-steps or "
+                        f"lower eval_every (--set eval_every=STEPS)"
                     )
     finally:
-        _end(running.values())
+        _terminate(running.values())
 
 
-def furthest(jobs: Iterable[Job]) -> Sequence[Job]:
-    """Return jobs of different runs, each as far as anyone asks, in order of first appearance."""
-    furthest: dict[str, Job] = {}
+def merge_jobs(jobs: Iterable[Job]) -> Sequence[Job]:
+    """Return one job per run, the longest, in the order of first appearance."""
+    merged: dict[str, Job] = {}
     for job in jobs:
-        held = furthest.setdefault(job.name, job)
-        if job.max_env_steps > held.max_env_steps:
-            furthest[job.name] = job
-    return list(furthest.values())
+        kept = merged.setdefault(job.name, job)
+        if job.max_env_steps > kept.max_env_steps:
+            merged[job.name] = job
+    return list(merged.values())
 
 
 def copy_finished(
-    jobs: Iterable[Job], root: Path, sources: Sequence[Path], say: Callable[[str], None]
+    jobs: Iterable[Job], root: Path, sources: Sequence[Path], echo: Callable[[str], None]
 ) -> None:
-    """Copy the records of runs that are done in other folders of studies, and not in this one.
+    """Copy the records of runs that are finished in other folders of studies but not in this one.
 
     Args:
-        jobs: as for :func:`carry_out`.
-        root: where runs live.
-        sources: the other folders; the first that has a run counts.
-        say: receives a line for each run that is copied.
+        jobs: as for :func:`run_jobs`.
+        root: folder of the folder ``runs``.
+        sources: the other folders. The first with the finished run is used.
+        echo: called with a line for each copied run.
 
     Raises:
-        ConfigError: a source has no runs.
+        ConfigError: a source has no folder ``runs``.
     """
     for source in sources:
         if not (source / "runs").is_dir():
             raise ConfigError(
-                f"--runs-from {source}: expected a folder of studies with the folder runs in it; "
-                f"name what was given to --folder"
+                f"--runs-from {source}: expected a folder of studies, which contains the folder "
+                f"runs; name the --folder of another study"
             )
-    for job in furthest(jobs):
+    for job in merge_jobs(jobs):
         finished = next((source for source in sources if job.done(source)), None)
         if finished is None or job.done(root):
             continue
-        say(f"copied from {finished}: {job.described}")
+        echo(f"copied from {finished}: {job.described}")
         job.folder(root).mkdir(parents=True, exist_ok=True)
         for name in RECORDS:
             put(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
 
 
-def _start(job: Job, root: Path) -> subprocess.Popen[bytes]:
+def _start(job: Job, root: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """Start a process for a run; return it, and the size of the log so far in bytes."""
     folder = job.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
     put(folder / "job.json", msgspec.json.format(msgspec.json.encode(job)))
     with (folder / "log.txt").open("ab") as output:
-        return subprocess.Popen(  # noqa: S603 - our own program
+        size = output.tell()
+        process = subprocess.Popen(  # noqa: S603 - our own program
             [sys.executable, *_PROGRAM, str(folder), "--parent", str(os.getpid())],
             stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
         )  # fmt: skip
+    return process, size
 
 
-def _failure(folder: Path, code: int) -> RunFailed:
-    words = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").splitlines()[-5:]
-    failure = RunFailed(f"the run in {folder} ended with code {code}:\n" + "\n".join(words))
-    failure.exit_code = code if code > 0 else failure.exit_code
+def _failure(folder: Path, code: int, output: bytes) -> RunFailed:
+    """Return the error of a failed run, in one line.
+
+    Args:
+        folder: folder of the run.
+        code: exit code of its process.
+        output: what the process wrote to the log.
+    """
+    log = folder / "log.txt"
+    if code < 0:
+        return RunFailed(f"the run in {folder} was killed by signal {-code}; see {log}")
+    lines = output.decode(errors="replace").split("\n")
+    # If there is no error of udrl, the last line is that of a traceback: the exception's message.
+    errors = [line for line in lines if line.startswith(ERROR_PREFIX)]
+    causes = errors or [line for line in lines if line.strip()] or ["no output"]
+    cause = causes[-1].removeprefix(ERROR_PREFIX)
+    failure = RunFailed(f"the run in {folder} failed with exit code {code}: {cause}; see {log}")
+    failure.exit_code = code
     return failure
 
 
-def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
+def _terminate(processes: Iterable[subprocess.Popen[bytes]]) -> None:
     for process in processes:
         process.terminate()
     for process in processes:

@@ -1,6 +1,6 @@
-"""Algorithms of Stable-Baselines3, with the behavior function's networks (section 3.2).
+"""Models of Stable-Baselines3 with the behavior function's networks (section 3.2).
 
-Importing it needs Stable-Baselines3; :mod:`udrl_experiments.baselines` does so when it trains.
+This module imports Stable-Baselines3, so :mod:`udrl_experiments.baselines` imports it on first use.
 """
 
 from collections.abc import Mapping
@@ -30,20 +30,20 @@ Model = DQN | A2C | PPO
 
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
-#: Stable-Baselines3's default, which naming another decay would lose.
+#: Stable-Baselines3's default, which does not apply if the optimizer's arguments are given.
 _RMS_PROP_EPS = 1e-5
 
-#: What a model counts, besides what lies in its tensors.
+#: Attributes of a model that are part of its state, besides tensors.
 _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 class TrainingResets(gym.Wrapper[Any, Any, Any, Any]):
-    """Resets an environment with the paper's seeds for training, whatever it is asked for.
+    """Resets an environment with the paper's training seeds, and ignores the seed argument.
 
     Args:
         env: the environment.
-        stream: what the seeds are drawn from.
+        stream: random stream of the seeds.
     """
 
     def __init__(self, env: Environment, stream: Stream) -> None:
@@ -53,7 +53,7 @@ class TrainingResets(gym.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
+        """Begin an episode with the next seed of the stream."""
         (seed,) = self._stream.integers(1, *TRAINING_SEEDS).tolist()
         return self.env.reset(seed=seed, options=options)
 
@@ -63,7 +63,7 @@ class Convolutions(BaseFeaturesExtractor):
 
     Args:
         observation_space: uint8 images, [frame_stack, channels, height, width].
-        channels: of each layer.
+        channels: output channels of each layer.
     """
 
     def __init__(self, observation_space: spaces.Box, channels: tuple[int, ...]) -> None:
@@ -99,10 +99,10 @@ def make(
     """Return an untrained model with its environments.
 
     Args:
-        algorithm: which.
-        hyperparameters: all of the algorithm's (:mod:`udrl_experiments.tuned`), by name.
+        algorithm: the algorithm.
+        hyperparameters: all hyperparameters of the algorithm (:mod:`udrl_experiments.tuned`).
         config: environment, networks, seed and device, which must not be ``auto``.
-        part: evaluations before; what goes on with a run draws other random numbers.
+        part: number of evaluations before this process; a resumed run has other random numbers.
 
     Raises:
         UnsupportedEnvironment: the environment cannot be made or is not supported.
@@ -120,14 +120,14 @@ def make(
         policy = "CnnPolicy"
         networks["features_extractor_class"] = Convolutions
         networks["features_extractor_kwargs"] = {"channels": config.network.convolutions}
-    # numpy's global generator, which Stable-Baselines3 seeds, takes 32 bits.
+    # Stable-Baselines3 seeds numpy's global generator, which takes 32 bits.
     (seed,) = Stream(stream_key(config.seed, Purpose.INITIALISE, part)).integers(1, 0, 2**32)
     common: dict[str, Any] = {
         "policy_kwargs": networks, "seed": int(seed), "device": config.arithmetic.device,
     }  # fmt: skip
     model: Model
     if algorithm == "DQN":
-        del chosen["exploration_fraction"]  # see `explore_for`
+        del chosen["exploration_fraction"]  # see `set_exploration`
         model = DQN(policy, envs, **chosen, **common)
     elif algorithm == "PPO":
         model = PPO(policy, envs, **chosen, **common)
@@ -137,22 +137,22 @@ def make(
             "alpha": chosen.pop("rms_prop_decay"), "eps": _RMS_PROP_EPS,
         }  # fmt: skip
         model = A2C(policy, envs, **chosen, **common)
-    model.set_logger(Logger(None, []))  # the default one makes a folder in /tmp
+    model.set_logger(Logger(None, []))  # the default logger creates a folder in /tmp
     return model
 
 
 def _environment(config: Config, part: int, index: int) -> Environment:
     env: Environment = make_environment(config)
-    # Even with one frame, a dimension of their own keeps Stable-Baselines3 from guessing which one
-    # of an image's holds the channels.
+    # With a dimension for frames, even for a single one, Stable-Baselines3 does not guess which
+    # dimension of an image has the channels.
     env = gym.wrappers.FrameStackObservation(env, config.network.frame_stack)
     return TrainingResets(env, Stream(stream_key(config.seed, Purpose.TRAINING, part, index)))
 
 
-def explore_for(model: Model, env_steps: int) -> None:
-    """Let the part of random actions fall linearly for so many env steps, if the model is DQN.
+def set_exploration(model: Model, env_steps: int) -> None:
+    """Decrease DQN's exploration rate linearly over ``env_steps``; ignore other models.
 
-    Stable-Baselines3's own schedule begins anew with every call of ``learn``.
+    Stable-Baselines3's own schedule restarts with every call of ``learn``.
     """
     if not isinstance(model, DQN):
         return
@@ -164,12 +164,12 @@ def explore_for(model: Model, env_steps: int) -> None:
     model.exploration_schedule, model.exploration_rate = rate, rate()
 
 
-class InPlaceOfBehavior:
-    """A model in the place of an acting function (:mod:`udrl.acting`); it hears no command.
+class ModelPolicy:
+    """A model as a policy for :mod:`udrl.acting`. It ignores commands.
 
     Args:
-        model: who acts; it must not be trained meanwhile.
-        shape: of what is observed, with frames stacked along the first dimension.
+        model: the model; it must not be trained while the policy is in use.
+        shape: shape of an observation, with frames stacked along the first dimension.
     """
 
     def __init__(self, model: Model, shape: tuple[int, ...]) -> None:
@@ -179,21 +179,21 @@ class InPlaceOfBehavior:
 
     def call(self, n: int) -> Call:
         """Return a call of ``n`` rows."""
-        return _Rows(self, n)
+        return _ModelCall(self, n)
 
 
-class _Rows:
-    def __init__(self, behavior: InPlaceOfBehavior, n: int) -> None:
-        self._model = behavior.model
-        space = behavior.model.observation_space
-        self.seen: Seen = (np.zeros((n, *behavior.shape), space.dtype),)
+class _ModelCall:
+    def __init__(self, policy: ModelPolicy, n: int) -> None:
+        self._model = policy.model
+        space = policy.model.observation_space
+        self.seen: Seen = (np.zeros((n, *policy.shape), space.dtype),)
         self.state = self.next_state = np.zeros((n, 0), np.float32)
         self.command = np.zeros((n, 2))
-        assert isinstance(behavior.model.action_space, spaces.Discrete)
-        self.logits = np.zeros((n, int(behavior.model.action_space.n)), np.float32)
+        assert isinstance(policy.model.action_space, spaces.Discrete)
+        self.logits = np.zeros((n, int(policy.model.action_space.n)), np.float32)
 
     def run(self) -> None:
-        """Compute logits, or DQN's Q-values, of which the greatest one is meant."""
+        """Compute the logits. DQN's are Q-values: their maximum is the greedy action."""
         model = self._model
         shape = model.observation_space.shape
         assert shape is not None
@@ -209,7 +209,7 @@ class _Rows:
 
 
 def counters(model: Model) -> dict[str, int]:
-    """Return what a model has counted, by name."""
+    """Return a model's counters by name."""
     counted = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     if isinstance(model, DQN):
         assert model.replay_buffer is not None
@@ -218,54 +218,56 @@ def counters(model: Model) -> dict[str, int]:
 
 
 def tensors(model: Model) -> dict[str, Tensor]:
-    """Return weights, optimizer and the filled part of the replay buffer, by name.
+    """Return weights, optimizer state and the filled part of the replay buffer, by name.
 
-    They are the model's own, and no two share memory.
+    They share memory with the model, but not with each other.
     """
-    held = {f"policy.{n}": p.detach() for n, p in model.policy.named_parameters()}
+    named = {f"policy.{n}": p.detach() for n, p in model.policy.named_parameters()}
     for index, state in model.policy.optimizer.state_dict()["state"].items():
-        held |= {f"optimizer.{index}.{key}": value for key, value in state.items()}
+        named |= {f"optimizer.{index}.{key}": value for key, value in state.items()}
     if isinstance(model, DQN):
         buffer = model.replay_buffer
         assert buffer is not None
         for name in _TRANSITIONS:
-            held[f"replay.{name}"] = torch.from_numpy(getattr(buffer, name)[: buffer.size()])
-    return held
+            named[f"replay.{name}"] = torch.from_numpy(getattr(buffer, name)[: buffer.size()])
+    return named
 
 
-def restore(model: Model, held: Mapping[str, Tensor], counted: Mapping[str, int]) -> None:
-    """Give a model the :func:`tensors` and :func:`counters` of another one.
+def restore(model: Model, named: Mapping[str, Tensor], counted: Mapping[str, int]) -> None:
+    """Restore a model from :func:`tensors` and :func:`counters`.
 
     Raises:
-        KeyError: something is missing.
-        ValueError: something has another shape.
+        KeyError: a tensor or counter is missing.
+        ValueError: a tensor has the wrong shape.
     """
     for name in _COUNTERS:
         if hasattr(model, name):
             setattr(model, name, counted[name])
     for name, parameter in model.policy.named_parameters():
-        value = held[f"policy.{name}"]
+        value = named[f"policy.{name}"]
         if value.shape != parameter.shape:
-            raise ValueError(f"{name} is {tuple(value.shape)}, not {tuple(parameter.shape)}")
+            raise ValueError(
+                f"{name}: shape {tuple(value.shape)}, expected {tuple(parameter.shape)}"
+            )
         parameter.data.copy_(value)
     optimizer = model.policy.optimizer
     state: dict[int, dict[str, Tensor]] = {}
-    for name, value in held.items():
+    for name, value in named.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".", 2)
             state.setdefault(int(index), {})[key] = value.clone()
     optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
     if isinstance(model, DQN):
-        _restore_replay(model, held, counted["pos"])
+        _restore_replay(model, named, counted["pos"])
 
 
-def _restore_replay(model: DQN, held: Mapping[str, Tensor], pos: int) -> None:
+def _restore_replay(model: DQN, named: Mapping[str, Tensor], pos: int) -> None:
     buffer = model.replay_buffer
     assert buffer is not None
     for name in _TRANSITIONS:
-        value = held[f"replay.{name}"].numpy()
+        value = named[f"replay.{name}"].numpy()
         getattr(buffer, name)[: len(value)] = value
     buffer.pos, buffer.full = pos, len(value) == buffer.buffer_size
     if model.n_steps > 1:
-        # The episode in progress is lost: its return must not go on in another one's.
+        # The episode in progress is lost. An n-step return must not extend into the next one.
         buffer.timeouts[pos - 1] = 1 - buffer.dones[pos - 1]

@@ -1,4 +1,4 @@
-"""Section 3.2: what all studies share, at the paper's scale and at one for two cores."""
+"""The protocol of all studies (section 3.2), at the paper's scale and at one for two cores."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -12,30 +12,30 @@ from udrl_launch.settings import with_steps_as_numbers
 #: Algorithms of Stable-Baselines3 that UDRL is compared with.
 BaselineAlgorithm = Literal["DQN", "A2C", "PPO"]
 Algorithm = Literal["UDRL", BaselineAlgorithm]
-#: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has only what is
-#: in the paper.
+#: Participants of a comparison; ``UDRL-paper`` is UDRL with the preset that has only what is in the
+#: paper.
 Participant = Literal["UDRL", "UDRL-paper", BaselineAlgorithm]
-#: Those of Figures 4 and 5.
+#: The participants in Figures 4 and 5.
 DEFAULT_PARTICIPANTS: tuple[Participant, ...] = ("UDRL", "DQN", "A2C")
 Scale = Literal["small", "paper"]
 
-#: Evaluations that a score is the mean of (Appendix B).
+#: Number of evaluations in a score (Appendix B).
 LAST = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """An environment of the paper, and what is asked of its agents.
+    """An environment of the paper.
 
     Attributes:
         environment: Gymnasium's id; its preset has the same name.
-        title: in pictures.
+        title: title in figures.
         small_steps: env steps of a run of UDRL at the small scale.
-        small_baseline_steps: those of a run of another algorithm.
-        desired_returns: what trained agents are told in the study of section 3.5.
-        landmarks: returns that the paper names, by what they mean.
-        thresholds: returns whose first evaluation is looked for, in env steps and in seconds.
-        module: what its environment needs.
+        small_baseline_steps: env steps of a run of another algorithm at the small scale.
+        desired_returns: desired returns of trained agents in the study of section 3.5.
+        landmarks: returns that the paper names, by label.
+        thresholds: mean returns whose first evaluation is reported (``reached.csv``).
+        module: module that the environment needs.
     """
 
     environment: str
@@ -72,10 +72,10 @@ PAPER_STEPS = 10_000_000
 #: Env steps between evaluations (section 3.2).
 EVAL_EVERY = 50_000
 
-#: Settings of networks that all algorithms have.
+#: Settings of the networks of all algorithms.
 NETWORKS = "frame_stack", "convolutions", "hidden"
 
-#: Settings of a UDRL run that other algorithms have too; their runs do not depend on any other.
+#: Settings of UDRL that runs of other algorithms depend on.
 _SHARED = (
     *NETWORKS, "environment", "environment_kwargs", "wrappers", "max_episode_steps", "seed",
     "eval_every", "eval_episodes", "eval_temperature", "eval_seeds", "device",
@@ -83,13 +83,13 @@ _SHARED = (
 
 
 class StudyPlan(NamedTuple):
-    """What a study is to do.
+    """Seeds, steps and settings of a study.
 
     Attributes:
-        scale: where seeds and steps come from when they are not given.
-        seeds: of the runs; None: 1 to 20 in the paper, 1 to 3 at the small scale.
-        max_env_steps: of each run; None: as the scale says.
-        assignments: ``NAME=VALUE``, changes of UDRL's presets.
+        scale: sets the defaults of seeds and steps.
+        seeds: seeds of the runs; None: 1 to 20 at the paper's scale, 1 to 3 at the small scale.
+        max_env_steps: length of each run; None: the scale's.
+        assignments: ``NAME=VALUE``, changes to UDRL's presets.
     """
 
     scale: Scale = "small"
@@ -98,13 +98,13 @@ class StudyPlan(NamedTuple):
     assignments: tuple[str, ...] = ()
 
     def seeds_of_runs(self) -> tuple[int, ...]:
-        """Return the seeds."""
+        """Return the seeds of the runs."""
         if self.seeds is not None:
             return self.seeds
         return tuple(range(1, 21 if self.scale == "paper" else 4))
 
     def steps(self, task: Task, algorithm: Algorithm = "UDRL") -> int:
-        """Return the env steps of a run."""
+        """Return the length of a run in env steps."""
         if self.max_env_steps is not None:
             return self.max_env_steps
         if self.scale == "paper":
@@ -112,16 +112,16 @@ class StudyPlan(NamedTuple):
         return task.small_steps if algorithm == "UDRL" else task.small_baseline_steps
 
     def config(self, task: Task, seed: int, *, paper: bool = False, **changes: Any) -> Config:
-        """Return the settings of a UDRL run: the preset, changes, and the plan's assignments.
+        """Return the settings of a UDRL run: the preset, with changes and the plan's assignments.
 
         Args:
-            task: whose environment and preset.
-            seed: of the run.
-            paper: start from the preset that has only what is in the paper.
-            changes: of the preset.
+            task: the task, which determines environment and preset.
+            seed: seed of the run.
+            paper: use the preset that has only what is in the paper.
+            changes: changes to the preset that the study makes.
 
         Raises:
-            ConfigError: a setting is unknown or impossible.
+            ConfigError: a setting is unknown or invalid.
         """
         own = changes | {"environment": task.environment, "seed": seed}
         given = self.assigned(own)
@@ -130,26 +130,26 @@ class StudyPlan(NamedTuple):
         return build(Config, values | {"eval_every": EVAL_EVERY} | given | own)
 
     def baseline(self, task: Task, seed: int, **changes: Any) -> Config:
-        """Return the settings of a run of another algorithm: what they have in common with UDRL's.
+        """Return the settings of a run of another algorithm, those that it shares with UDRL.
 
         Args:
-            task: whose environment and networks.
-            seed: of the run.
-            changes: of the preset.
+            task: the task, which determines environment and networks.
+            seed: seed of the run.
+            changes: changes to the preset that the study makes.
 
         Raises:
-            ConfigError: a setting is unknown or impossible.
+            ConfigError: a setting is unknown or invalid.
         """
         return shared(self.config(task, seed, **changes))
 
     def assigned(self, own: Collection[str]) -> dict[str, Any]:
-        """Return the plan's assignments, by setting.
+        """Return the plan's assignments as a dictionary.
 
         Args:
             own: settings that the study sets itself.
 
         Raises:
-            ConfigError: an assignment is none, or is of one of these.
+            ConfigError: an assignment is malformed, or names a setting in ``own``.
         """
         given = with_steps_as_numbers(dict(parse_assignment(text) for text in self.assignments))
         for name in given:
@@ -159,16 +159,16 @@ class StudyPlan(NamedTuple):
 
 
 def shared(config: Config) -> Config:
-    """Return the settings that a run of another algorithm has in common with one of UDRL."""
+    """Return the settings that a run of another algorithm shares with a run of UDRL."""
     settings = flat(config)
     return build(Config, {name: settings[name] for name in _SHARED})
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds that ``1-3,7`` names.
+    """Return seeds from text such as ``1-3,7``.
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: the text is not a list of numbers and ranges.
     """
     seeds: list[int] = []
     for part in text.split(","):
@@ -179,8 +179,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         last = int(found[2] or first)
         if not first <= last < first + 10_000:
             raise ConfigError(
-                f"--seeds {text}: {part.strip()}: expected the smaller number first, and at most "
-                f"10,000 seeds"
+                f"--seeds {text}: {part.strip()}: expected an ascending range of at most 10,000 "
+                f"seeds"
             )
         seeds.extend(range(first, last + 1))
     return tuple(dict.fromkeys(seeds))
@@ -190,10 +190,10 @@ def tasks(names: Iterable[str]) -> list[Task]:
     """Return tasks by name.
 
     Raises:
-        ConfigError: there is no task of that name.
+        ConfigError: a name is unknown.
     """
     names = tuple(names)
     for name in names:
         if name not in TASKS:
-            raise ConfigError(f"task {name!r}: there are {', '.join(TASKS)}")
+            raise ConfigError(f"unknown task {name!r}: expected one of {', '.join(TASKS)}")
     return [TASKS[name] for name in names]

@@ -1,4 +1,4 @@
-"""What results come from: software, commit, and the kind of machine."""
+"""Provenance of results: versions of software, commit, kind of machine."""
 
 import importlib.metadata
 import os
@@ -11,7 +11,7 @@ import msgspec
 
 from udrl.version import __version__
 
-#: Packages whose version may change a result.
+#: Packages whose version may affect a result.
 _PACKAGES = (
     "Box2D", "box2d-py", "eclipse-zenoh", "gymnasium", "numpy", "ray", "stable-baselines3", "torch",
     "vizdoom",
@@ -22,8 +22,8 @@ class Machine(msgspec.Struct, frozen=True):
     """A kind of machine.
 
     Attributes:
-        processor: its name.
-        cores: those that the process may use.
+        processor: name of the processor.
+        cores: number of cores that the process may use.
         system: operating system and architecture.
     """
 
@@ -36,7 +36,7 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 def provenance() -> dict[str, Any]:
-    """Return what software and what kind of machine results come from."""
+    """Return commit, versions and kind of machine, for ``study.json`` and ``done.json``."""
     versions = {"udrl": __version__, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -52,7 +52,7 @@ def provenance() -> dict[str, Any]:
 
 
 def _commit() -> str:
-    """Return the commit of the code, if Git keeps it here."""
+    """Return the commit of the code; empty outside a Git checkout."""
     here = Path(__file__)
 
     def git(*arguments: str) -> str:
@@ -62,7 +62,8 @@ def _commit() -> str:
         ).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", here.name)  # not a checkout that we are installed in
+        # Fails if this is an installation in an ignored folder of another checkout.
+        git("ls-files", "--error-unmatch", here.name)
         changed = git("status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "HEAD") + (" and changes" if changed else "")
     except (OSError, subprocess.SubprocessError):

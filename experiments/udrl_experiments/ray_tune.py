@@ -1,4 +1,4 @@
-"""Runs on Ray Tune: on this machine, or unchanged on a cluster that Ray has been started on."""
+"""Runs on Ray Tune: on this machine, or on a Ray cluster."""
 
 import logging
 import os
@@ -9,37 +9,47 @@ from typing import Any
 
 import msgspec
 
-from udrl.errors import ConfigError, Interrupted, RunFailed, Unreachable
+from udrl.errors import ConfigError, Interrupted, RunFailed, UdrlError, Unreachable
 from udrl_experiments import jobs
 from udrl_experiments.jobs import INTERRUPTED, Job
 
-#: Cores that a run is reckoned with.
+#: Cores that Ray reserves for a run.
 _CORES = 2
 
+#: Environment variables that Ray reads.
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "RAY_AIR_NEW_OUTPUT": "0",  # the new output ignores verbose=0: it prints tables and paths
+    "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",  # with tracebacks; failures are reported here
+}
+#: Loggers of Ray that warn about its defaults, which the user did not choose.
+_DEFAULTS_LOGGERS = ("ray._private.authentication",)
 
-def carry_out(
+
+def run_jobs(
     planned: Iterable[Job],
     root: Path,
     side_by_side: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> None:
-    """Do all runs that are not done; as :func:`udrl_experiments.jobs.carry_out`, by Ray Tune.
+    """Run all jobs that are not done, like :func:`udrl_experiments.jobs.run_jobs`, on Ray Tune.
 
-    With ``RAY_ADDRESS`` set, the runs go to that cluster; ``root`` must be a folder that all its
-    machines share. What was done is known by what lies there, so nothing of Ray's is kept.
+    With ``RAY_ADDRESS`` set, the runs go to that cluster, and ``root`` must be a folder that all
+    its machines share. Finished runs are recognised by their files; nothing that Ray writes is
+    read.
 
-    A run that fails does not end the search: hyperparameters that a run cannot be made with are
-    what a search finds out.
+    A failed run does not end the search, because some hyperparameters may be unusable.
 
     Raises:
         ConfigError: Ray is not installed.
-        Unreachable: nobody answers at ``RAY_ADDRESS``.
+        Unreachable: there is no Ray cluster at ``RAY_ADDRESS``.
         RunFailed: every run failed.
         Interrupted: ``stop`` was set.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_CHDIR_TO_TRIAL_DIR", "0")
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         import ray
         from ray import tune
@@ -47,30 +57,55 @@ def carry_out(
         raise ConfigError(
             'the search needs Ray Tune; install it with: pip install "udrl[studies]"'
         ) from error
-    waiting = {job.name: job for job in jobs.furthest(planned) if not job.done(root)}
+    for name in _DEFAULTS_LOGGERS:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    waiting = {job.name: job for job in jobs.merge_jobs(planned) if not job.done(root)}
     if not waiting:
         return
+    failures: list[str] = []
+
+    def report_failure(trial: Any, cause: str) -> None:
+        failures.append(cause)
+        echo(f"failed: {waiting[trial.config['name']].described}: {cause}")
 
     class Watch(tune.Callback):
         def __reduce__(self) -> tuple[type[tune.Callback], tuple[()]]:
-            return tune.Callback, ()  # Tune saves it with what could be restored; nobody does
+            # Tune pickles its callbacks to restore an experiment, which is never done here.
+            return tune.Callback, ()
 
         def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
             if stop.is_set():
-                say(INTERRUPTED)
+                echo(INTERRUPTED)
                 raise Interrupted(INTERRUPTED)
 
         def on_trial_start(
             self, iteration: int, trials: list[Any], trial: Any, **info: Any
         ) -> None:
-            say(waiting[trial.config["name"]].described)
+            echo(waiting[trial.config["name"]].described)
 
-    def trial(config: dict[str, str]) -> dict[str, float]:
+        def on_trial_complete(
+            self, iteration: int, trials: list[Any], trial: Any, **info: Any
+        ) -> None:
+            if cause := trial.last_result.get("failure"):
+                report_failure(trial, cause)
+
+        def on_trial_error(
+            self, iteration: int, trials: list[Any], trial: Any, **info: Any
+        ) -> None:
+            # An error of Ray, e.g. a killed worker. Only its first line is for users.
+            error = trial.get_pickled_error() or trial.get_error()
+            cause = str(getattr(error, "cause", error)).strip()
+            report_failure(trial, cause.partition("\n")[0])
+
+    def run_trial(config: dict[str, str]) -> dict[str, int | str]:
         job = msgspec.json.decode(config["job"], type=Job)
-        jobs.carry_out([job], root, 1, threading.Event(), lambda text: None)
-        return {"evaluations": len(job.evaluations(root))}
+        try:
+            jobs.run_jobs([job], root, 1, threading.Event(), lambda text: None)
+            return {"evaluations": len(job.evaluations(root))}
+        except (UdrlError, OSError) as error:  # Ray would print the traceback
+            return {"failure": str(error)}
 
-    say(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
+    echo(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
     if address := os.environ.get("RAY_ADDRESS"):
         try:
             ray.init(logging_level=logging.WARNING)
@@ -83,8 +118,8 @@ def carry_out(
         ray.init(num_cpus=cores, include_dashboard=False, logging_level=logging.WARNING,
                  _node_ip_address="127.0.0.1")  # fmt: skip
     try:
-        results = tune.Tuner(
-            tune.with_resources(trial, {"cpu": _CORES}),
+        tune.Tuner(
+            tune.with_resources(run_trial, {"cpu": _CORES}),
             param_space=tune.grid_search(
                 [{"name": name, "job": msgspec.json.encode(job).decode()}
                  for name, job in waiting.items()]
@@ -94,9 +129,7 @@ def carry_out(
                 name="ray", storage_path=str(root.resolve()), verbose=0, callbacks=[Watch()],
             ),
         ).fit()  # fmt: skip
-        for failure in results.errors:
-            say(f"a run failed: {failure}")
-        if len(results.errors) == len(waiting):
-            raise RunFailed(f"no run succeeded; the first failed with: {results.errors[0]}")
     finally:
         ray.shutdown()
+    if len(failures) == len(waiting):
+        raise RunFailed(f"no run succeeded; the first failed: {failures[0]}")

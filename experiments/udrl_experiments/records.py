@@ -2,20 +2,28 @@
 
 import msgspec
 
+#: Variant of the participant ``UDRL-paper``.
+PAPER = "paper"
+
+
+def agent_name(algorithm: str, variant: str) -> str:
+    """Return an agent's name in output: ``UDRL``, ``UDRL-paper``, ``UDRL lead 2``."""
+    return f"{algorithm}{'-' if variant == PAPER else ' '}{variant}".rstrip()
+
 
 class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """An evaluation of one agent in training (section 3.2).
+    """An evaluation of an agent during training (section 3.2).
 
     Attributes:
         environment: Gymnasium's id.
         algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
-        variant: what sets the agent apart within the study, e.g. ``lead 2``; may be empty.
-        seed: of the run.
-        env_steps: training steps before it.
-        wall_s: seconds of training and evaluations before it, and its own.
-        mean: of the episodes' returns.
-        std: standard deviation of the sample of returns.
-        episodes: how many.
+        variant: label that distinguishes agents of a study, e.g. ``lead 2``; may be empty.
+        seed: seed of the run.
+        env_steps: training steps before the evaluation.
+        wall_s: seconds from the start of training to the end of the evaluation.
+        mean: mean return.
+        std: sample standard deviation of the returns.
+        episodes: number of episodes.
     """
 
     environment: str
@@ -30,17 +38,17 @@ class EvaluationRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Obtained(msgspec.Struct, frozen=True, kw_only=True):
-    """What a trained agent obtained when it was told a return (section 3.5), over many episodes.
+    """Returns that a trained agent obtained for a command (section 3.5).
 
     Attributes:
         environment: Gymnasium's id.
-        seed: of the run.
+        seed: seed of the run.
         env_steps: training steps of the agent.
-        desired_return: what it was told.
-        desired_horizon: what it was told, in steps.
-        mean: of the episodes' returns.
-        std: standard deviation of the sample of returns.
-        episodes: how many.
+        desired_return: desired return of the command.
+        desired_horizon: desired horizon of the command, in steps.
+        mean: mean obtained return.
+        std: sample standard deviation of the obtained returns.
+        episodes: number of episodes.
     """
 
     environment: str

@@ -1,4 +1,4 @@
-"""Appendix B: random search over the paper's spaces, or over one of your own."""
+"""Random search over the paper's spaces or over one of your own (Appendix B)."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
-from udrl.config import OPEN, Config, change, flat, preset
+from udrl.config import OPEN, Config, build, change, flat, preset
 from udrl.errors import ConfigError
 from udrl.fitting import fit
 from udrl.spaces import Image, Vector
@@ -27,7 +27,7 @@ from udrl_experiments.protocol import (
     Task,
     shared,
 )
-from udrl_experiments.ray_tune import carry_out
+from udrl_experiments.ray_tune import run_jobs
 from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
@@ -36,22 +36,22 @@ from udrl_inspect.csv_tables import put, write
 from udrl_launch.settings import gather
 from udrl_replay.creation import as_toml
 
-#: Configurations of each algorithm, and env steps of each run, at the small scale.
+#: Configurations per algorithm and env steps per run at the small scale.
 SMALL_CONFIGURATIONS = 8
 SMALL_STEPS = 500_000
 
 
 class Scored(msgspec.Struct, frozen=True, kw_only=True):
-    """How a configuration did.
+    """The score of a configuration.
 
     Attributes:
         environment: Gymnasium's id.
-        algorithm: the learner.
-        configuration: its number; which settings it has is a function of it.
-        seeds: runs that the score is the mean of.
-        score: mean of the last 20 evaluations (Appendix B), mean over the seeds; none if a run of
-            it failed.
-        settings: what was drawn, as JSON.
+        algorithm: the algorithm.
+        configuration: number of the configuration, which determines its settings.
+        seeds: number of runs.
+        score: mean of the last 20 evaluations (Appendix B), mean over the runs; none if a run
+            failed.
+        settings: drawn settings, as JSON.
     """
 
     environment: str
@@ -63,13 +63,13 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Subject(NamedTuple):
-    """An environment whose settings are searched.
+    """An environment of a search.
 
     Attributes:
-        space: what configurations are drawn from.
-        algorithms: whose settings are searched.
-        config: a run of UDRL but for its seed and what is drawn.
-        preset: the settings that UDRL's best configuration is written with.
+        space: the search space.
+        algorithms: algorithms whose configurations are drawn.
+        config: settings of a UDRL run, before a seed and drawn settings are set.
+        preset: settings that are written with UDRL's best configuration.
     """
 
     space: SearchSpace
@@ -84,16 +84,16 @@ def search(
     algorithms: Sequence[Algorithm] = (),
     configurations: int | None = None,
 ) -> Study:
-    """Return the study of the paper's tasks, over the spaces of Appendix B.1.
+    """Return the study ``search`` of the paper's tasks, over the spaces of Appendix B.
 
     Args:
-        plan: seeds and steps; at the paper's scale the space says how many seeds.
-        tasks: on which.
-        algorithms: whose settings are searched; none: of all that the space has.
-        configurations: how many of each; None: as the scale says.
+        plan: seeds and steps; at the paper's scale the number of seeds is the space's.
+        tasks: tasks to search on.
+        algorithms: algorithms to search; none: all in the space.
+        configurations: number of configurations per algorithm; None: the scale's.
 
     Raises:
-        ConfigError: the space has no such algorithm, or a setting is unknown or impossible.
+        ConfigError: an algorithm is not in the space, or a setting is unknown or invalid.
     """
     subjects = []
     for task in tasks:
@@ -112,21 +112,21 @@ def search_environment(
     algorithms: Sequence[Algorithm] = (),
     configurations: int | None = None,
 ) -> Study:
-    """Return the study of any environment, over a space of your own.
+    """Return the study ``search-ENV`` of any environment, over a space in a file.
 
-    Settings that are not drawn are those of ``udrl train``: of the preset that is named after the
-    environment, or of ``any``. What that leaves open is chosen once for all runs, with seed 1.
+    Settings that are not drawn are those of ``udrl train``: the preset named after the environment,
+    or ``any``. Its ``auto`` settings are chosen once for all runs, with seed 1.
 
     Args:
         plan: as for :func:`search`; its assignments change the preset.
         environment: Gymnasium's id.
-        file: the space (:mod:`udrl_experiments.search_space`).
+        file: file with the space (:mod:`udrl_experiments.search_space`).
         algorithms: as for :func:`search`.
         configurations: as for :func:`search`.
 
     Raises:
-        ConfigError: as for :func:`search`, or the file cannot be used, or an algorithm cannot be
-            used in the environment.
+        ConfigError: as for :func:`search`, or the file is not a valid space, or an algorithm does
+            not support the environment.
         UnsupportedEnvironment: the environment cannot be made or is not supported.
         EnvironmentFault: the environment failed repeatedly.
     """
@@ -134,10 +134,12 @@ def search_environment(
     chosen = _chosen(space, algorithms)
     assigned = plan.assigned(_drawn_settings(space, chosen))
     own = {"seed": 1, "eval_seeds": "search", "eval_every": EVAL_EVERY}
-    # What is drawn is not left open; which value stands here does not matter.
+    # A drawn setting must not be `auto`. Any of its values will do here.
     drawn = {
         name: values[0] for name, values in space.lists.get("UDRL", {}).items() if name in OPEN
     }
+    with space.errors_of("UDRL"):
+        build(Config, {"environment": environment} | drawn)
     settings = gather(environment, options=own | drawn, assignments=plan.assignments)
     config = fit(settings.config, settings.left_open)
     others = [algorithm for algorithm in chosen if algorithm != "UDRL"]
@@ -148,7 +150,7 @@ def search_environment(
         and isinstance(spec.observation_space, Vector | Image)
     ):
         raise ConfigError(
-            f"{environment} with {', '.join(others)}: expected discrete actions, and one vector or "
+            f"{environment} with {', '.join(others)}: expected discrete actions and one vector or "
             f"image as observation; search with --algorithm UDRL"
         )
     written = {name: flat(config)[name] for name in (*sorted(settings.left_open), *assigned)}
@@ -161,14 +163,14 @@ def _chosen(space: SearchSpace, algorithms: Sequence[Algorithm]) -> tuple[Algori
         if algorithm not in space.lists:
             raise ConfigError(
                 f"--algorithm {algorithm}: the space of {space.environment} has "
-                f"{', '.join(space.lists)}; name one of them, or a file with a space of your own: "
-                f"udrl study search ENV --space FILE"
+                f"{', '.join(space.lists)}; choose one of these, or search over a space of your "
+                f"own: udrl study search ENV --space FILE"
             )
     return tuple(dict.fromkeys(algorithms)) or tuple(space.lists)
 
 
 def _drawn_settings(space: SearchSpace, algorithms: Sequence[Algorithm]) -> set[str]:
-    """Return the settings of UDRL that the search sets itself."""
+    """Return the settings of UDRL that the search sets, so that ``--set`` must not."""
     drawn = space.lists["UDRL"].keys() if "UDRL" in algorithms else ()
     return {"environment", "seed", "eval_seeds", *space.networks, *drawn}
 
@@ -186,26 +188,26 @@ def _study(
     }
     spaces = {subject.space.environment: subject.space for subject in subjects}
 
-    def report(place: StudyFolders) -> str:
+    def report(folders: StudyFolders) -> str:
         rows = [
             Scored(
                 environment=environment,
                 algorithm=algorithm,
                 configuration=number,
                 seeds=len(runs),
-                score=_score(runs, place.root),
+                score=_score(runs, folders.root),
                 settings=json.dumps(spaces[environment].draw(algorithm, number)),
             )
             for (environment, algorithm, number), runs in jobs.items()
         ]
-        write(place.folder / "scores.csv", Scored, rows)
+        write(folders.folder / "scores.csv", Scored, rows)
         return "\n".join(
-            _write_preset(place.folder, rows, subject, algorithm)
+            _write_preset(folders.folder, rows, subject, algorithm)
             for subject in subjects
             for algorithm in subject.algorithms
         )
 
-    return Study(name, [run for runs in jobs.values() for run in runs], report, carry_out, ("ray",))
+    return Study(name, [run for runs in jobs.values() for run in runs], report, run_jobs, ("ray",))
 
 
 def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:
@@ -222,18 +224,21 @@ def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> i
 
 def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
     steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_STEPS)
-    drawn = subject.space.draw(algorithm, number)
-    if algorithm == "UDRL":
-        config = change(subject.config, seed=seed, **drawn)
-        return Job(algorithm=algorithm, settings=flat(config), max_env_steps=steps)
-    networks = {name: drawn.pop(name) for name in subject.space.networks}
-    complete(algorithm, drawn)
-    config = shared(change(subject.config, seed=seed, **networks))
-    return baseline(algorithm, config, drawn, steps)
+    space, variant = subject.space, f"configuration {number}"
+    drawn = space.draw(algorithm, number)
+    networks = {name: drawn.pop(name) for name in space.networks}
+    with space.errors_of("networks"):
+        config = change(subject.config, seed=seed, **networks)
+    with space.errors_of(algorithm):
+        if algorithm == "UDRL":
+            settings = flat(change(config, **drawn))
+            return Job(algorithm=algorithm, settings=settings, max_env_steps=steps, variant=variant)
+        complete(algorithm, drawn)
+    return baseline(algorithm, shared(config), drawn, steps, variant)
 
 
 def _score(runs: Sequence[Job], root: Path) -> float | None:
-    """Return the mean score of a configuration's runs; none if one of them failed."""
+    """Return the mean score of a configuration's runs; None if one of them failed."""
     if not all(run.done(root) for run in runs):
         return None
     return fmean(score([row.mean for row in run.evaluations(root)], LAST) for run in runs)
@@ -242,7 +247,10 @@ def _score(runs: Sequence[Job], root: Path) -> float | None:
 def _write_preset(
     folder: Path, rows: Sequence[Scored], subject: Subject, algorithm: Algorithm
 ) -> str:
-    """Write the best settings as a file, UDRL's for ``udrl train --config``; return its text."""
+    """Write the best configuration to a TOML file, and return its text.
+
+    UDRL's can be passed to ``udrl train --config``.
+    """
     environment = subject.space.environment
     kind = (environment, algorithm)
     scored = [
@@ -251,14 +259,14 @@ def _write_preset(
         if (row.environment, row.algorithm) == kind and row.score is not None
     ]
     if not scored:
-        return f"# {algorithm}, {environment}: no configuration got to its end"
+        return f"# {algorithm}, {environment}: every configuration has a failed run"
     value, best = max(scored, key=lambda pair: pair[0])
     drawn = json.loads(best.settings)
     if algorithm == "UDRL":
         values = subject.preset | drawn
     else:
         values = {"environment": environment, **drawn}
-    text = f"# Configuration {best.configuration}; score {value:.1f}, seeds: {best.seeds}.\n"
+    text = f"# Configuration {best.configuration}: score {value:.1f}, seeds: {best.seeds}.\n"
     text += "".join(f"{name} = {as_toml(value)}\n" for name, value in values.items())
     path = folder / f"{algorithm.lower()}-{_file_name(environment)}.toml"
     put(path, text.encode())
@@ -266,5 +274,5 @@ def _write_preset(
 
 
 def _file_name(environment: str) -> str:
-    """Return an environment's id as a part of a file name."""
+    """Return an environment's id as part of a file name."""
     return re.sub(r"[^\w.-]+", "-", environment)

@@ -1,8 +1,9 @@
-"""The spaces that a search draws from: those of Appendix B.1 (``spaces/``), and users' files."""
+"""Search spaces: those of Appendix B (``spaces/``), and files of users."""
 
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
@@ -19,17 +20,20 @@ from udrl_experiments.protocol import NETWORKS, Algorithm
 
 
 class SearchSpace(NamedTuple):
-    """What the configurations of an environment are drawn from.
+    """Values from which the configurations of an environment are drawn.
 
     Attributes:
+        source: the file, as errors name it.
         environment: Gymnasium's id.
-        configurations: how many are drawn at the paper's scale; None: as at the small scale.
-        seeds: runs of each configuration at the paper's scale.
-        networks: values of settings that all algorithms have, among
-            :data:`~udrl_experiments.protocol.NETWORKS`.
-        lists: for each algorithm, values of its settings or hyperparameters.
+        configurations: number of configurations per algorithm at the paper's scale; None: the
+            number at the small scale.
+        seeds: runs per configuration at the paper's scale.
+        networks: values of settings that all algorithms have
+            (:data:`~udrl_experiments.protocol.NETWORKS`), by setting.
+        lists: for each algorithm, values of its settings or hyperparameters, by name.
     """
 
+    source: str
     environment: str
     configurations: int | None
     seeds: int
@@ -37,11 +41,11 @@ class SearchSpace(NamedTuple):
     lists: dict[Algorithm, dict[str, list[Any]]]
 
     def draw(self, algorithm: Algorithm, configuration: int) -> dict[str, Any]:
-        """Return the settings of a configuration: a value of every list, each as likely.
+        """Return the settings of a configuration: from each list a value, uniformly drawn.
 
         Args:
-            algorithm: one that the space has.
-            configuration: its number, from 0; the settings are a function of it.
+            algorithm: an algorithm in the space.
+            configuration: number of the configuration, from 0; it determines the settings.
         """
         lists = self.networks | self.lists[algorithm]
         name = f"udrl/search/1|{self.environment}|{algorithm}|{configuration}"
@@ -52,9 +56,17 @@ class SearchSpace(NamedTuple):
             for (key, values), u in zip(sorted(lists.items()), numbers, strict=True)
         }
 
+    @contextmanager
+    def errors_of(self, table: str) -> Iterator[None]:
+        """Name the file and a table in each :class:`ConfigError` that is raised within."""
+        try:
+            yield
+        except ConfigError as error:
+            raise ConfigError(f"{self.source}: [{table}] {error}") from error
+
 
 def shipped_space(environment: str) -> SearchSpace:
-    """Return the space of Appendix B.1 for one of the paper's environments."""
+    """Return the space of Appendix B for one of the paper's environments."""
     name = f"{environment}.toml"
     text = (resources.files("udrl_experiments") / "spaces" / name).read_text(encoding="utf-8")
     return _space(environment, tomllib.loads(text), name)
@@ -64,13 +76,13 @@ def read_space(environment: str, file: Path) -> SearchSpace:
     """Return the space in a file.
 
     Raises:
-        ConfigError: it cannot be read, or it is no space.
+        ConfigError: the file cannot be read, or is not a valid space.
     """
     return _space(environment, read_toml(file), str(file))
 
 
 class _Logspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers from 10^low to 10^high in equal ratios: ``[low, high, how many]``."""
+    """``[low, high, n]``: n numbers from 10^low to 10^high, in equal ratios."""
 
     logspace: tuple[
         Annotated[float, Meta(ge=-300, le=300)],
@@ -83,7 +95,7 @@ _Values = Annotated[list[Any], Meta(min_length=1)] | _Logspace
 
 
 class _File(msgspec.Struct, frozen=True):
-    """What a file says besides the tables of algorithms."""
+    """The content of a file, except for the tables of algorithms."""
 
     configurations: PositiveInt | None = None
     seeds: PositiveInt = 1
@@ -95,18 +107,18 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     for name in values:
         if name not in (*_File.__struct_fields__, *algorithms):
             raise ConfigError(
-                f"{source}: {name}; expected configurations, seeds and the tables networks, "
-                f"{', '.join(algorithms)}"
+                f"{source}: unknown setting or table {name!r}: expected configurations, seeds, "
+                f"[networks], [{'], ['.join(algorithms)}]"
             )
     try:
         file = msgspec.convert(values, _File)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {error}; expected a number from 1, or a table") from error
+        raise ConfigError(f"{source}: {error}; see docs/studies.md") from error
     for name in file.networks:
         if name not in NETWORKS:
             raise ConfigError(
-                f"{source}: {name} in [networks]; expected settings that all algorithms have: "
-                f"{', '.join(NETWORKS)}; move it to the table of an algorithm"
+                f"{source}: [networks] {name}: expected one of {', '.join(NETWORKS)}, which all "
+                f"algorithms have; move it to the table of an algorithm"
             )
     lists = {
         name: _expanded(values[name], f"{source}: [{name}]")
@@ -115,20 +127,20 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     }
     if not lists:
         raise ConfigError(
-            f"{source}: no algorithm to search for; expected a table [{'] or ['.join(algorithms)}]"
+            f"{source}: no table of an algorithm; expected [{'] or ['.join(algorithms)}]"
         )
     for algorithm, settings in lists.items():
         if "environment" in settings:
             raise ConfigError(
-                f"{source}: environment in [{algorithm}]; the environment is the argument ENV, "
+                f"{source}: [{algorithm}] environment: the environment is the argument ENV, "
                 f"{environment!r}; leave it out"
             )
     networks = _expanded(file.networks, f"{source}: [networks]")
-    return SearchSpace(environment, file.configurations, file.seeds, networks, lists)
+    return SearchSpace(source, environment, file.configurations, file.seeds, networks, lists)
 
 
 def _expanded(table: Any, source: str) -> dict[str, list[Any]]:
-    """Return the lists of a table, with those written as ``logspace`` expanded."""
+    """Return the lists of a table, with ``logspace`` expanded."""
     if not isinstance(table, dict):
         raise ConfigError(f"{source} = {table!r}: expected a table of lists")
     lists = {}

@@ -1,4 +1,4 @@
-"""Figure 6: what trained agents obtain, against what they are told to (section 3.5)."""
+"""Figure 6: desired and obtained returns of trained agents (section 3.5)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,61 +15,64 @@ from udrl_inspect.agents import evaluate_all, evaluation_commands, load_agent
 from udrl_inspect.csv_tables import read, write
 from udrl_inspect.inspection import read_status
 
-#: Episodes a point.
+#: Episodes per desired return.
 EPISODES = 100
 
 
 def sensitivity(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
-    """Return the study; it tells the agents of the studies of Figures 4 and 5.
+    """Return the study ``sensitivity``, which uses the agents of Figures 4 and 5.
 
     Args:
         plan: seeds and steps.
-        tasks: on which.
-        episodes: for each desired return.
+        tasks: tasks of the agents.
+        episodes: episodes per desired return.
     """
     jobs = {
         task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
     }
 
-    def report(place: StudyFolders) -> str:
-        said = []
+    def report(folders: StudyFolders) -> str:
+        lines = []
         for task, runs in jobs.items():
-            table = place.folder / f"{task.title}.csv"
-            rows = [row for run in runs for row in _told(run, place.root, task, episodes)]
+            table = folders.folder / f"{task.title}.csv"
+            rows = [
+                row for run in runs for row in _evaluate_agent(run, folders.root, task, episodes)
+            ]
             write(table, Obtained, rows)
             draw(table, task.title)
-            said += _in_words(task, rows)
-        return "\n".join(said)
+            lines += _summary(task, rows)
+        return "\n".join(lines)
 
     return Study("sensitivity", [run for runs in jobs.values() for run in runs], report)
 
 
-def _in_words(task: Task, rows: Sequence[Obtained]) -> list[str]:
-    """Return a line for each agent: how desired and obtained returns go together."""
-    said = []
+def _summary(task: Task, rows: Sequence[Obtained]) -> list[str]:
+    """Return one line per agent, with the correlation of desired and obtained returns."""
+    lines = []
     for seed in dict.fromkeys(row.seed for row in rows):
         mine = [row for row in rows if row.seed == seed]
-        told, got = [row.desired_return for row in mine], [row.mean for row in mine]
-        said.append(
-            f"{task.title}, seed {seed}: told {min(told):.0f} to {max(told):.0f}, obtained "
-            f"{min(got):.1f} to {max(got):.1f}, correlation {correlation(told, got):.2f}"
+        desired, obtained = [row.desired_return for row in mine], [row.mean for row in mine]
+        lines.append(
+            f"{task.title}, seed {seed}: desired {min(desired):.0f} to {max(desired):.0f}, "
+            f"obtained {min(obtained):.1f} to {max(obtained):.1f}, "
+            f"correlation {correlation(desired, obtained):.2f}"
         )
-    return said
+    return lines
 
 
-def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
-    """Return what the agent of a run obtains; another study may have taken it further."""
+def _evaluate_agent(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
+    """Evaluate the agent of a run, which another study may have trained for more steps."""
     run_dir = run.folder(root) / "run"
     try:
         agent, env_steps = load_agent(run_dir), read_status(run_dir).env_steps
     except StoreError as error:
         raise StoreError(
-            f"{run.described}: its agent cannot be used: {error}; if only the records of the run "
-            f"were kept, delete {run.folder(root)} to have it made again"
+            f"{run.described}: the agent cannot be loaded: {error}; if only the records of the run "
+            f"were kept, delete {run.folder(root)} to repeat it"
         ) from error
     commands = [
-        evaluation_commands(agent, episodes=episodes, desired_return=told)
-        for told in task.desired_returns
+        evaluation_commands(agent, episodes=episodes, desired_return=desired)
+        for desired in task.desired_returns
     ]
     return [
         Obtained(
@@ -87,5 +90,5 @@ def _told(run: Job, root: Path, task: Task, episodes: int) -> list[Obtained]:
 
 
 def draw(table: Path, title: str) -> None:
-    """Draw the picture from its table alone."""
+    """Draw the figure from its table."""
     figures.save(figures.sensitivity(read(table, Obtained), title), table.with_suffix(""))

@@ -1,7 +1,7 @@
-"""What the paper says about several runs: mean curves with bootstrap intervals, scores, thresholds.
+"""Statistics of runs as in the paper: curves with bootstrap intervals, scores, thresholds.
 
-Everything here is a function of a tidy table alone: the bootstrap resamples with the numbers of one
-fixed stream, so drawing a figure again from the same file gives the same figure.
+All results are functions of a tidy table. The bootstrap uses a fixed random stream, so the same
+table always gives the same figure.
 """
 
 import hashlib
@@ -19,18 +19,18 @@ _KEY = hashlib.sha256(b"udrl/study/bootstrap/1").digest()[:16]
 
 
 class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
-    """A point of a learning curve (Figures 4 and 5): the evaluations of all seeds at one time.
+    """A point of a learning curve (Figures 4 and 5): the evaluations of all seeds at one step.
 
     Attributes:
         environment: Gymnasium's id.
         algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
-        variant: what sets the agents apart within the study; may be empty.
-        env_steps: training steps before the evaluations, a multiple of the curves' interval.
-        wall_s: seconds before the end of the evaluations, mean over the seeds.
-        seeds: how many.
-        mean: of the seeds' evaluation scores.
-        low: lower end of the 95 % bootstrap interval of the mean.
-        high: its upper end.
+        variant: label that distinguishes agents of a study; may be empty.
+        env_steps: training steps before the evaluations, a multiple of the curve's interval.
+        wall_s: seconds from the start to the end of the evaluations, mean over the seeds.
+        seeds: number of seeds.
+        mean: mean over the seeds of the evaluations' mean returns.
+        low: lower bound of the 95 % bootstrap interval of the mean.
+        high: upper bound of this interval.
     """
 
     environment: str
@@ -45,16 +45,16 @@ class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Reached(msgspec.Struct, frozen=True, kw_only=True):
-    """When the evaluations of a run first had a mean return that was asked for.
+    """The first evaluation of a run that reached a threshold.
 
     Attributes:
         environment: Gymnasium's id.
         algorithm: one of :data:`udrl_experiments.protocol.Algorithm`.
-        variant: what sets the agent apart within the study; may be empty.
-        seed: of the run.
-        threshold: the mean return.
-        env_steps: training steps before the evaluation; none if no evaluation reached it.
-        wall_s: seconds before the evaluation's end; none if no evaluation reached it.
+        variant: label that distinguishes agents of a study; may be empty.
+        seed: seed of the run.
+        threshold: the mean return to reach.
+        env_steps: training steps before the evaluation; none if the threshold was not reached.
+        wall_s: seconds from the start to the evaluation's end; none likewise.
     """
 
     environment: str
@@ -69,26 +69,26 @@ class Reached(msgspec.Struct, frozen=True, kw_only=True):
 def bootstrap_interval(
     values: Sequence[float], samples: int = 1000, level: float = 0.95
 ) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of the mean (section 3.3): its lower and upper end.
+    """Return the bounds of the percentile bootstrap interval of the mean (section 3.3).
 
-    The order of the values does not matter. The interval of one value is that value twice.
+    The order of the values does not matter. The bounds of a single value are the value itself.
 
     Args:
-        values: finite, at least one; of independent runs.
-        samples: how often to resample.
-        level: of the interval, between 0 and 1.
+        values: finite values of independent runs, at least one.
+        samples: number of bootstrap samples.
+        level: confidence level, between 0 and 1.
 
     Raises:
         ConfigError: there are no values.
     """
     if not values:
-        raise ConfigError("an interval of no values; expected the scores of at least one run")
+        raise ConfigError("no values for a bootstrap interval; expected those of at least one run")
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     chosen = Stream(_KEY).integers(len(ordered) * samples, 0, len(ordered))
-    # A column per resample: numpy adds up rows one after the other, the same on every processor.
+    # One column per sample: numpy adds rows in order, with the same rounding on every processor.
     means = ordered[chosen.reshape(len(ordered), samples)].sum(axis=0) / len(ordered)
     ends = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    # Rounding can carry the mean of equal values past them.
+    # Rounding can move the mean of equal values beyond them.
     low, high = np.clip(ends, ordered[0], ordered[-1])
     return float(low), float(high)
 
@@ -97,15 +97,15 @@ def score(means: Sequence[float], last: int = 20) -> float:
     """Return the score of a run: the mean of its last evaluations (Appendix B).
 
     Args:
-        means: mean return of each evaluation, in their order.
-        last: how many count, at least one; all of them if there are fewer.
+        means: mean return of each evaluation, in order.
+        last: number of evaluations in the score, at least 1; all of them if there are fewer.
 
     Raises:
-        ConfigError: there are no evaluations, or none should count.
+        ConfigError: there are no evaluations, or ``last`` is less than 1.
     """
     if not means or last < 1:
         raise ConfigError(
-            f"a score of the last {last} of {len(means)} evaluations; expected at least one"
+            f"score of the last {last} of {len(means)} evaluations; expected at least one"
         )
     return fmean(means[-last:])
 
@@ -113,22 +113,22 @@ def score(means: Sequence[float], last: int = 20) -> float:
 def curves(rows: Iterable[EvaluationRecord], every: int) -> list[CurvePoint]:
     """Return the learning curves of runs that differ in their seeds (section 3.3).
 
-    An evaluation belongs to the last multiple of ``every`` that the run had passed; if several of a
-    run belong to the same one, the earliest counts. A multiple is a point only where all seeds
-    have it: a curve never bends because a seed is missing.
+    An evaluation counts at the last multiple of ``every`` that the run had reached. If several of a
+    run count at the same multiple, the earliest is used. A multiple at which some seed has no
+    evaluation is left out, so that a curve never jumps because a seed is missing.
 
     Args:
         rows: evaluations of any number of agents.
         every: interval between points, in env steps.
 
     Returns:
-        The points in the order of env steps, agent after agent in the order of their first rows.
+        The points by agent, in the order of the agents' first rows, then by env steps.
 
     Raises:
         ConfigError: the interval is not positive.
     """
     if every < 1:
-        raise ConfigError(f"points every {every} env steps; expected at least 1")
+        raise ConfigError(f"interval of {every} env steps; expected at least 1")
     agents: dict[tuple[str, str, str], dict[int, dict[int, EvaluationRecord]]] = {}
     for row in rows:
         bins = agents.setdefault((row.environment, row.algorithm, row.variant), {})
@@ -153,14 +153,14 @@ def curves(rows: Iterable[EvaluationRecord], every: int) -> list[CurvePoint]:
 
 
 def reached(rows: Iterable[EvaluationRecord], thresholds: Sequence[float]) -> list[Reached]:
-    """Return when each run first reached each threshold.
+    """Return the first evaluation of each run that reached each threshold.
 
     Args:
         rows: evaluations of any number of runs.
-        thresholds: mean returns; an evaluation reaches one that it equals.
+        thresholds: mean returns; equality counts.
 
     Returns:
-        A row for each run and threshold, runs in the order of their first rows.
+        One row per run and threshold, runs in the order of their first rows.
     """
     runs: dict[tuple[str, str, str, int], list[EvaluationRecord]] = {}
     for one in rows:

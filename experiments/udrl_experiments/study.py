@@ -1,4 +1,4 @@
-"""What a study is, and how it is conducted: runs, tables, provenance, pictures."""
+"""Studies: they run jobs, then write tables and figures."""
 
 import importlib.util
 import threading
@@ -10,18 +10,18 @@ import msgspec
 
 from udrl.errors import ConfigError, InvalidData
 from udrl.strategies import make_strategy
-from udrl_experiments.jobs import Job, carry_out, copy_finished
+from udrl_experiments.jobs import Job, copy_finished, run_jobs
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
 from udrl_inspect.csv_tables import put
 
 
 class StudyFolders(NamedTuple):
-    """Where a study works.
+    """Folders of a study.
 
     Attributes:
-        root: where its runs live, in ``runs``; most studies share them.
-        folder: its own: tables, pictures, ``study.json``.
+        root: folder of the folder ``runs``, which most studies share.
+        folder: the study's own folder, with tables, figures and ``study.json``.
     """
 
     root: Path
@@ -32,73 +32,72 @@ class Study(NamedTuple):
     """One of the paper's experiments.
 
     Attributes:
-        name: of its folder, and of the command.
-        jobs: the runs that it needs.
-        report: makes tables and pictures of them, once they are done; returns what came of them in
-            words.
-        carry_out: does the runs.
-        needs: modules that must be there besides those that its runs need.
-        shares_runs: whether runs that other studies have made will do.
+        name: name of the study's folder and command.
+        jobs: the runs that the study needs.
+        report: writes tables and figures of the finished runs; returns a summary as text.
+        run_jobs: runs the jobs; see :func:`udrl_experiments.jobs.run_jobs`.
+        needs: modules that the study needs, in addition to those of its runs.
+        shares_runs: whether the study uses runs of other studies.
     """
 
     name: str
     jobs: Sequence[Job]
     report: Callable[[StudyFolders], str]
-    carry_out: Callable[
-        [Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None
-    ] = carry_out
+    run_jobs: Callable[[Sequence[Job], Path, int, threading.Event, Callable[[str], None]], None] = (
+        run_jobs
+    )
     needs: Sequence[str] = ()
     shares_runs: bool = True
 
 
-def conduct(
+def run_study(
     study: Study,
     root: Path,
     *,
     side_by_side: int,
     resume: bool,
     stop: threading.Event,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
     runs_from: Sequence[Path] = (),
 ) -> str:
-    """Conduct a study, or go on with it where it stopped, and return what came of it in words.
+    """Run or resume a study, and return its summary.
 
     Args:
-        study: what to do.
+        study: the study.
         root: folder of all studies.
-        side_by_side: runs at a time.
-        resume: go on if the folder holds this study already.
-        stop: ends it early.
-        say: is told how it goes.
-        runs_from: folders of other studies; runs that are done there are not made again.
+        side_by_side: number of simultaneous runs.
+        resume: resume the study if the folder contains it.
+        stop: ends the study early.
+        echo: called with each line of progress.
+        runs_from: other folders of studies, whose finished runs are copied.
 
     Raises:
-        ConfigError: a package is missing, a strategy cannot be made, the folder cannot be written,
-            or it holds a study already: another one, or ``resume`` is not set. Or one of
-            ``runs_from`` has no runs.
+        ConfigError: a module is missing, a run is too short for an evaluation, a strategy cannot be
+            created, the folder is not writable, or it contains a study but ``resume`` is not set,
+            or it contains runs that are not in this study, or one of ``runs_from`` has no runs.
         RunFailed: a run failed.
         Interrupted: ``stop`` was set.
     """
-    _require(study)
+    _check(study)
     root = root.resolve()
     folder = root / study.name
-    place = StudyFolders(root if study.shares_runs else folder, folder)
+    folders = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         sources = [one if study.shares_runs else one / study.name for one in runs_from]
-        copy_finished(study.jobs, place.root, sources, say)
-        _open(study, place, resume=resume)
-        study.carry_out(study.jobs, place.root, side_by_side, stop, say)
-        said = study.report(place)
+        copy_finished(study.jobs, folders.root, sources, echo)
+        _write_plan(study, folders, resume=resume)
+        study.run_jobs(study.jobs, folders.root, side_by_side, stop, echo)
+        summary = study.report(folders)
     except OSError as error:
         raise ConfigError(
-            f"--folder {root}: {error}; name a folder that you may write, on a disk with room"
+            f"--folder {root}: {error}; choose a writable folder on a disk with free space"
         ) from error
-    say(f"tables and pictures are in {folder}")
-    return said
+    echo(f"tables and figures are in {folder}")
+    return summary
 
 
-def _require(study: Study) -> None:
-    """Refuse before the first run what would be missed after the last one."""
+def _check(study: Study) -> None:
+    """Raise :class:`ConfigError` before the first run for errors that would occur later."""
     modules = dict.fromkeys(("matplotlib", *study.needs))
     for job in study.jobs:
         if job.algorithm != "UDRL":
@@ -112,47 +111,55 @@ def _require(study: Study) -> None:
                 f"the study {study.name} needs the module {module}, which is not installed; "
                 f'install it with: pip install "udrl[box2d,doom,studies]"'
             )
+    for job in study.jobs:
+        every = job.config.evaluation.eval_every
+        if job.max_env_steps < every:
+            raise ConfigError(
+                f"a run of {job.max_env_steps:,} env steps has no evaluation, because eval_every = "
+                f"{every:,}; raise --max-env-steps or lower eval_every (--set eval_every=STEPS)"
+            )
     strategies = {job.config.commands.command_strategy: job.config for job in study.jobs}
     for config in strategies.values():
         make_strategy(config)
 
 
-def _open(study: Study, place: StudyFolders, *, resume: bool) -> None:
-    """Write down what is about to be done; it may be more than what was begun, but not less."""
-    file = place.folder / "study.json"
+def _write_plan(study: Study, folders: StudyFolders, *, resume: bool) -> None:
+    """Write ``study.json``. A resumed study may have more runs or steps than before, not fewer."""
+    file = folders.folder / "study.json"
     if file.exists():
         if not resume:
             raise ConfigError(
-                f"{place.folder} holds a study already; resume it with --resume; or name another "
-                f"--folder"
+                f"{folders.folder} already contains a study; pass --resume to resume it, or choose "
+                f"another --folder"
             )
         planned: dict[tuple[str, str], int] = {}
         for job in study.jobs:
-            key = job.name, job.variant
-            planned[key] = max(planned.get(key, 0), job.max_env_steps)
+            for variant in (job.variant, ""):  # earlier searches have runs without a variant
+                key = job.name, variant
+                planned[key] = max(planned.get(key, 0), job.max_env_steps)
         for job in read_study(file):
             if planned.get((job.name, job.variant), 0) < job.max_env_steps:
                 raise ConfigError(
-                    f"{place.folder} holds a study with the run {job.described}, which is not in "
-                    f"this one; give the options that it was begun with, or ones that ask for "
-                    f"more, or name another --folder"
+                    f"{folders.folder} contains a study with the run {job.described}, which is not "
+                    f"in this one; pass the original options, or options for a larger study, or "
+                    f"choose another --folder"
                 )
-    place.folder.mkdir(parents=True, exist_ok=True)
+    folders.folder.mkdir(parents=True, exist_ok=True)
     about = {"study": study.name, **provenance(), "runs": study.jobs}
     put(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
 
 
 def read_study(file: Path) -> list[Job]:
-    """Return the runs of the study in a file ``study.json``.
+    """Return the jobs in a file ``study.json``.
 
     Raises:
-        InvalidData: it is something else.
+        InvalidData: the file is not a valid ``study.json``.
     """
 
-    class About(msgspec.Struct):
+    class StudyFile(msgspec.Struct):
         runs: list[Job]
 
     try:
-        return msgspec.json.decode(file.read_bytes(), type=About).runs
+        return msgspec.json.decode(file.read_bytes(), type=StudyFile).runs
     except (OSError, msgspec.DecodeError, ConfigError) as error:
-        raise InvalidData(f"{file}: {error}; delete it to begin the study anew") from error
+        raise InvalidData(f"{file}: {error}; delete it to start the study again") from error

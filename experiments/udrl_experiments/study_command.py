@@ -1,4 +1,4 @@
-"""``udrl study``: the paper's experiments from the command line."""
+"""The command ``udrl study``."""
 
 import logging
 import os
@@ -25,7 +25,7 @@ from udrl_experiments.search import search as make_search
 from udrl_experiments.search import search_environment
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
-from udrl_experiments.study import Study, conduct
+from udrl_experiments.study import Study, run_study
 from udrl_experiments.study_progress import studies, table
 from udrl_experiments.variants import commands as make_commands
 from udrl_experiments.variants import lead as make_lead
@@ -52,11 +52,11 @@ def study() -> None:
 
 
 def _options(command: Command) -> Command:
-    """Add the options that all studies have."""
+    """Add the options of all studies."""
     options = (
         click.option("--scale", type=click.Choice(get_args(Scale)), default="small",
-                     show_default=True, help="Number of seeds and steps: for an evening on two "
-                     "cores, or the paper's."),
+                     show_default=True, help="Number of seeds and steps: small takes an evening on "
+                     "two cores."),
         click.option("--seeds", metavar="SEEDS", help="Seeds of the runs, e.g. 1-20 or 1,2,7-9."),
         click.option("--max-env-steps", type=STEPS, help="Env steps per run, e.g. 500K or 10M."),
         click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
@@ -72,7 +72,7 @@ def _options(command: Command) -> Command:
 
 
 def _runs_from(command: Command) -> Command:
-    """Add the option that names folders of finished runs."""
+    """Add the option ``--runs-from``."""
     return click.option(
         "--runs-from", multiple=True, metavar="DIR",
         type=click.Path(path_type=Path, file_okay=False),
@@ -81,7 +81,7 @@ def _runs_from(command: Command) -> Command:
 
 
 def _tasks(*default: str) -> Callable[[Command], Command]:
-    """Add the option that names tasks."""
+    """Add the option ``--task``."""
     return click.option(
         "--task", "names", multiple=True, type=click.Choice(list(TASKS)), default=default,
         show_default=True, help="Task to run. May be repeated.",
@@ -89,7 +89,7 @@ def _tasks(*default: str) -> Callable[[Command], Command]:
 
 
 def _participants(command: Command) -> Command:
-    """Add the option that names participants of a comparison."""
+    """Add the option ``--algorithm`` of comparisons."""
     return click.option(
         "--algorithm", "participants", multiple=True, type=click.Choice(get_args(Participant)),
         default=DEFAULT_PARTICIPANTS, show_default=True,
@@ -97,7 +97,7 @@ def _participants(command: Command) -> Command:
     )(command)  # fmt: skip
 
 
-def _conduct(
+def _run(
     make: Callable[[StudyPlan], Study],
     *,
     scale: Scale,
@@ -120,11 +120,11 @@ def _conduct(
     cores = len(os.sched_getaffinity(0))
 
     def service(stop: threading.Event) -> None:
-        said = conduct(
+        summary = run_study(
             planned, folder, side_by_side=side_by_side or max(1, cores // 2), resume=resume,
-            stop=stop, say=lambda text: click.echo(text, err=True), runs_from=runs_from,
+            stop=stop, echo=lambda text: click.echo(text, err=True), runs_from=runs_from,
         )  # fmt: skip
-        click.echo(said)
+        click.echo(summary)
 
     return run_service(service)
 
@@ -133,9 +133,9 @@ def _conduct(
 @click.argument("names", nargs=-1, metavar="[STUDY]...")
 @_FOLDER
 def show(names: tuple[str, ...], folder: Path) -> int:
-    """Show which runs of studies are done, and how far the others are.
+    """Show the progress of studies, run by run.
 
-    Shows all studies in the folder, or those named. Starts nothing.
+    Shows all studies in the folder, or those named. Starts no runs.
 
     Example: udrl study show lander --folder runs/studies
     """
@@ -154,7 +154,7 @@ def lander(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study lander --algorithm UDRL --algorithm UDRL-paper
     """
-    return _conduct(lambda plan: comparison("lander", plan, participants), **options)
+    return _run(lambda plan: comparison("lander", plan, participants), **options)
 
 
 @study.command()
@@ -166,7 +166,7 @@ def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study takecover --algorithm UDRL
     """
-    return _conduct(lambda plan: comparison("takecover", plan, participants), **options)
+    return _run(lambda plan: comparison("takecover", plan, participants), **options)
 
 
 @study.command()
@@ -178,7 +178,7 @@ def sparse(participants: tuple[Participant, ...], **options: Any) -> int:
 
     Example: udrl study sparse --scale paper
     """
-    return _conduct(lambda plan: comparison("sparse", plan, participants), **options)
+    return _run(lambda plan: comparison("sparse", plan, participants), **options)
 
 
 @study.command()
@@ -191,7 +191,7 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 
     Example: udrl study sensitivity --task lander --task sparse
     """
-    return _conduct(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
+    return _run(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
 
 
 @study.command()
@@ -199,11 +199,11 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 @_runs_from
 @_tasks("lander")
 def lead(names: tuple[str, ...], **options: Any) -> int:
-    """Cost of asynchrony: lead 0, 1, 2, 4 and 8.
+    """Cost of asynchrony: lead 0, 1, 2, 4 and 8, by env steps and by wall time.
 
     Example: udrl study lead --side-by-side 1
     """
-    return _conduct(lambda plan: make_lead(plan, tasks(names)), **options)
+    return _run(lambda plan: make_lead(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -215,7 +215,7 @@ def segments(names: tuple[str, ...], **options: Any) -> int:
 
     Example: udrl study segments --task sparse
     """
-    return _conduct(lambda plan: make_segments(plan, tasks(names)), **options)
+    return _run(lambda plan: make_segments(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -229,7 +229,7 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 
     Example: udrl study commands --strategy mine.strategies:Patient
     """
-    return _conduct(lambda plan: make_commands(plan, tasks(names), strategies), **options)
+    return _run(lambda plan: make_commands(plan, tasks(names), strategies), **options)
 
 
 @study.command()
@@ -262,12 +262,14 @@ def search(
         given, missing = ("--space", "ENV") if env is None else (f"ENV {env}", "--space FILE")
         raise ConfigError(f"{given} needs {missing}: udrl study search ENV --space FILE")
     if env is None or file is None:
-        return _conduct(
+        return _run(
             lambda plan: make_search(plan, tasks(names or ("lander",)), algorithms, configurations),
             **options,
         )
     if names:
-        raise ConfigError(f"--task {names[0]}: leave it out, or leave out ENV and --space")
-    return _conduct(
+        raise ConfigError(
+            f"--task {names[0]}: cannot be combined with ENV and --space; leave out one of them"
+        )
+    return _run(
         lambda plan: search_environment(plan, env, file, algorithms, configurations), **options
     )

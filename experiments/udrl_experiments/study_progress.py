@@ -1,4 +1,4 @@
-"""``udrl study show``: which runs of a study are done, and how far the others are."""
+"""Progress of studies and their runs (``udrl study show``)."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
-from udrl_experiments.jobs import Job, furthest
-from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.jobs import Job, merge_jobs
+from udrl_experiments.records import EvaluationRecord, agent_name
 from udrl_experiments.study import read_study
 from udrl_inspect.csv_tables import read
 from udrl_inspect.inspection import read_status
@@ -17,14 +17,14 @@ _HEAD = "state", "env steps", "wall time", "mean return", "run"
 
 
 class JobProgress(NamedTuple):
-    """How far a run is.
+    """Progress of a run.
 
     Attributes:
         job: the run.
         state: ``done``; ``unfinished``: in progress or interrupted; ``not begun``.
-        env_steps: env steps so far; of a run that went further than asked, those asked for.
+        env_steps: env steps so far, at most the job's.
         wall_s: seconds of training and evaluations so far.
-        mean: mean return of the last evaluation; None: there was none.
+        mean: mean return of the last evaluation; None: no evaluation yet.
     """
 
     job: Job
@@ -35,11 +35,11 @@ class JobProgress(NamedTuple):
 
 
 def job_progress(job: Job, root: Path) -> JobProgress:
-    """Return how far a run is, without changing anything.
+    """Return the progress of a run. Only reads files.
 
     Args:
         job: the run.
-        root: where runs live.
+        root: folder of the folder ``runs``.
     """
     folder = job.folder(root)
     if job.done(root):
@@ -53,7 +53,7 @@ def job_progress(job: Job, root: Path) -> JobProgress:
             return JobProgress(job, "unfinished", status.env_steps, status.wall_s, mean)
         last = read(folder / "evaluations.csv", EvaluationRecord)[-1]
         return JobProgress(job, "unfinished", last.env_steps, last.wall_s, last.mean)
-    except (UdrlError, IndexError):  # it has no store or table yet
+    except (UdrlError, IndexError):  # no store or table yet
         return JobProgress(job, "unfinished" if folder.exists() else "not begun")
 
 
@@ -61,34 +61,36 @@ def studies(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, list[JobP
     """Yield the studies in a folder, each with its runs.
 
     Args:
-        folder: of all studies.
-        names: of some studies; none: of all in the folder.
+        folder: folder of all studies.
+        names: names of studies; none: all studies in the folder.
 
     Raises:
-        ConfigError: the folder holds no such study.
+        ConfigError: the folder does not contain the study.
         InvalidData: a study cannot be read.
     """
     found = sorted(file.parent.name for file in folder.glob("*/study.json"))
     if not found:
-        raise ConfigError(f"{folder} holds no study; begin one with e.g. udrl study lander")
+        raise ConfigError(f"{folder} contains no study; start one, e.g. udrl study lander")
     for name in names:
         if name not in found:
-            raise ConfigError(f"{folder} holds no study {name}; there are {', '.join(found)}")
+            raise ConfigError(
+                f"{folder} contains no study {name}; expected one of {', '.join(found)}"
+            )
     for name in names or found:
-        own = folder / name / "runs"  # of a study that does not share its runs
+        own = folder / name / "runs"  # if the study does not share its runs
         root = own.parent if own.is_dir() else folder
-        runs = furthest(read_study(folder / name / "study.json"))
+        runs = merge_jobs(read_study(folder / name / "study.json"))
         yield name, [job_progress(job, root) for job in runs]
 
 
 def table(name: str, runs: Sequence[JobProgress]) -> list[str]:
-    """Return the lines that show a study: its runs below a summary."""
+    """Return the lines of a study: a summary, then one line per run."""
     done = [run for run in runs if run.state == "done"]
-    steps, asked = sum(run.env_steps for run in runs), sum(run.job.max_env_steps for run in runs)
+    steps, planned = sum(run.env_steps for run in runs), sum(run.job.max_env_steps for run in runs)
     rows = [_HEAD, *map(_cells, runs)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
-        f"{name}: {len(done)} of {len(runs)} runs done, {steps:,} of {asked:,} env steps, "
+        f"{name}: {len(done)} of {len(runs)} runs done, {steps:,} of {planned:,} env steps, "
         f"wall time {duration(sum(run.wall_s for run in runs))}",
         *(
             "  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip()
@@ -99,11 +101,11 @@ def table(name: str, runs: Sequence[JobProgress]) -> list[str]:
 
 def _cells(run: JobProgress) -> tuple[str, ...]:
     job = run.job
-    parts = (job.algorithm, job.variant, job.config.environment, f"seed {job.config.seed}")
+    agent = agent_name(job.algorithm, job.variant)
     return (
         run.state,
         f"{run.env_steps:,} of {job.max_env_steps:,}",
         duration(run.wall_s) if run.wall_s else "",
         "" if run.mean is None else return_text(run.mean),
-        " ".join(part for part in parts if part),
+        f"{agent} {job.config.environment} seed {job.config.seed}",
     )

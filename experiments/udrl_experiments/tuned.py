@@ -1,4 +1,4 @@
-"""Hyperparameters of algorithms other than UDRL: their names, and the values in ``tuned.toml``."""
+"""Hyperparameters of algorithms other than UDRL: names, defaults, and values in ``tuned.toml``."""
 
 import tomllib
 from collections.abc import Mapping
@@ -13,35 +13,35 @@ from udrl.errors import ConfigError
 from udrl.setting_groups import Count, PositiveInt
 from udrl_experiments.protocol import BaselineAlgorithm
 
-Part = Annotated[float, Meta(ge=0, le=1)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(gt=0, le=10)]
 Coefficient = Annotated[float, Meta(ge=0, le=1e6)]
 
 
 class DqnHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """DQN's, by Stable-Baselines3's names and with its defaults.
+    """Hyperparameters of DQN, with Stable-Baselines3's names and defaults.
 
     Attributes:
-        activation: of the fully connected layers.
-        batch_size: transitions in one update.
-        buffer_size: transitions that the replay buffer holds.
+        activation: activation function of the fully connected layers.
+        batch_size: transitions per update.
+        buffer_size: capacity of the replay buffer in transitions.
         gamma: discount factor.
-        exploration_fraction: part of a run in which the part of random actions falls, from 1.
-        exploration_final_eps: what it falls to.
-        learning_rate: Adam's.
+        exploration_fraction: fraction of a run over which the exploration rate decreases from 1.
+        exploration_final_eps: final exploration rate.
+        learning_rate: learning rate of Adam.
         train_freq: env steps between updates.
         target_update_interval: env steps between updates of the target network.
         learning_starts: env steps of random actions before the first update.
-        gradient_steps: updates every ``train_freq`` env steps; -1: as many as these.
-        n_steps: rewards in a return before it is bootstrapped.
+        gradient_steps: updates every ``train_freq`` env steps; -1: one per env step.
+        n_steps: number of rewards in an n-step return.
     """
 
     activation: Literal["relu", "tanh"] = "relu"
     batch_size: PositiveInt = 32
     buffer_size: PositiveInt = 1_000_000
-    gamma: Part = 0.99
-    exploration_fraction: Part = 0.1
-    exploration_final_eps: Part = 0.05
+    gamma: Fraction = 0.99
+    exploration_fraction: Fraction = 0.1
+    exploration_final_eps: Fraction = 0.05
     learning_rate: Rate = 1e-4
     train_freq: PositiveInt = 4
     target_update_interval: PositiveInt = 10_000
@@ -51,60 +51,61 @@ class DqnHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
 
 class A2cHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A2C's, by Stable-Baselines3's names and with its defaults; it has none for ``n_envs``.
+    """Hyperparameters of A2C, with Stable-Baselines3's names and defaults, except for ``n_envs``.
 
     Attributes:
-        activation: of the fully connected layers.
+        activation: activation function of the fully connected layers.
         gamma: discount factor.
-        ent_coef: factor of the entropy in the loss.
-        learning_rate: RMSprop's.
-        vf_coef: factor of the value function's error in the loss.
-        rms_prop_decay: alpha, RMSprop's decay.
-        n_steps: steps of each environment before an update.
-        n_envs: environments that it acts in at the same time.
-        gae_lambda: of generalised advantage estimation; 1: advantages as in the paper.
-        normalize_advantage: scale the advantages of an update to a standard deviation of 1.
+        ent_coef: coefficient of the entropy in the loss.
+        learning_rate: learning rate of RMSprop.
+        vf_coef: coefficient of the value loss.
+        rms_prop_decay: alpha, the decay of RMSprop.
+        n_steps: steps per environment and update.
+        n_envs: number of parallel environments.
+        gae_lambda: lambda of generalised advantage estimation; 1: advantages as in the paper.
+        normalize_advantage: normalise the advantages of an update to mean 0 and standard deviation
+            1.
     """
 
     activation: Literal["relu", "tanh"] = "tanh"
-    gamma: Part = 0.99
+    gamma: Fraction = 0.99
     ent_coef: Coefficient = 0.0
     learning_rate: Rate = 7e-4
     vf_coef: Coefficient = 0.5
-    rms_prop_decay: Part = 0.99
+    rms_prop_decay: Fraction = 0.99
     n_steps: PositiveInt = 5
     n_envs: Annotated[int, Meta(ge=1, le=1024)] = 8
-    gae_lambda: Part = 1.0
+    gae_lambda: Fraction = 1.0
     normalize_advantage: bool = False
 
 
 class PpoHyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """PPO's, by Stable-Baselines3's names and with its defaults; it has none for ``n_envs``.
+    """Hyperparameters of PPO, with Stable-Baselines3's names and defaults, except for ``n_envs``.
 
     Attributes:
-        activation: of the fully connected layers.
+        activation: activation function of the fully connected layers.
         gamma: discount factor.
-        learning_rate: Adam's.
-        n_envs: environments that it acts in at the same time.
-        n_steps: steps of each environment before an update.
-        batch_size: of a minibatch, in env steps.
+        learning_rate: learning rate of Adam.
+        n_envs: number of parallel environments.
+        n_steps: steps per environment and update.
+        batch_size: env steps per minibatch.
         n_epochs: passes over the steps of an update.
-        gae_lambda: of generalised advantage estimation.
-        clip_range: largest change of an action's probability ratio that is rewarded.
-        ent_coef: factor of the entropy in the loss.
-        vf_coef: factor of the value function's error in the loss.
-        max_grad_norm: gradients are scaled down to this norm.
+        gae_lambda: lambda of generalised advantage estimation.
+        clip_range: range to which the probability ratio of an action is clipped, around 1.
+        ent_coef: coefficient of the entropy in the loss.
+        vf_coef: coefficient of the value loss.
+        max_grad_norm: maximum norm of the gradient, which is clipped.
     """
 
     activation: Literal["relu", "tanh"] = "tanh"
-    gamma: Part = 0.99
+    gamma: Fraction = 0.99
     learning_rate: Rate = 3e-4
     n_envs: Annotated[int, Meta(ge=1, le=1024)] = 1
-    # Advantages are divided by the standard deviation of a minibatch, which takes two.
+    # At least 2: advantages are divided by their standard deviation in a minibatch.
     n_steps: Annotated[int, Meta(ge=2)] = 2048
     batch_size: Annotated[int, Meta(ge=2)] = 64
     n_epochs: PositiveInt = 10
-    gae_lambda: Part = 0.95
+    gae_lambda: Fraction = 0.95
     clip_range: Annotated[float, Meta(gt=0, le=1)] = 0.2
     ent_coef: Coefficient = 0.0
     vf_coef: Coefficient = 0.5
@@ -121,32 +122,32 @@ _KINDS: dict[BaselineAlgorithm, type[Hyperparameters]] = {
 
 
 def complete(algorithm: BaselineAlgorithm, chosen: Mapping[str, KeywordValue]) -> Hyperparameters:
-    """Return some hyperparameters and the defaults of all others.
+    """Return all hyperparameters, with defaults for those that are not given.
 
     Raises:
-        ConfigError: a name is unknown or a value impossible.
+        ConfigError: a name is unknown or a value is invalid.
     """
     kind = _KINDS[algorithm]
     for name in chosen:
         if name not in kind.__struct_fields__:
             raise ConfigError(
                 f"unknown hyperparameter {name!r} of {algorithm}: "
-                f"there are {', '.join(kind.__struct_fields__)}"
+                f"expected one of {', '.join(kind.__struct_fields__)}"
             )
     return build(kind, chosen)
 
 
 def tuned(algorithm: BaselineAlgorithm, environment: str) -> dict[str, KeywordValue]:
-    """Return an algorithm's hyperparameters for an environment.
+    """Return an algorithm's hyperparameters for an environment from ``tuned.toml``.
 
     Raises:
-        ConfigError: there are none.
+        ConfigError: ``tuned.toml`` has none.
     """
     text = (resources.files("udrl_experiments") / "tuned.toml").read_text(encoding="utf-8")
     shipped: dict[str, dict[str, dict[str, KeywordValue]]] = tomllib.loads(text)
     if environment not in shipped:
         raise ConfigError(
-            f"no hyperparameters of {algorithm} ship for {environment!r}: "
-            f"there are some for {', '.join(shipped)}"
+            f"tuned.toml has no hyperparameters of {algorithm} for {environment!r}, only for "
+            f"{', '.join(shipped)}"
         )
     return shipped[environment][algorithm]

@@ -1,7 +1,7 @@
-"""Studies that change one setting of UDRL: ``lead``, ``segments``, ``commands``.
+"""Studies of one setting of UDRL: ``lead``, ``segments``, ``commands``.
 
-The paper has none of them in figures. Section 2.3.3 leaves out all but trailing segments, section 6
-calls for a study of other ways to choose exploratory commands, and lead is ours.
+The paper has no figures of them. It trains on trailing segments only (section 2.3.3), and suggests
+a study of other strategies for exploratory commands (section 6). ``lead`` is not in the paper.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +21,14 @@ LEADS = (0, 1, 2, 4, 8)
 
 
 def lead(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
-    """Return the study of what asynchrony costs: against env steps, and against wall time."""
+    """Return the study of the cost of asynchrony, by env steps and by wall time."""
     variants = {f"lead {n}": {"lead": n} for n in LEADS}
     return _variants("lead", plan, tasks, variants, wall_time=True)
 
 
 def segments(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
-    """Return the study of trailing segments against all, 0 <= t1 < t2 <= T (section 2.3.3)."""
-    # A baseline's labels are of trailing segments only.
+    """Return the study of trailing and all segments, 0 <= t1 < t2 <= T (section 2.3.3)."""
+    # A baseline allows trailing segments only.
     variants = {name: {"segments": name, "baseline": "none"} for name in ("trailing", "all")}
     return _variants("segments", plan, tasks, variants)
 
@@ -38,10 +38,11 @@ def commands(plan: StudyPlan, tasks: Sequence[Task], strategies: Sequence[str]) 
 
     Args:
         plan: seeds and steps.
-        tasks: on which.
-        strategies: your own, ``package.module:Class``, besides those of :mod:`udrl.strategies`.
+        tasks: tasks to train on.
+        strategies: additional strategies, ``package.module:Class``, to those of
+            :mod:`udrl.strategies`.
     """
-    # The landers declare no greatest return, which `maximum` commands.
+    # `maximum` commands the highest possible return, which the landers do not declare.
     names = (*(name for name in STRATEGIES if name != "maximum"), *strategies)
     return _variants("commands", plan, tasks, {name: {"command_strategy": name} for name in names})
 
@@ -70,18 +71,18 @@ def _variants(
         for task in tasks
     }
 
-    def report(place: StudyFolders) -> str:
-        said = []
+    def report(folders: StudyFolders) -> str:
+        lines = []
         for task, runs in jobs.items():
-            folder = place.folder if len(jobs) == 1 else place.folder / task.title
+            folder = folders.folder if len(jobs) == 1 else folders.folder / task.title
             folder.mkdir(exist_ok=True)
-            here = place._replace(folder=folder)
+            here = folders._replace(folder=folder)
             title = f"{task.title}: {name}"
-            said.append(report_curves(runs, task, title, here))
+            lines.append(report_curves(runs, task, title, here))
             if wall_time:
                 report_wall_time(runs, task, title, here)
-        return "\n".join(said)
+        return "\n".join(lines)
 
-    # A time that was measured beside other runs, or by other code, is not comparable.
-    every = [job for runs in jobs.values() for job in runs]
-    return Study(name, every, report, shares_runs=not wall_time)
+    # Wall times are only comparable if the same study measured them.
+    all_jobs = [job for runs in jobs.values() for job in runs]
+    return Study(name, all_jobs, report, shares_runs=not wall_time)

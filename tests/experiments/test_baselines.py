@@ -182,7 +182,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
         for mine, their in zip(ours, theirs, strict=True):
             mine.copy_(their)
         expected = behavior((observation,), torch.zeros(5, 2))
-        call = policies.InPlaceOfBehavior(model, seen).call(5)
+        call = policies.ModelPolicy(model, seen).call(5)
         call.seen[0][:] = observation.numpy()
         call.run()
         logits = torch.from_numpy(call.logits)
@@ -326,16 +326,16 @@ def test_extended_with_the_exploration_that_it_began_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     explored: list[int] = []
-    original = policies.explore_for
+    original = policies.set_exploration
 
-    def explore_for(model: policies.Model, env_steps: int) -> None:
+    def set_exploration(model: policies.Model, env_steps: int) -> None:
         original(model, env_steps)
         assert isinstance(model, DQN)
         explored.append(env_steps)
         rate = 0.05 + 0.95 * max(0.0, 1 - model.num_timesteps / env_steps)
         assert model.exploration_rate == pytest.approx(rate)
 
-    monkeypatch.setattr(policies, "explore_for", explore_for)
+    monkeypatch.setattr(policies, "set_exploration", set_exploration)
     run(baseline("DQN"), 100, tmp_path / "fraction")
     run(baseline("DQN"), 100, tmp_path / "said", exploration_steps=250)
     rows = run(baseline("DQN"), 400, tmp_path / "said", exploration_steps=999)

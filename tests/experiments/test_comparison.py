@@ -56,9 +56,9 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
     }
     assert {row.variant for row in read(place.folder / "reached.csv", Reached)} == {"", "paper"}
     picture = (place.folder / "learning-curves.svg").read_text(encoding="utf-8")
-    for label in ("UDRL (2 seeds)", "UDRL paper (2 seeds)"):
+    for label in ("UDRL (2 seeds)", "UDRL-paper (2 seeds)"):
         assert f">{label}</text>" in picture
-    assert "LunarLander: UDRL paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
+    assert "LunarLander: UDRL-paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
 
 
 def test_wall_times_are_compared_on_one_kind_of_machine_alone(tmp_path: Path) -> None:

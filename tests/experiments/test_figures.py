@@ -234,9 +234,9 @@ def test_nothing_is_cut_off_or_covered(points: Sequence[CurvePoint], tmp_path: P
 
 
 def test_an_empty_table_is_an_error() -> None:
-    with pytest.raises(ConfigError, match="lander: a figure of an empty table; expected at least"):
+    with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
         learning_curves([], "lander")
-    with pytest.raises(ConfigError, match="lander: a figure of an empty table; expected at least"):
+    with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
         sensitivity([], "lander")
 
 

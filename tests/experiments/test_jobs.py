@@ -12,8 +12,8 @@ from udrl.config import Config, build, change, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed, RunInUse
 from udrl_experiments import job as job_module
 from udrl_experiments import jobs
-from udrl_experiments.job import carry_out as do
-from udrl_experiments.jobs import RECORDS, Job, carry_out, copy_finished, furthest, read_job
+from udrl_experiments.job import run_job
+from udrl_experiments.jobs import RECORDS, Job, copy_finished, merge_jobs, read_job, run_jobs
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import write
 
@@ -40,7 +40,7 @@ def evaluated(env_steps: int) -> EvaluationRecord:
 
 def test_runs_of_equal_settings_are_one_run_as_far_as_anyone_asks() -> None:
     planned = [job(100), job(50, "short"), job(300, "long"), job(10, seed=2)]
-    assert [(one.config.seed, one.max_env_steps) for one in furthest(planned)] == [
+    assert [(one.config.seed, one.max_env_steps) for one in merge_jobs(planned)] == [
         (1, 300),
         (2, 10),
     ]
@@ -117,9 +117,9 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, program: Callable[[str],
     program(FINISH)
     said: list[str] = []
     planned = [job(seed=n) for n in (1, 2, 3)]
-    carry_out(planned[:2], tmp_path, 2, threading.Event(), said.append)
+    run_jobs(planned[:2], tmp_path, 2, threading.Event(), said.append)
     assert len(said) == 2
-    carry_out(planned, tmp_path, 2, threading.Event(), said.append)
+    run_jobs(planned, tmp_path, 2, threading.Event(), said.append)
     assert said[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
     assert read_job(planned[2].folder(tmp_path)) == planned[2]
 
@@ -131,7 +131,7 @@ def test_no_more_than_asked_side_by_side(tmp_path: Path, program: Callable[[str]
         "time.sleep(0.5); n = sum(f.endswith('.on') for f in os.listdir(root)); "
         "open(folder + '.count', 'w').write(str(n)); os.remove(mark)\n" + FINISH
     )
-    carry_out([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), quietly)
+    run_jobs([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), quietly)
     counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
     assert len(counts) == 4
     assert max(counts) == 2
@@ -146,8 +146,8 @@ def test_records_of_finished_runs_are_copied_and_their_runs_not_made_again(
 ) -> None:
     first, second, here = (tmp_path / name for name in ("first", "second", "here"))
     program(FINISH)
-    carry_out([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
-    carry_out([job(2000, seed=2)], second, 1, threading.Event(), quietly)
+    run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
+    run_jobs([job(2000, seed=2)], second, 1, threading.Event(), quietly)
     said: list[str] = []
     wanted = [job(seed=1), job(2000, seed=2), job(seed=3)]
     copy_finished(wanted, here, [first, second], said.append)
@@ -163,7 +163,7 @@ def test_records_of_finished_runs_are_copied_and_their_runs_not_made_again(
 
     del said[:]
     copy_finished(wanted, here, [first, second], said.append)  # they are here now
-    carry_out(wanted, here, 1, threading.Event(), said.append)
+    run_jobs(wanted, here, 1, threading.Event(), said.append)
     assert said == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
 
 
@@ -189,7 +189,7 @@ def test_a_run_of_which_only_records_were_kept_begins_anew(
     if state:
         (tmp_path / state).touch()
     with pytest.raises(RunFailed, match="later"):
-        do(job(), tmp_path, threading.Event())
+        run_job(job(), tmp_path, threading.Event())
     assert (tmp_path / "done.json").exists() is kept
 
 
@@ -221,7 +221,7 @@ def test_a_stop_ends_what_runs(tmp_path: Path, program: Callable[[str], None]) -
     program(LAST)
     stop, said = WhenItRuns(job().folder(tmp_path)), list[str]()
     with pytest.raises(Interrupted, match="--resume"):
-        carry_out([job()], tmp_path, 1, stop, said.append)
+        run_jobs([job()], tmp_path, 1, stop, said.append)
     assert "--resume" in said[-1]
     assert not is_running(stop.pid)
 
@@ -237,20 +237,44 @@ def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
         "print('no such luck', file=sys.stderr); sys.exit(7)"
     )
     with pytest.raises(RunFailed, match="no such luck") as raised:
-        carry_out([lasting, job(seed=2)], tmp_path, 2, threading.Event(), quietly)
+        run_jobs([lasting, job(seed=2)], tmp_path, 2, threading.Event(), quietly)
     assert raised.value.exit_code == 7
     assert not is_running(WhenItRuns(lasting.folder(tmp_path)).pid)
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("raise ValueError('no luck')", r"failed with exit code 1: ValueError: no luck; see .*log"),
+        (
+            "print('udrl: error: full\\nlast lines of a service', file=sys.stderr); sys.exit(8)",
+            "failed with exit code 8: full; see",
+        ),
+        ("sys.exit(3)", "failed with exit code 3: no output; see"),
+        ("os.kill(os.getpid(), 9)", "was killed by signal 9; see"),
+    ],
+)
+def test_a_failure_is_one_line_with_its_cause(
+    tmp_path: Path, program: Callable[[str], None], line: str, message: str
+) -> None:
+    folder = job().folder(tmp_path)
+    folder.mkdir(parents=True)
+    (folder / "log.txt").write_text("udrl: error: of an earlier process\n", encoding="utf-8")
+    program(line)
+    with pytest.raises(RunFailed, match=message) as raised:
+        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+    assert "\n" not in str(raised.value)
+
+
 def test_a_run_without_evaluations_is_told(tmp_path: Path, program: Callable[[str], None]) -> None:
     program("")
-    with pytest.raises(RunFailed, match=r"no evaluation within 1,000 env steps; ask for more"):
-        carry_out([job()], tmp_path, 1, threading.Event(), quietly)
+    with pytest.raises(RunFailed, match=r"without an evaluation within 1,000 env steps; raise"):
+        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
 
 
 def test_nobody_else_works_on_a_run(tmp_path: Path) -> None:
     dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=10)
     with (tmp_path / "lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(RunInUse, match="another study works on the run"):
-            do(dqn, tmp_path, threading.Event())
+        with pytest.raises(RunInUse, match="another process is running"):
+            run_job(dqn, tmp_path, threading.Event())

@@ -51,7 +51,7 @@ def test_an_unknown_setting_is_refused() -> None:
 
 def test_tasks_by_name() -> None:
     assert tasks(["sparse", "lander"]) == [TASKS["sparse"], TASKS["lander"]]
-    with pytest.raises(ConfigError, match=r"task 'moon': there are lander"):
+    with pytest.raises(ConfigError, match=r"task 'moon': expected one of lander"):
         tasks(["moon"])
 
 

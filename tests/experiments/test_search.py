@@ -87,7 +87,7 @@ def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
     study = search(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()
     said = study.report(StudyFolders(tmp_path, tmp_path / "search"))
-    assert "no configuration got to its end" in said
+    assert "every configuration has a failed run" in said
     assert not list((tmp_path / "search").glob("*.toml"))
 
 
@@ -160,10 +160,23 @@ def test_the_best_settings_of_any_environment_are_those_that_were_run(
     assert change(again.config, eval_seeds="search", eval_every=50_000) == run.config
 
 
+def test_runs_of_different_configurations_have_different_descriptions(mine: Path) -> None:
+    study = search_environment(StudyPlan(), "MountainCar-v0", mine, configurations=3)
+    assert [one.described for one in study.jobs] == [
+        f"{algorithm} configuration {number}, MountainCar-v0, seed 1: 500,000 env steps"
+        for algorithm in ("UDRL", "PPO")
+        for number in range(3)
+    ]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[UDRL]", "[ULDR]", r"mine\.toml: ULDR; expected .*UDRL, DQN, A2C, PPO"),
+        (
+            "[UDRL]",
+            "[ULDR]",
+            r"mine\.toml: unknown setting or table 'ULDR': .*\[UDRL\], \[DQN\]",
+        ),
         (
             "[32, 64]",
             "[]",
@@ -181,10 +194,13 @@ def test_the_best_settings_of_any_environment_are_those_that_were_run(
         ),
         (SPACE, "UDRL = 3", r"mine\.toml: \[UDRL\] = 3: expected a table"),
         ("seeds = 2", "seeds = 0", r"mine\.toml: .*seeds"),
-        ("hidden", "lead", r"mine\.toml: lead in \[networks\].*frame_stack, convolutions, hidden"),
-        ("batch_size", "bach_size", r"unknown.*bach_size"),
-        ("[32, 64]", '["many"]', r"batch_size = 'many'"),
-        ("gamma", "gama", r"unknown hyperparameter 'gama' of PPO"),
+        ("hidden", "lead", r"mine\.toml: \[networks\] lead: .*frame_stack, convolutions, hidden"),
+        ("batch_size", "bach_size", r"mine\.toml: \[UDRL\] unknown.*bach_size"),
+        ("[32, 64]", '["many"]', r"mine\.toml: \[UDRL\] batch_size = 'many'"),
+        ("[0.5]", "[-1.0]", r"mine\.toml: \[UDRL\] return_scale = -1\.0"),
+        ("[[8], [16, 8]]", "[[0]]", r"mine\.toml: \[networks\] hidden = \[0\]"),
+        ("[0.9, 0.99]", "[2.0]", r"mine\.toml: \[PPO\] gamma = 2\.0"),
+        ("gamma", "gama", r"mine\.toml: \[PPO\] unknown hyperparameter 'gama'"),
         ("seeds = 2", "seeds =", r"mine\.toml is not TOML"),
     ],
 )
@@ -196,7 +212,7 @@ def test_a_space_that_cannot_be_used_is_told(mine: Path, old: str, new: str, mes
 
 def test_a_space_without_algorithms_is_told(mine: Path) -> None:
     mine.write_text("seeds = 2")
-    with pytest.raises(ConfigError, match=r"no algorithm to search for; expected a table \[UDRL\]"):
+    with pytest.raises(ConfigError, match=r"no table of an algorithm; expected \[UDRL\] or"):
         search_environment(StudyPlan(), "MountainCar-v0", mine)
 
 
@@ -218,7 +234,7 @@ def test_algorithms_that_cannot_act_in_the_environment_are_told(mine: Path) -> N
         (["--space", "mine.toml"], "--space needs ENV"),
         (
             ["CartPole-v1", "--space", "mine.toml", "--task", "lander"],
-            "--task lander: leave it out",
+            "--task lander: cannot be combined with ENV and --space",
         ),
     ],
 )

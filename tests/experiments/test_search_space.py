@@ -55,5 +55,5 @@ def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -
 def test_a_space_is_of_one_environment(tmp_path: Path) -> None:
     file = tmp_path / "space.toml"
     file.write_text('[UDRL]\nenvironment = ["CartPole-v1"]\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"environment in \[UDRL\]; .*ENV, 'Acrobot-v1'"):
+    with pytest.raises(ConfigError, match=r"\[UDRL\] environment: .*ENV, 'Acrobot-v1'"):
         read_space("Acrobot-v1", file)

@@ -117,7 +117,7 @@ def test_interval_holds_the_true_mean_about_as_often_as_it_says() -> None:
 
 
 def test_interval_of_nothing_is_an_error() -> None:
-    with pytest.raises(ConfigError, match="no values; expected the scores of at least one run"):
+    with pytest.raises(ConfigError, match="no values for a bootstrap interval; expected"):
         bootstrap_interval([])
 
 
@@ -232,7 +232,7 @@ def test_points_are_rows_of_a_tidy_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("every", [0, -1])
 def test_an_interval_that_is_not_positive_is_an_error(every: int) -> None:
-    with pytest.raises(ConfigError, match=f"every {every} env steps; expected at least 1"):
+    with pytest.raises(ConfigError, match=f"interval of {every} env steps; expected at least 1"):
         curves([], every)
 
 

@@ -9,19 +9,21 @@ from typing import Any
 import msgspec
 import pytest
 
-from udrl.config import Config, flat
+from udrl.config import Config, build, flat
 from udrl.errors import ConfigError, InvalidData, RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.study import Study, StudyFolders, conduct
+from udrl_experiments.study import Study, StudyFolders, run_study
 from udrl_inspect.csv_tables import write
 
 
-def job(seed: int, max_env_steps: int = 100) -> Job:
-    return Job(algorithm="UDRL", settings=flat(Config(environment="CartPole-v1", seed=seed)),
-               max_env_steps=max_env_steps)  # fmt: skip
+def job(seed: int, max_env_steps: int = 100, variant: str = "") -> Job:
+    config = build(Config, {"environment": "CartPole-v1", "seed": seed, "eval_every": 5})
+    return Job(
+        algorithm="UDRL", settings=flat(config), max_env_steps=max_env_steps, variant=variant
+    )
 
 
 class World:
@@ -37,12 +39,14 @@ class World:
         return "all is well"
 
     def conduct(self, *jobs: Job, resume: bool = False) -> None:
-        def carry_out(planned: Sequence[Job], *others: Any) -> None:
+        def run_jobs(planned: Sequence[Job], *others: Any) -> None:
             self.done = list(planned)
 
-        study = Study("try", jobs, self.report, carry_out)
-        self.said = conduct(study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
-                say=lambda text: None)  # fmt: skip
+        study = Study("try", jobs, self.report, run_jobs)
+        self.said = run_study(
+            study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
+            echo=lambda text: None,
+        )  # fmt: skip
 
 
 @pytest.fixture
@@ -79,7 +83,7 @@ def test_what_is_missing_is_told_before_the_first_run(
     world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    settings = flat(Config(environment="LunarLander-v3"))
+    settings = flat(job(1).config) | {"environment": "LunarLander-v3"}
     needy = msgspec.structs.replace(job(1), algorithm=algorithm, settings=settings)
     with pytest.raises(ConfigError, match=rf'{module}.*pip install "udrl\[box2d,doom,studies\]"'):
         world.conduct(needy)
@@ -89,7 +93,7 @@ def test_what_is_missing_is_told_before_the_first_run(
 
 def test_a_study_is_not_done_over_another(world: World) -> None:
     world.conduct(job(1))
-    with pytest.raises(ConfigError, match=r"holds a study already; resume it with --resume"):
+    with pytest.raises(ConfigError, match=r"already contains a study; pass --resume to resume it"):
         world.conduct(job(1))
 
 
@@ -107,6 +111,22 @@ def test_it_does_not_go_on_with_less(world: World, jobs: tuple[Job, ...]) -> Non
         world.conduct(*jobs, resume=True)
 
 
+def test_a_search_begun_without_variants_is_resumed(world: World) -> None:
+    world.conduct(job(1))
+    world.conduct(job(1, variant="configuration 0"), resume=True)
+    with pytest.raises(ConfigError, match=r"configuration 0, .*which is not in this one"):
+        world.conduct(job(1), resume=True)
+
+
+def test_a_run_that_is_too_short_for_an_evaluation_is_refused(world: World) -> None:
+    world.conduct(job(1, 5))
+    with pytest.raises(
+        ConfigError, match=r"a run of 4 env steps has no evaluation, because eval_every = 5; raise"
+    ):
+        world.conduct(job(2, 4), resume=True)
+    assert world.done == [job(1, 5)]
+
+
 def test_a_damaged_book_is_told(world: World) -> None:
     world.conduct(job(1))
     (world.root / "try" / "study.json").write_text('{"runs": [{}]}')
@@ -120,8 +140,8 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
 
     study = Study("try", [job(1)], world.report, fail)
     with pytest.raises(RunFailed):
-        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
-                say=lambda text: None)  # fmt: skip
+        run_study(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                echo=lambda text: None)  # fmt: skip
     assert not world.reported
 
 
@@ -142,16 +162,16 @@ def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: st
         return str(job(1).evaluations(place.root)[0].mean)
 
     study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
-    said = conduct(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
-                   say=lambda text: None, runs_from=[other])  # fmt: skip
+    said = run_study(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
+                   echo=lambda text: None, runs_from=[other])  # fmt: skip
     assert said == "2.0"
 
 
 def test_a_source_without_runs_leaves_no_study(world: World, tmp_path: Path) -> None:
     study = Study("try", [job(1)], world.report, lambda *_: None)
     with pytest.raises(ConfigError, match=r"--runs-from .*nowhere: expected a folder of studies"):
-        conduct(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
-                say=lambda text: None, runs_from=[tmp_path / "nowhere"])  # fmt: skip
+        run_study(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
+                echo=lambda text: None, runs_from=[tmp_path / "nowhere"])  # fmt: skip
     assert not (world.root / "try").exists()
 
 
@@ -164,5 +184,5 @@ def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World)
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"--folder .*file.*name a folder that you may write"):
+    with pytest.raises(ConfigError, match=r"--folder .*file.*choose a writable folder"):
         World(tmp_path / "file").conduct(job(1))

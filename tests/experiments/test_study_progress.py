@@ -61,10 +61,10 @@ def test_a_study_that_does_not_share_its_runs_has_them_in_its_folder(tmp_path: P
 
 
 def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"holds no study; begin one with"):
+    with pytest.raises(ConfigError, match=r"contains no study; start one"):
         list(studies(tmp_path, ()))
     plan(tmp_path, "lander", job(1))
-    with pytest.raises(ConfigError, match=r"holds no study moon; there are lander"):
+    with pytest.raises(ConfigError, match=r"contains no study moon; expected one of lander"):
         list(studies(tmp_path, ("moon",)))
 
 
@@ -78,6 +78,17 @@ def test_the_table_has_a_summary_and_a_line_for_each_run() -> None:
         "state      env steps       wall time  mean return  run",
         "done       1,000 of 1,000  1:01       -12.5        DQN lead 2 CartPole-v1 seed 1",
         "not begun  0 of 2,000                              DQN CartPole-v1 seed 2",
+    ]
+
+
+def test_runs_of_the_papers_preset_and_of_configurations_are_named() -> None:
+    runs = [
+        JobProgress(msgspec.structs.replace(job(1, variant=variant), algorithm="UDRL"), "not begun")
+        for variant in ("paper", "configuration 3")
+    ]
+    assert [line.split("  ")[-1].strip() for line in table("search", runs)[2:]] == [
+        "UDRL-paper CartPole-v1 seed 1",
+        "UDRL configuration 3 CartPole-v1 seed 1",
     ]
 
 

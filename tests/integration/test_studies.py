@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from udrl.config import Config, build, flat, read_toml
+from udrl.errors import RunFailed
 from udrl_experiments.jobs import Job
 from udrl_experiments.study_progress import job_progress
 from udrl_inspect.inspection import read_status
@@ -66,10 +67,10 @@ def test_a_comparison_is_interrupted_and_goes_on(
 
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), *SETTINGS, *whole).finish()
     assert code == 2
-    assert "holds a study already; resume it with --resume" in error
+    assert "already contains a study; pass --resume to resume it" in error
     code, _, error = cli("study", "lander", "--folder", str(tmp_path), "--resume").finish()
     assert code == 2
-    assert "which is not in this one; give the options that it was begun with" in error
+    assert "which is not in this one; pass the original options" in error
 
     folder = study("lander", *whole, "--resume", root=tmp_path)
     assert first.stat().st_mtime_ns == done_at
@@ -189,6 +190,30 @@ def test_a_search_over_a_space_of_ones_own(study: Callable[..., Path], tmp_path:
     assert all(float(r["score"]) > 0 for r in rows(folder / "scores.csv"))
     best = read_toml(folder / "udrl-CartPole-v1.toml")
     assert (best["batch_size"], best["n_updates_per_iter"]) == (32, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_failed_run_of_a_search_is_reported_in_one_line(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    space = tmp_path / "mine.toml"
+    # The warm-up alone is longer than the run.
+    space.write_text("[UDRL]\nn_warm_up_episodes = [1000]\nbatch_size = [32, 33]\n")
+    code, output, error = cli(
+        "study", "search", "CartPole-v1", "--space", str(space), "--folder", str(tmp_path),
+        "--configurations", "1", "--max-env-steps", str(STEPS), *SEARCH,
+    ).finish(200)  # fmt: skip
+    assert code == RunFailed.exit_code
+    (run,) = runs_of(tmp_path, "udrl")
+    described = "UDRL configuration 0, CartPole-v1, seed 1: 2,000 env steps"
+    cause = f"the run in {run} ended without an evaluation within 2,000 env steps; raise "
+    lines = error.splitlines()
+    assert lines[0].startswith("1 runs on Ray Tune")
+    assert lines[1] == described
+    assert lines[2].startswith(f"failed: {described}: {cause}")
+    assert lines[3].startswith(f"udrl: error: no run succeeded; the first failed: {cause}")
+    assert (output, len(lines)) == ("", 4)
 
 
 @pytest.mark.slow
