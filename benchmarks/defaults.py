@@ -78,7 +78,7 @@ def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
         steps[run.iteration] = run.env_steps
 
     began = time.process_time()
-    run = algorithm1(settings.config, settings.budget, report=note, left_open=settings.left_open)
+    run = algorithm1(settings.config, settings.budget, report=note, automatic=settings.automatic)
     return Curve(
         _random_return(settings.config),
         [(steps[i - 1], e.mean) for i, e in sorted(run.evaluations.items())],

@@ -27,7 +27,7 @@ from tests.markdown import (
 )
 from tests.proto.strategies import setting_fields
 from udrl import errors
-from udrl.config import OPEN, Budget, Config, preset, preset_names, read_toml
+from udrl.config import AUTOMATIC, Budget, Config, preset, preset_names, read_toml
 from udrl.errors import UdrlError
 from udrl_launch.settings import Fleet, gather
 from udrl_launch.supervisor import FINAL_CODES
@@ -115,7 +115,7 @@ def test_every_setting_is_documented_with_its_type_default_and_range(
     expected = {}
     for field in setting_fields(kind):
         name, allowed = described(field.type)
-        if field.name in OPEN:
+        if field.name in AUTOMATIC:
             allowed += ", or `auto`" if allowed else "or `auto`"
         expected[f"`{field.name}`"] = [name, default_of(field), allowed]
     rows = records(section("docs/configuration.md", heading), "setting")

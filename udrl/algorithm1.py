@@ -16,8 +16,8 @@ from udrl.evaluation import Evaluation, summarise
 from udrl.fitting import fit
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
-from udrl.numerics import settle
-from udrl.offline import settle_dataset
+from udrl.numerics import resolve_arithmetic
+from udrl.offline import resolve_dataset
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
@@ -76,7 +76,7 @@ def algorithm1(
     budget: Budget,
     n_environments: int = 16,
     report: Callable[[Run], None] = lambda run: None,
-    left_open: Collection[str] = (),
+    automatic: Collection[str] = (),
 ) -> Run:
     """Train with Algorithm 1 until a stopping criterion is met, and return the final state.
 
@@ -85,7 +85,7 @@ def algorithm1(
         budget: stopping criteria.
         n_environments: episodes generated at the same time; affects speed, not the result.
         report: called after every iteration.
-        left_open: names of automatic settings (:mod:`udrl.fitting`).
+        automatic: names of automatic settings (:mod:`udrl.fitting`).
 
     Raises:
         ConfigError: ``lead`` is not 0, or other settings cannot be used.
@@ -95,9 +95,9 @@ def algorithm1(
         raise ConfigError(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
-    config = settle(fit(config, left_open))
+    config = resolve_arithmetic(fit(config, automatic))
     generator = EpisodeGenerator(config, n_environments)
-    config, offline = settle_dataset(config, generator.spec)
+    config, offline = resolve_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
 

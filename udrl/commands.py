@@ -181,7 +181,7 @@ class CommandSampler:
         n = episodes_due(self._settings, buffer)
         u, w, x = self._stream(iteration).uniforms(3 * n).reshape(3, n).tolist()
         desired = [
-            self._target.settle(*choose_command(self._strategy, best, number)) for number in u
+            self._target.initial(*choose_command(self._strategy, best, number)) for number in u
         ]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
@@ -220,7 +220,7 @@ class CommandSampler:
     def _evaluation(self, iteration: int, first: int, buffer: ReplayBuffer) -> list[Command]:
         evaluation = self._config.evaluation
         best = Best.of(buffer.best(self._settings.last_few))
-        c0 = self._target.settle(best.mean, best.horizon)
+        c0 = self._target.initial(best.mean, best.horizon)
         seeds = EVALUATION_SEEDS if evaluation.eval_seeds == "final" else SEARCH_SEEDS
         commands = self._commands(
             "evaluate", iteration, first, [c0] * evaluation.eval_episodes, seeds

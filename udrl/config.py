@@ -140,7 +140,7 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
 
 
 #: Settings that accept ``auto``, with placeholders until :mod:`udrl.fitting` chooses values.
-OPEN: Mapping[str, Any] = {
+AUTOMATIC: Mapping[str, Any] = {
     "observe_time": False,
     "return_scale": 1.0,
     "horizon_scale": 1.0,

@@ -14,9 +14,9 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import CommandSampler
-from udrl.config import OPEN, Config, change
+from udrl.config import AUTOMATIC, Config, change
 from udrl.episode import Episode
-from udrl.offline import settle_dataset
+from udrl.offline import resolve_dataset
 
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500
@@ -37,14 +37,14 @@ _WARM_UP, _WARM_UP_STEPS = 50, 4_000
 _MIN_LAMBDA, _REACH = 0.95, 4.0
 
 
-def fit(config: Config, left_open: Collection[str]) -> Config:
+def fit(config: Config, automatic: Collection[str]) -> Config:
     """Return the settings of a new run, with values for the automatic ones.
 
     This makes one environment, and only if a setting is automatic.
 
     Args:
         config: the settings; the values of automatic ones are ignored.
-        left_open: names of the automatic settings, among :data:`udrl.config.OPEN`.
+        automatic: names of the automatic settings, among :data:`udrl.config.OPEN`.
 
     Raises:
         ConfigError: the settings are not compatible with the chosen values, or the dataset cannot
@@ -52,16 +52,16 @@ def fit(config: Config, left_open: Collection[str]) -> Config:
         UnsupportedEnvironment: the environment does not exist or is not supported.
         EnvironmentFault: the environment failed three times under the same command.
     """
-    if not left_open:
+    if not automatic:
         return config
     with closing(EpisodeGenerator(config, 1)) as generator:
-        _, offline = settle_dataset(config, generator.spec)
-        return choose(config, left_open, generator, offline)
+        _, offline = resolve_dataset(config, generator.spec)
+        return choose(config, automatic, generator, offline)
 
 
 def choose(
     config: Config,
-    left_open: Collection[str],
+    automatic: Collection[str],
     generator: EpisodeGenerator,
     episodes: Sequence[Episode] | None = None,
 ) -> Config:
@@ -69,7 +69,7 @@ def choose(
 
     Args:
         config: the settings; the values of automatic ones are ignored.
-        left_open: names of the automatic settings, among :data:`udrl.config.OPEN`.
+        automatic: names of the automatic settings, among :data:`udrl.config.OPEN`.
         generator: runs the first commands of the warm-up.
         episodes: episodes to use instead of these.
 
@@ -77,13 +77,13 @@ def choose(
         ConfigError: the settings are not compatible with the chosen values.
         EnvironmentFault: the environment failed three times under the same command.
     """
-    assert OPEN.keys() >= set(left_open)
+    assert AUTOMATIC.keys() >= set(automatic)
     hold, n_warm_up = config.commands.warm_up_hold, config.commands.n_warm_up_episodes
     if episodes is not None:
         sample = Sample()
         for episode in episodes:
             sample.add(episode)
-    elif {"warm_up_hold", "hold_steps"}.isdisjoint(left_open):
+    elif {"warm_up_hold", "hold_steps"}.isdisjoint(automatic):
         sample = _play(config, generator, hold)
     else:
         hold, sample = _best_hold(config, generator)
@@ -111,7 +111,7 @@ def choose(
         "held_rate": _STOCHASTIC_RATE if stochastic else _RATE,
         "hold_steps": hold,
     }
-    return change(config, **{name: chosen[name] for name in left_open})
+    return change(config, **{name: chosen[name] for name in automatic})
 
 
 class Sample:

@@ -22,7 +22,7 @@ PROBE_ROWS = 16
 PROBE_CHOICES = 64
 
 
-def settle(config: Config) -> Config:
+def resolve_arithmetic(config: Config) -> Config:
     """Return settings with ``device`` and ``precision`` chosen for this machine if ``auto``."""
     device, precision = config.arithmetic.device, config.arithmetic.precision
     if device == "auto":
@@ -32,7 +32,7 @@ def settle(config: Config) -> Config:
     return change(config, device=device, precision=precision)
 
 
-def settle_as(held: Config, config: Config) -> Config:
+def resolve_as(held: Config, config: Config) -> Config:
     """Return settings with the choices of an existing run for what ``config`` does not specify.
 
     Args:

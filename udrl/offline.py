@@ -69,7 +69,7 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
     return episodes
 
 
-def settle_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[Episode] | None]:
+def resolve_dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[Episode] | None]:
     """Return the settings of a new run, completed from its dataset, and the dataset's episodes.
 
     Raises:

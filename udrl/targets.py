@@ -42,7 +42,7 @@ class ReturnInTime:
         """Factors on return and horizon at the networks' input (section 3.2)."""
         return self._network.return_scale, self._network.horizon_scale
 
-    def settle(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
+    def initial(self, desired_return: float, desired_horizon: int) -> tuple[float, int]:
         """Return c_0: the horizon is at least 1; if it follows the return, both are integers."""
         if self.horizon_follows:
             desired_horizon = max(1, min(math.floor(desired_return), 2**31))

@@ -23,7 +23,7 @@ from udrl.config import Config, KeywordValue, change
 from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
 from udrl.memory import FrameStack
-from udrl.numerics import settle
+from udrl.numerics import resolve_arithmetic
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments.protocol import BaselineAlgorithm
 from udrl_experiments.records import EvaluationRecord
@@ -111,7 +111,7 @@ def run(
 
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    config, hyperparameters = settle(baseline.config), baseline.complete()
+    config, hyperparameters = resolve_arithmetic(baseline.config), baseline.complete()
     path = folder / "state.safetensors"
     tensors: dict[str, Tensor] = {}
     if path.exists():

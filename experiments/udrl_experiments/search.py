@@ -12,7 +12,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
-from udrl.config import OPEN, Config, build, change, flat, preset
+from udrl.config import AUTOMATIC, Config, build, change, flat, preset
 from udrl.errors import ConfigError
 from udrl.fitting import fit
 from udrl.spaces import Image, Vector
@@ -136,12 +136,12 @@ def search_environment(
     own = {"seed": 1, "eval_seeds": "search", "eval_every": EVAL_EVERY}
     # A drawn setting must not be `auto`. Any of its values will do here.
     drawn = {
-        name: values[0] for name, values in space.lists.get("UDRL", {}).items() if name in OPEN
+        name: values[0] for name, values in space.lists.get("UDRL", {}).items() if name in AUTOMATIC
     }
     with space.errors_of("UDRL"):
         build(Config, {"environment": environment} | drawn)
     settings = gather(environment, options=own | drawn, assignments=plan.assignments)
-    config = fit(settings.config, settings.left_open)
+    config = fit(settings.config, settings.automatic)
     others = [algorithm for algorithm in chosen if algorithm != "UDRL"]
     with closing(EpisodeGenerator(shared(config) if others else config, 1)) as generator:
         spec = generator.spec
@@ -153,7 +153,7 @@ def search_environment(
             f"{environment} with {', '.join(others)}: expected discrete actions and one vector or "
             f"image as observation; search with --algorithm UDRL"
         )
-    written = {name: flat(config)[name] for name in (*sorted(settings.left_open), *assigned)}
+    written = {name: flat(config)[name] for name in (*sorted(settings.automatic), *assigned)}
     subject = Subject(space, chosen, config, {"environment": environment} | written)
     return _study(f"search-{_file_name(environment)}", plan, [subject], configurations)
 

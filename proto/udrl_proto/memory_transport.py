@@ -41,7 +41,7 @@ class MemoryTransport:
             return
         query = _MemoryQuery(data)
         receive(query)
-        query.settled.wait(timeout_s)
+        query.completed.wait(timeout_s)
         if query.answer is not None:
             yield query.answer
 
@@ -104,7 +104,7 @@ class _MemoryQuery:
     def __init__(self, data: bytes) -> None:
         self._data = data
         self.answer: Answer | None = None
-        self.settled = threading.Event()
+        self.completed = threading.Event()
 
     @property
     def data(self) -> bytes:
@@ -112,10 +112,10 @@ class _MemoryQuery:
 
     def reply(self, answer: Answer) -> None:
         self.answer = answer
-        self.settled.set()
+        self.completed.set()
 
     def drop(self) -> None:
-        self.settled.set()
+        self.completed.set()
 
 
 def _matches(pattern: str, key: str) -> bool:

@@ -9,7 +9,7 @@ from hypothesis import given
 
 from tests.proto.strategies import configs
 from udrl.config import (
-    OPEN,
+    AUTOMATIC,
     Budget,
     Config,
     build,
@@ -181,9 +181,9 @@ def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str)
 
 def test_the_preset_for_any_environment_leaves_settings_open() -> None:
     values = preset("any")
-    left_open = {name for name, value in values.items() if value == "auto"}
-    assert left_open == OPEN.keys()
-    build(Config, {n: v for n, v in values.items() if n not in OPEN} | {"environment": "X-v0"})
+    automatic = {name for name, value in values.items() if value == "auto"}
+    assert automatic == AUTOMATIC.keys()
+    build(Config, {n: v for n, v in values.items() if n not in AUTOMATIC} | {"environment": "X-v0"})
 
 
 def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
-from udrl.config import OPEN, Budget, Config, build, change
+from udrl.config import AUTOMATIC, Budget, Config, build, change
 from udrl.episode import Episode
 from udrl.fitting import Sample, choose, fit, fits
 
@@ -81,7 +81,7 @@ def test_what_is_given_stays() -> None:
 
 
 def test_the_choice_does_not_depend_on_how_many_environments_there_are() -> None:
-    fitted = [choose(config(), OPEN, EpisodeGenerator(config(), n)) for n in (1, 7)]
+    fitted = [choose(config(), AUTOMATIC, EpisodeGenerator(config(), n)) for n in (1, 7)]
     assert fitted[0] == fitted[1]
     assert 0.01 < fitted[0].network.return_scale < 0.1
 
@@ -92,7 +92,7 @@ def test_algorithm_1_chooses_them() -> None:
     fitted = fit(config(**small), SCALES)
     budget = Budget(max_env_steps=300)
     ways = [
-        algorithm1(config(**small), budget, left_open=SCALES),
+        algorithm1(config(**small), budget, automatic=SCALES),
         algorithm1(fitted, budget),
     ]
     assert ways[0].weights_sha256 == ways[1].weights_sha256
@@ -177,7 +177,7 @@ def test_lambda_follows_the_length_of_episodes(length: int, expected: float) -> 
 def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
     endless = config(environment=Endless.id)
     with closing(EpisodeGenerator(endless, 1)) as generator:
-        fitted = choose(endless, OPEN, generator)
+        fitted = choose(endless, AUTOMATIC, generator)
     assert Endless.steps <= 60_000
     assert fitted.network.horizon_scale == 0.0005
     assert fitted.commands.n_warm_up_episodes == 50
@@ -191,7 +191,7 @@ def test_short_episodes_are_many_in_the_warm_up() -> None:
 
 def test_a_dataset_decides_how_many_episodes_the_warm_up_has() -> None:
     settings = config(n_warm_up_episodes=3)
-    fitted = choose(settings, OPEN, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
+    fitted = choose(settings, AUTOMATIC, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
     assert fitted.commands.n_warm_up_episodes == 3
     assert fitted.commands.warm_up_hold == 1
 

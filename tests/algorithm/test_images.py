@@ -17,7 +17,7 @@ from udrl.config import Config, build
 from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.numerics import settle, settle_as
+from udrl.numerics import resolve_arithmetic, resolve_as
 from udrl.replay import Entry, ReplayBuffer
 from udrl.segments import Experience
 from udrl.spaces import Image
@@ -208,17 +208,17 @@ def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch
     for fast, cuda in ((True, False), (False, True)):
         monkeypatch.setattr(numerics, "_is_fast_in_bfloat16", lambda fast=fast: fast)
         monkeypatch.setattr(numerics, "has_cuda", lambda cuda=cuda: cuda)
-        settled = settle(automatic)
-        assert settled.arithmetic.precision == ("bfloat16" if fast else "float32")
-        assert settled.arithmetic.device == ("cuda" if cuda else "cpu")
-        assert settle(settled) == settled
+        resolved = resolve_arithmetic(automatic)
+        assert resolved.arithmetic.precision == ("bfloat16" if fast else "float32")
+        assert resolved.arithmetic.device == ("cuda" if cuda else "cpu")
+        assert resolve_arithmetic(resolved) == resolved
 
 
 def test_resumed_run_keeps_what_was_settled() -> None:
     held = settings(precision="bfloat16", device="cpu", seed=3)
-    assert settle_as(held, settings(precision="auto", device="auto", seed=3)) == held
+    assert resolve_as(held, settings(precision="auto", device="auto", seed=3)) == held
     asked = settings(precision="float32", device="auto", seed=3)
-    assert settle_as(held, asked).arithmetic.precision == "float32"
+    assert resolve_as(held, asked).arithmetic.precision == "float32"
 
 
 @pytest.mark.parametrize(

@@ -26,14 +26,14 @@ def test_desired_return_never_exceeds_the_cap() -> None:
 
 @pytest.mark.parametrize(("horizon", "said"), [(7, 7), (0, 1), (-3, 1)])
 def test_horizon_is_one_step_at_least(horizon: int, said: int) -> None:
-    assert target().settle(2.5, horizon) == (2.5, said)
+    assert target().initial(2.5, horizon) == (2.5, said)
 
 
 @pytest.mark.parametrize(
     ("desired_return", "said"), [(300.7, 300), (0.4, 1), (-5.0, 1), (1e12, 2**31)]
 )
 def test_horizon_that_follows_is_the_return_as_an_integer(desired_return: float, said: int) -> None:
-    assert target(desired_horizon="return").settle(desired_return, 99) == (said, said)
+    assert target(desired_horizon="return").initial(desired_return, 99) == (said, said)
 
 
 def test_networks_read_it_bounded_and_scaled() -> None:

@@ -127,7 +127,7 @@ def test_any_environment_is_searched_from_the_settings_of_a_training(mine: Path)
         (algorithm, seed) for algorithm in ("UDRL", "PPO") for _ in range(2) for seed in (1, 2)
     ]
     settings = gather("MountainCar-v0", options={"seed": 1}, assignments=plan.assignments)
-    fitted = fit(settings.config, settings.left_open)
+    fitted = fit(settings.config, settings.automatic)
     drawn = read_space("MountainCar-v0", mine).draw("UDRL", 1)
     assert study.jobs[3].config == change(
         fitted, seed=2, eval_seeds="search", eval_every=50_000, **drawn
@@ -156,7 +156,7 @@ def test_the_best_settings_of_any_environment_are_those_that_were_run(
     study.report(place)
     written = read_toml(place.folder / "udrl-MountainCar-v0.toml")
     again = gather("MountainCar-v0", options=written, assignments=())
-    assert not again.left_open
+    assert not again.automatic
     assert change(again.config, eval_seeds="search", eval_every=50_000) == run.config
 
 

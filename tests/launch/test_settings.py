@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from udrl.config import OPEN, preset, preset_names
+from udrl.config import AUTOMATIC, preset, preset_names
 from udrl.errors import ConfigError
 from udrl_launch.settings import gather
 from udrl_launch.subcommands.train_command import warn_of_idle_environments
@@ -24,16 +24,16 @@ def test_another_preset_can_be_named() -> None:
 
 def test_without_a_preset_of_its_own_an_environment_gets_that_for_any() -> None:
     settings = gather("Figure2-v0", options={})
-    assert settings.left_open == OPEN.keys()
+    assert settings.automatic == AUTOMATIC.keys()
     assert settings.config.buffer.max_age == preset("any")["max_age"]
-    assert gather("Figure2-v0", preset_name="none", options={}).left_open == frozenset()
+    assert gather("Figure2-v0", preset_name="none", options={}).automatic == frozenset()
 
 
 def test_a_setting_is_left_open_or_has_a_value() -> None:
     settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["warm_up_hold=4"])
-    assert settings.left_open == OPEN.keys() - {"return_scale", "warm_up_hold"}
+    assert settings.automatic == AUTOMATIC.keys() - {"return_scale", "warm_up_hold"}
     assert settings.config.network.return_scale == 0.5
-    assert gather("CartPole-v1", options={}, assignments=["warm_up_hold=auto"]).left_open == {
+    assert gather("CartPole-v1", options={}, assignments=["warm_up_hold=auto"]).automatic == {
         "warm_up_hold"
     }
 
@@ -41,13 +41,13 @@ def test_a_setting_is_left_open_or_has_a_value() -> None:
 def test_all_segments_go_without_a_baseline() -> None:
     settings = gather("Figure2-v0", options={"segments": "all"})
     assert settings.config.network.baseline == "none"
-    assert "baseline" in settings.left_open
+    assert "baseline" in settings.automatic
 
 
 def test_a_run_that_exists_keeps_what_was_chosen_for_it() -> None:
     stored = {"return_scale": 0.5, "last_few": 4}
     settings = gather("Figure2-v0", stored=stored, options={}, assignments=["return_scale=auto"])
-    assert settings.left_open == frozenset()
+    assert settings.automatic == frozenset()
     assert settings.config.network.return_scale == 0.5
 
 

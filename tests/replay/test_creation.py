@@ -58,7 +58,7 @@ def test_spaces_are_those_after_settings_are_chosen(
     environment: str, shown: bool, tmp_path: Path
 ) -> None:
     config = Config(environment=environment)
-    with closing(creation.create(tmp_path, config, left_open=["observe_time"])) as store:
+    with closing(creation.create(tmp_path, config, automatic=["observe_time"])) as store:
         hello = store.fact("hello", Hello)
     assert hello.config.observe_time is shown
     with closing(EpisodeGenerator(hello.config, 1)) as generator:

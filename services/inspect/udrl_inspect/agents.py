@@ -214,7 +214,7 @@ def evaluation_commands(
     sampler = CommandSampler(config, agent.environment)
     commands = sampler.evaluate_final(agent.iteration, agent.buffer)
     default = commands[0]
-    desired = ReturnInTime(config.network).settle(
+    desired = ReturnInTime(config.network).initial(
         default.desired_return if desired_return is None else desired_return,
         default.desired_horizon if desired_horizon is None else desired_horizon,
     )

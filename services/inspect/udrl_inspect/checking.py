@@ -77,12 +77,12 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     advice: tuple[str, ...]
 
 
-def check(config: Config, left_open: Collection[str] = ()) -> Check:
+def check(config: Config, automatic: Collection[str] = ()) -> Check:
     """Create an environment, check it, and play random episodes.
 
     Args:
         config: the settings of a run.
-        left_open: settings to choose automatically (:mod:`udrl.fitting`).
+        automatic: settings to choose automatically (:mod:`udrl.fitting`).
 
     Raises:
         UnsupportedEnvironment: it cannot be created or is not supported.
@@ -95,7 +95,7 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
     env.close()
     with closing(EpisodeGenerator(config, 1)) as generator:
         memory = (_memory() - before) / 2  # two were created
-        fitted = choose(config, left_open, generator) if left_open else config
+        fitted = choose(config, automatic, generator) if automatic else config
     env = make_environment(fitted)  # what is chosen may add to the observations
     declared = env.observations.declared, env.actions.declared
     env.close()
@@ -128,7 +128,7 @@ def check(config: Config, left_open: Collection[str] = ()) -> Check:
         step_s=step_s,
         memory_mib=round(max(0.0, memory) / _MIB, 1),
         step_bytes=spec.step_bytes,
-        chosen={name: flat(fitted)[name] for name in sorted(left_open)},
+        chosen={name: flat(fitted)[name] for name in sorted(automatic)},
         advice=tuple(advice),
     )
 

@@ -68,7 +68,7 @@ def open_run(
             if listen is not None:
                 sessions.check_listening(listen, insecure=insecure, secure=secure)
             store = create(
-                run_dir, settings.config, left_open=settings.left_open, allow_inexact=allow_inexact
+                run_dir, settings.config, automatic=settings.automatic, allow_inexact=allow_inexact
             )
     with closed_on_error(store):
         write_config(run_dir, config_of(store), settings.budget)

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from udrl.config import (
-    OPEN,
+    AUTOMATIC,
     Budget,
     Config,
     build,
@@ -111,14 +111,14 @@ class Settings(NamedTuple):
         config: the settings that define the run.
         budget: when it ends.
         fleet: its parallelism.
-        left_open: settings of ``config`` that are chosen automatically when the run is created
+        automatic: settings of ``config`` that are chosen automatically when the run is created
             (:mod:`udrl.fitting`). Until then their values have no meaning.
     """
 
     config: Config
     budget: Budget
     fleet: Fleet
-    left_open: frozenset[str] = frozenset()
+    automatic: frozenset[str] = frozenset()
 
     @property
     def envs_per_actor(self) -> int:
@@ -174,17 +174,17 @@ def gather(
     kinds = (Config, Budget, Fleet)
     refuse_unknown(values, tuple(name for kind in kinds for name in setting_names(kind)))
 
-    left_open = {n for n in OPEN if values.get(n) == _AUTO}
-    values |= {name: OPEN[name] for name in left_open}
-    if "baseline" in left_open and values.get("segments") == "all":
+    automatic = {n for n in AUTOMATIC if values.get(n) == _AUTO}
+    values |= {name: AUTOMATIC[name] for name in automatic}
+    if "baseline" in automatic and values.get("segments") == "all":
         values["baseline"] = "none"  # the only one that supports them
     if stored is not None:  # these were chosen when the run was created
-        values |= {name: stored[name] for name in left_open if name in stored}
-        left_open.clear()
+        values |= {name: stored[name] for name in automatic if name in stored}
+        automatic.clear()
 
     def part(kind: type[Kind]) -> Kind:
         return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)
     refuse_ineffective(config, assigned)
-    return Settings(config, part(Budget), part(Fleet), frozenset(left_open))
+    return Settings(config, part(Budget), part(Fleet), frozenset(automatic))

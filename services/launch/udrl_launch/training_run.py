@@ -133,7 +133,7 @@ def train(
         run_dir, settings, resume=resume, allow_inexact=allow_inexact, listen=endpoint,
         insecure=insecure, secure=keys is not None,
     )  # fmt: skip
-    settings = settings._replace(config=config_of(store), left_open=frozenset())
+    settings = settings._replace(config=config_of(store), automatic=frozenset())
     with ExitStack() as closing_store:
         closing_store.callback(store.close)
         progress = StoredRun(store, settings.budget).progress

@@ -18,8 +18,8 @@ from udrl.episode import Episode
 from udrl.errors import StoreError
 from udrl.fitting import fit
 from udrl.graph import acting_graph
-from udrl.numerics import settle
-from udrl.offline import settle_dataset
+from udrl.numerics import resolve_arithmetic
+from udrl.offline import resolve_dataset
 from udrl.repeating import repeated_digest
 from udrl.strategies import make_strategy
 from udrl.version import __version__
@@ -59,7 +59,7 @@ def create(
     run_dir: Path,
     config: Config,
     *,
-    left_open: Collection[str] = (),
+    automatic: Collection[str] = (),
     allow_inexact: bool = False,
 ) -> Store:
     """Create a new run.
@@ -71,7 +71,7 @@ def create(
     Args:
         run_dir: its directory.
         config: its settings.
-        left_open: settings to choose by properties of the environment (:mod:`udrl.fitting`).
+        automatic: settings to choose by properties of the environment (:mod:`udrl.fitting`).
         allow_inexact: accept services of other numerics classes.
 
     Raises:
@@ -81,7 +81,7 @@ def create(
         StoreError: the directory already holds a run, or cannot be written.
     """
     with no_empty_folder_left(run_dir):
-        return _create(run_dir.absolute(), config, left_open, allow_inexact=allow_inexact)
+        return _create(run_dir.absolute(), config, automatic, allow_inexact=allow_inexact)
 
 
 @contextmanager
@@ -96,16 +96,16 @@ def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
 
 
 def _create(
-    run_dir: Path, config: Config, left_open: Collection[str], *, allow_inexact: bool
+    run_dir: Path, config: Config, automatic: Collection[str], *, allow_inexact: bool
 ) -> Store:
     make_strategy(config)
-    if left_open:
+    if automatic:
         log.info("choosing settings by random episodes of %s", config.environment)
-    config = settle(fit(config, left_open))
+    config = resolve_arithmetic(fit(config, automatic))
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First and in a fresh instance, as actors do.
         digest = repeated_digest(generator)
-        config, offline = settle_dataset(config, generator.spec)
+        config, offline = resolve_dataset(config, generator.spec)
     exact = digest != ""
     progress = RunProgress(exact=exact)
     if not exact:

@@ -250,7 +250,7 @@ def contents(run: RunState) -> Contents:
     # The best episode is always shown.
     shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
     best = Best.of(run.buffer.best(config.commands.last_few)) if entries else None
-    evaluated = best and ReturnInTime(config.network).settle(best.mean, best.horizon)
+    evaluated = best and ReturnInTime(config.network).initial(best.mean, best.horizon)
     commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
     return Contents(
         iteration=max(run.progress.iteration, 0),

@@ -12,7 +12,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.commands import CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Config, flat
 from udrl.errors import EnvironmentFault, OtherConfiguration
-from udrl.numerics import settle_as
+from udrl.numerics import resolve_as
 from udrl.repeating import difference, environment_digest
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
@@ -44,7 +44,7 @@ def resume(
     store = Store(run_dir)
     with closed_on_error(store):
         hello = store.fact("hello", Hello)
-        held, asked = flat(hello.config), flat(settle_as(hello.config, config))
+        held, asked = flat(hello.config), flat(resolve_as(hello.config, config))
         different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
         if different:
             raise OtherConfiguration(

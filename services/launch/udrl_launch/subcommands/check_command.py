@@ -29,7 +29,7 @@ def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bo
     Example: udrl check your_package.your_module:YourEnv-v0
     """
     settings = gather(env, file=file, assignments=assignments, options={})
-    found = check_environment(settings.config, settings.left_open)
+    found = check_environment(settings.config, settings.automatic)
     if as_json:
         print_json(found)
         return 0
