@@ -23,9 +23,6 @@ MIN_DEVIATION = 3e-3
 #: whose rounding IEEE 754 defines, so the result does not depend on the processor's instructions.
 SQUAREPLUS = 2.0
 
-#: Relative desired returns are clipped to this many deviations.
-DEVIATIONS = 2.0
-
 #: Normalised observations are clipped to this many deviations from their mean.
 NORMAL_BOUND = 10.0
 

@@ -178,6 +178,7 @@ class Batches:
         self._actions = torch.empty(*n, *experience.action_shape, dtype=torch.int64)
         self._device = config.arithmetic.device
         self._scales = np.array(ReturnInTime(config.network).scales)
+        self._bound = config.network.advantage_bound
 
     def gather(self, *, hide: bool = False) -> Iterator[Batch]:
         """Yield the batches of all updates.
@@ -213,7 +214,9 @@ class Batches:
         command[:] = (examples.command * self._scales).reshape(command.shape)
         if (expected := self._experience.expected_at(flat)) is not None:
             commands = self._commands[:n]
-            commands[:] = relative(commands, torch.from_numpy(expected).view(commands.shape))
+            commands[:] = relative(
+                commands, torch.from_numpy(expected).view(commands.shape), self._bound
+            )
         action[:] = examples.action.reshape(action.shape)
         return n
 

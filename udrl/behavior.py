@@ -49,6 +49,7 @@ class BehaviorFunction(nn.Module):
             self.custom = make_custom(network, spec)
         else:
             self._assemble(spec, network, precision)
+        self._bound = network.advantage_bound
         self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
     def _assemble(
@@ -84,7 +85,7 @@ class BehaviorFunction(nn.Module):
         state, *others = states or (None, None)
         if self.value is not None:
             with torch.no_grad():
-                command = relative(command, self.value(seen, others[0]))
+                command = relative(command, self.value(seen, others[0]), self._bound)
         return self.forward_relative(seen, command, state)
 
     def forward_relative(

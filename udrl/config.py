@@ -161,6 +161,7 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "memory_size": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "memory_window": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
+    "advantage_bound": (lambda config: config.network.baseline != "none", "a baseline"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),
 }

@@ -23,7 +23,6 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
 from udrl.architecture import (
-    DEVIATIONS,
     FILTER,
     FORBIDDEN,
     MIN_DEVIATION,
@@ -226,11 +225,9 @@ class _Builder(Nodes):
         deviation = self.append("Mul", self.append("Add", d, root), self.number(0.5))
         deviation = self.append("Add", deviation, self.number(MIN_DEVIATION))
         above = self.append("Sub", self.column(command, 0), self.column(expected, 0))
+        bound = self._network.advantage_bound
         bounded = self.append(
-            "Clip",
-            self.append("Div", above, deviation),
-            self.number(-DEVIATIONS),
-            self.number(DEVIATIONS),
+            "Clip", self.append("Div", above, deviation), self.number(-bound), self.number(bound)
         )
         return self.append("Concat", bounded, self.column(command, 1), axis=1)
 

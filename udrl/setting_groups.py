@@ -67,6 +67,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
         baseline: baseline of desired returns at the network's input. ``none``: none, as in the
             paper. ``value``: a learned value function. ``action_value``: the same, with examples
             labelled with the average outcome of their action (:mod:`udrl.value`).
+        advantage_bound: with a ``baseline``, largest absolute value of relative desired returns, in
+            mean deviations of the return.
     """
 
     behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -82,6 +84,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     horizon_scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.01
     desired_horizon: Literal["mean", "return"] = "mean"
     baseline: Literal["none", "value", "action_value"] = "none"
+    advantage_bound: Annotated[float, Meta(gt=0, le=1000)] = 2.0
 
 
 class ActionSettings(SettingsGroup, frozen=True, kw_only=True):

@@ -9,7 +9,9 @@ D(s), the mean absolute deviation of returns from V(s). They are used in two way
   replaces the rewards that follow (``return_lambda``).
 - The behavior function reads (desired return - V(s)) / D(s). In training this is the generalised
   advantage estimate of Schulman et al. (2016), in units comparable between states. In acting it
-  demands better or worse results than usual, until V(s) equals the desired return.
+  demands better or worse results than usual, until V(s) equals the desired return. Values are
+  clipped to ``advantage_bound``; the larger it is, the further the agent goes beyond what it has
+  usually done.
 
 In stochastic environments, advantages are mostly luck, and an agent that is commanded to obtain
 high ones takes risks. With ``baseline = "action_value"`` a third network, the critic, learns
@@ -21,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from udrl.action_losses import of_action
-from udrl.architecture import DEVIATIONS, MIN_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
+from udrl.architecture import MIN_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.encoders import apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.recurrence import Memory
@@ -131,12 +133,13 @@ def value_loss(expected: Tensor, label: Tensor) -> Tensor:
     return error.square().mean() + (error.detach().abs() - expected[:, 1]).square().mean()
 
 
-def relative(command: Tensor, expected: Tensor) -> Tensor:
+def relative(command: Tensor, expected: Tensor, bound: float) -> Tensor:
     """Return scaled commands, [..., 2], with the desired return relative to V(s) and D(s).
 
     Args:
         command: (desired return, desired horizon), each scaled, float32 [..., 2].
         expected: (V(s), D(s)), float32 [..., 2].
+        bound: largest absolute value of relative returns (``advantage_bound``).
     """
     above = (command[..., 0] - expected[..., 0]) / expected[..., 1]
-    return torch.stack([above.clamp(-DEVIATIONS, DEVIATIONS), command[..., 1]], dim=-1)
+    return torch.stack([above.clamp(-bound, bound), command[..., 1]], dim=-1)

@@ -68,6 +68,7 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {"desired_horizon": "return", "activation": "tanh"}),
     (VECTOR, {"frame_stack": 3}),
     (VECTOR, {"baseline": "value"}),
+    (VECTOR, {"baseline": "value", "advantage_bound": 6.0}),
     (VECTOR, {"baseline": "value", "desired_horizon": "return"}),
     (VECTOR, {"baseline": "action_value"}),
     (CATEGORY, {}),

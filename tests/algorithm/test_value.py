@@ -132,7 +132,7 @@ def test_steps_come_one_after_another_in_parts() -> None:
 
 def test_a_relative_return_is_in_deviations_and_bounded() -> None:
     command = torch.tensor([[3.0, 0.1], [1.0, 0.2], [90.0, 0.3], [-90.0, 0.4]])
-    got = relative(command, torch.tensor([[1.0, 2.0]] * 4))
+    got = relative(command, torch.tensor([[1.0, 2.0]] * 4), 2.0)
     torch.testing.assert_close(got, torch.tensor([[1.0, 0.1], [0.0, 0.2], [2.0, 0.3], [-2.0, 0.4]]))
 
 
