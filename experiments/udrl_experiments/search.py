@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from statistics import fmean
@@ -52,6 +53,7 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
         score: mean of the last 20 evaluations (Appendix B), mean over the runs; none if a run
             failed.
         settings: drawn settings, as JSON.
+        final_score: the same of the longer runs in the final; none for other configurations.
     """
 
     environment: str
@@ -60,6 +62,19 @@ class Scored(msgspec.Struct, frozen=True, kw_only=True):
     seeds: int
     score: float | None
     settings: str
+    final_score: float | None = None
+
+
+class Final(NamedTuple):
+    """Longer runs of the best configurations, after the search.
+
+    Attributes:
+        configurations: number of configurations per environment and algorithm.
+        max_env_steps: length of each run.
+    """
+
+    configurations: int
+    max_env_steps: int
 
 
 class Subject(NamedTuple):
@@ -83,6 +98,7 @@ def search(
     tasks: Sequence[Task],
     algorithms: Sequence[Algorithm] = (),
     configurations: int | None = None,
+    final: Final | None = None,
 ) -> Study:
     """Return the study ``search`` of the paper's tasks, over the spaces of Appendix B.
 
@@ -91,6 +107,7 @@ def search(
         tasks: tasks to search on.
         algorithms: algorithms to search; none: all in the space.
         configurations: number of configurations per algorithm; None: the scale's.
+        final: longer runs of the best configurations; None: none.
 
     Raises:
         ConfigError: an algorithm is not in the space, or a setting is unknown or invalid.
@@ -102,7 +119,7 @@ def search(
         plan.assigned(_drawn_settings(space, chosen))
         config = plan.config(task, 1, paper=True, eval_seeds="search")
         subjects.append(Subject(space, chosen, config, preset(f"{task.environment}-paper")))
-    return _study("search", plan, subjects, configurations)
+    return _study("search", plan, subjects, configurations, final)
 
 
 def search_environment(
@@ -111,6 +128,7 @@ def search_environment(
     file: Path,
     algorithms: Sequence[Algorithm] = (),
     configurations: int | None = None,
+    final: Final | None = None,
 ) -> Study:
     """Return the study ``search-ENV`` of any environment, over a space in a file.
 
@@ -123,6 +141,7 @@ def search_environment(
         file: file with the space (:mod:`udrl_experiments.search_space`).
         algorithms: as for :func:`search`.
         configurations: as for :func:`search`.
+        final: as for :func:`search`.
 
     Raises:
         ConfigError: as for :func:`search`, or the file is not a valid space, or an algorithm does
@@ -155,7 +174,7 @@ def search_environment(
         )
     written = {name: flat(config)[name] for name in (*sorted(settings.automatic), *assigned)}
     subject = Subject(space, chosen, config, {"environment": environment} | written)
-    return _study(f"search-{_file_name(environment)}", plan, [subject], configurations)
+    return _study(f"search-{_file_name(environment)}", plan, [subject], configurations, final)
 
 
 def _chosen(space: SearchSpace, algorithms: Sequence[Algorithm]) -> tuple[Algorithm, ...]:
@@ -176,19 +195,56 @@ def _drawn_settings(space: SearchSpace, algorithms: Sequence[Algorithm]) -> set[
 
 
 def _study(
-    name: str, plan: StudyPlan, subjects: Sequence[Subject], configurations: int | None
+    name: str,
+    plan: StudyPlan,
+    subjects: Sequence[Subject],
+    configurations: int | None,
+    final: Final | None,
 ) -> Study:
+    by_environment = {subject.space.environment: subject for subject in subjects}
+
+    def runs_of(environment: str, algorithm: Algorithm, number: int, steps: StudyPlan) -> list[Job]:
+        subject = by_environment[environment]
+        seeds = _seeds(plan, subject.space)
+        return [_job(steps, subject, algorithm, number, seed) for seed in seeds]
+
     jobs = {
-        (subject.space.environment, algorithm, number): [
-            _job(plan, subject, algorithm, number, seed) for seed in _seeds(plan, subject.space)
-        ]
-        for subject in subjects
+        (environment, algorithm, number): runs_of(environment, algorithm, number, plan)
+        for environment, subject in by_environment.items()
         for algorithm in subject.algorithms
         for number in range(_configurations(plan, subject.space, configurations))
     }
-    spaces = {subject.space.environment: subject.space for subject in subjects}
+
+    def finalists(root: Path) -> dict[tuple[str, Algorithm, int], list[Job]]:
+        if final is None:
+            return {}
+        longer = plan._replace(max_env_steps=final.max_env_steps)
+        found: dict[tuple[str, Algorithm, int], list[Job]] = {}
+        for environment, subject in by_environment.items():
+            for algorithm in subject.algorithms:
+                scored = [
+                    (value, key)
+                    for key, runs in jobs.items()
+                    if key[:2] == (environment, algorithm)
+                    and (value := _score(runs, root)) is not None
+                ]
+                best = sorted(scored, key=lambda pair: -pair[0])[: final.configurations]
+                found |= {key: runs_of(*key, longer) for _, key in best}
+        return found
+
+    def run_all(
+        planned: Sequence[Job],
+        root: Path,
+        side_by_side: int,
+        stop: threading.Event,
+        echo: Callable[[str], None],
+    ) -> None:
+        run_jobs(planned, root, side_by_side, stop, echo)
+        if longer := [job for runs in finalists(root).values() for job in runs]:
+            run_jobs(longer, root, side_by_side, stop, echo)
 
     def report(folders: StudyFolders) -> str:
+        finals = finalists(folders.root)
         rows = [
             Scored(
                 environment=environment,
@@ -196,7 +252,8 @@ def _study(
                 configuration=number,
                 seeds=len(runs),
                 score=_score(runs, folders.root),
-                settings=json.dumps(spaces[environment].draw(algorithm, number)),
+                settings=json.dumps(by_environment[environment].space.draw(algorithm, number)),
+                final_score=_score(finals.get((environment, algorithm, number), []), folders.root),
             )
             for (environment, algorithm, number), runs in jobs.items()
         ]
@@ -207,7 +264,7 @@ def _study(
             for algorithm in subject.algorithms
         )
 
-    return Study(name, [run for runs in jobs.values() for run in runs], report, run_jobs, ("ray",))
+    return Study(name, [run for runs in jobs.values() for run in runs], report, run_all, ("ray",))
 
 
 def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:
@@ -238,8 +295,8 @@ def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, s
 
 
 def _score(runs: Sequence[Job], root: Path) -> float | None:
-    """Return the mean score of a configuration's runs; None if one of them failed."""
-    if not all(run.done(root) for run in runs):
+    """Return the mean score of a configuration's runs; None if there are none, or one failed."""
+    if not runs or not all(run.done(root) for run in runs):
         return None
     return fmean(score([row.mean for row in run.evaluations(root)], LAST) for run in runs)
 
@@ -253,10 +310,9 @@ def _write_preset(
     """
     environment = subject.space.environment
     kind = (environment, algorithm)
-    scored = [
-        (row.score, row)
-        for row in rows
-        if (row.environment, row.algorithm) == kind and row.score is not None
+    of_kind = [row for row in rows if (row.environment, row.algorithm) == kind]
+    scored = [(row.final_score, row) for row in of_kind if row.final_score is not None] or [
+        (row.score, row) for row in of_kind if row.score is not None
     ]
     if not scored:
         return f"# {algorithm}, {environment}: every configuration has a failed run"

@@ -21,8 +21,8 @@ from udrl_experiments.protocol import (
     parse_seeds,
     tasks,
 )
+from udrl_experiments.search import Final, search_environment
 from udrl_experiments.search import search as make_search
-from udrl_experiments.search import search_environment
 from udrl_experiments.sensitivity import EPISODES
 from udrl_experiments.sensitivity import sensitivity as make_sensitivity
 from udrl_experiments.study import Study, run_study
@@ -243,12 +243,18 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
               help="Algorithm to run. May be repeated. Default: all in the space.")  # fmt: skip
 @click.option("--configurations", type=click.IntRange(1, 100_000), metavar="N",
               help="Configurations per algorithm. Default: 8, or the paper's number.")  # fmt: skip
+@click.option("--finalists", type=click.IntRange(1, 100_000), metavar="N",
+              help="Run the N best configurations again for --final-env-steps.")  # fmt: skip
+@click.option("--final-env-steps", type=STEPS, metavar="STEPS",
+              help="Env steps per run of the finalists, e.g. 3M.")  # fmt: skip
 def search(
     env: str | None,
     file: Path | None,
     names: tuple[str, ...],
     algorithms: tuple[Algorithm, ...],
     configurations: int | None,
+    finalists: int | None,
+    final_env_steps: int | None,
     **options: Any,
 ) -> int:
     """Appendix B: random search with Ray Tune.
@@ -258,12 +264,19 @@ def search(
 
     Example: udrl study search CartPole-v1 --space mine.toml
     """
+    final = None
+    if finalists is not None and final_env_steps is not None:
+        final = Final(finalists, final_env_steps)
+    elif finalists is not None or final_env_steps is not None:
+        raise ConfigError("--finalists N and --final-env-steps STEPS need each other")
     if (env is None) != (file is None):
         given, missing = ("--space", "ENV") if env is None else (f"ENV {env}", "--space FILE")
         raise ConfigError(f"{given} needs {missing}: udrl study search ENV --space FILE")
     if env is None or file is None:
         return _run(
-            lambda plan: make_search(plan, tasks(names or ("lander",)), algorithms, configurations),
+            lambda plan: make_search(
+                plan, tasks(names or ("lander",)), algorithms, configurations, final
+            ),
             **options,
         )
     if names:
@@ -271,5 +284,6 @@ def search(
             f"--task {names[0]}: cannot be combined with ENV and --space; leave out one of them"
         )
     return _run(
-        lambda plan: search_environment(plan, env, file, algorithms, configurations), **options
+        lambda plan: search_environment(plan, env, file, algorithms, configurations, final),
+        **options,
     )

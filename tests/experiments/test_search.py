@@ -1,6 +1,8 @@
 import json
 import math
+import threading
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -11,10 +13,12 @@ from tests.experiments.finished_runs import finish
 from udrl.config import change, preset, read_toml
 from udrl.errors import ConfigError, UnsupportedEnvironment
 from udrl.fitting import fit
+from udrl_experiments import search as search_module
 from udrl_experiments import study_command
+from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, StudyPlan
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.search import Scored, search, search_environment
+from udrl_experiments.search import Final, Scored, search, search_environment
 from udrl_experiments.search_space import read_space, shipped_space
 from udrl_experiments.study import StudyFolders
 from udrl_inspect.csv_tables import read, write
@@ -81,6 +85,45 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
 def test_what_a_search_draws_cannot_be_set(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
         search(StudyPlan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
+
+
+def test_finalists_run_longer_and_the_best_of_them_becomes_a_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches: list[list[Job]] = []
+
+    def run(jobs: Sequence[Job], *_: object) -> None:
+        batches.append(list(jobs))
+        for job in jobs:
+            folder = job.folder(tmp_path)
+            folder.mkdir(parents=True, exist_ok=True)
+            number = int(job.variant.removeprefix("configuration "))
+            early, late = [1.0, 4.0, 2.0, 3.0][number], [0.0, 5.0, 0.0, 9.0][number]
+            rows = [
+                EvaluationRecord(
+                    environment="LunarLander-v3", algorithm="UDRL", variant="", seed=1,
+                    env_steps=steps, wall_s=0.0, mean=mean, std=0.0, episodes=1,
+                )
+                for steps, mean in ((50_000, early), (100_000, late))
+                if steps <= job.max_env_steps
+            ]  # fmt: skip
+            write(folder / "evaluations.csv", EvaluationRecord, rows)
+            (folder / "done.json").write_text(json.dumps({"max_env_steps": job.max_env_steps}))
+
+    monkeypatch.setattr(search_module, "run_jobs", run)
+    plan = StudyPlan(seeds=(1,), max_env_steps=50_000)
+    study = search(plan, [TASKS["lander"]], ["UDRL"], 4, Final(2, 100_000))
+    study.run_jobs(study.jobs, tmp_path, 1, threading.Event(), print)
+    assert [[(job.variant, job.max_env_steps) for job in batch] for batch in batches] == [
+        [(f"configuration {n}", 50_000) for n in range(4)],
+        [("configuration 1", 100_000), ("configuration 3", 100_000)],
+    ]
+    folders = StudyFolders(tmp_path, tmp_path / "search")
+    folders.folder.mkdir()
+    assert "# Configuration 3: score 6.0" in study.report(folders)
+    found = read(folders.folder / "scores.csv", Scored)
+    assert [row.score for row in found] == [1.0, 4.0, 2.0, 3.0]
+    assert [row.final_score for row in found] == [None, 4.5, None, 6.0]
 
 
 def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
