@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from udrl.config import Configured, FlatSettings, flat
+from udrl.config import Config, Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import Machine
@@ -59,10 +59,15 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     @property
     def name(self) -> str:
-        """Name of the run, with a hash of its settings: equal settings, equal names."""
+        """Name of the run, with a hash of its settings: equal settings, equal names.
+
+        Defaults are not hashed, so that a new setting does not change the names of kept runs.
+        """
+        config = self.config
+        defaults = flat(Config(environment=config.environment))
+        settings = {name: v for name, v in flat(config).items() if v != defaults[name]}
         identity = msgspec.json.encode(
-            [self.algorithm, flat(self.config), self.hyperparameters, self.exploration_steps],
-            order="sorted",
+            [self.algorithm, settings, self.hyperparameters, self.exploration_steps], order="sorted"
         )
         digest = hashlib.sha256(identity).hexdigest()[:12]
         environment = re.sub(r"[^a-z0-9]+", "-", self.config.environment.lower()).strip("-")
@@ -82,12 +87,13 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     def done(self, root: Path) -> bool:
         """Return whether the run is finished, with at least ``max_env_steps``."""
-        done = self._done(root)
+        folder, done = self.folder(root), self._done(root)
         try:
             return (
                 done is not None
                 and done.max_env_steps >= self.max_env_steps
-                and bool(read(self.folder(root) / "evaluations.csv", EvaluationRecord))
+                and read_job(folder).config == self.config
+                and bool(read(folder / "evaluations.csv", EvaluationRecord))
             )
         except InvalidData:
             return False

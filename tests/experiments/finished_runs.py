@@ -24,4 +24,5 @@ def finish(root: Path, one: Job, *, wall_s: float = 10.0, machine: Machine | Non
     ]  # fmt: skip
     write(folder / "evaluations.csv", EvaluationRecord, rows)
     done = {"max_env_steps": one.max_env_steps, "machine": machine}
+    (folder / "job.json").write_bytes(msgspec.json.encode(one))
     (folder / "done.json").write_bytes(msgspec.json.encode(done))

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from tests.experiments.finished_runs import finish
 from udrl.config import Config, build, change, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed, RunInUse
 from udrl_experiments import job as job_module
@@ -51,6 +52,23 @@ def test_other_settings_are_another_run(change: dict[str, Any]) -> None:
     assert job(**change).name != job().name
 
 
+def test_names_do_not_depend_on_defaults() -> None:
+    settings = {name: v for name, v in flat(CONFIG).items() if name != "advantage_bound"}
+    before = Job(algorithm="UDRL", settings=settings, max_env_steps=1)
+    after = Job(algorithm="UDRL", settings=flat(CONFIG), max_env_steps=1)
+    assert before.name == after.name
+    assert job().name == "udrl-cartpole-v1-seed1-9b61e2eb49be"
+
+
+def test_a_finished_run_with_other_defaults_is_another_run(tmp_path: Path) -> None:
+    one = job(50)
+    finish(tmp_path, one)
+    assert one.done(tmp_path)
+    stored = msgspec.structs.replace(one, settings=one.settings | {"memory_size": 65})
+    (one.folder(tmp_path) / "job.json").write_bytes(msgspec.json.encode(stored))
+    assert not one.done(tmp_path)
+
+
 def test_other_hyperparameters_are_another_run() -> None:
     dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=1)
     other = msgspec.structs.replace(dqn, hyperparameters={"gamma": 0.9})
@@ -78,6 +96,7 @@ def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
 def test_done_is_done_as_far_as_asked(tmp_path: Path, text: str, *, done: bool) -> None:
     folder = job().folder(tmp_path)
     folder.mkdir(parents=True)
+    (folder / "job.json").write_bytes(msgspec.json.encode(job()))
     (folder / "done.json").write_text(text, encoding="utf-8")
     assert not job().done(tmp_path), "it has no evaluations"
     write(folder / "evaluations.csv", EvaluationRecord, [evaluated(105)])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
+import msgspec
 import pytest
 from click.testing import CliRunner
 
@@ -65,6 +66,7 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
         write(job.folder(tmp_path) / "evaluations.csv", EvaluationRecord, rows)
         done = json.dumps({"max_env_steps": job.max_env_steps})
         (job.folder(tmp_path) / "done.json").write_text(done)
+        (job.folder(tmp_path) / "job.json").write_bytes(msgspec.json.encode(job))
     place = StudyFolders(tmp_path, tmp_path / "search")
     place.folder.mkdir()
     said = study.report(place)
@@ -109,6 +111,7 @@ def test_finalists_run_longer_and_the_best_of_them_becomes_a_preset(
             ]  # fmt: skip
             write(folder / "evaluations.csv", EvaluationRecord, rows)
             (folder / "done.json").write_text(json.dumps({"max_env_steps": job.max_env_steps}))
+            (folder / "job.json").write_bytes(msgspec.json.encode(job))
 
     monkeypatch.setattr(search_module, "run_jobs", run)
     plan = StudyPlan(seeds=(1,), max_env_steps=50_000)

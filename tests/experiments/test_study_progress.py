@@ -28,6 +28,7 @@ def begin(root: Path, one: Job, env_steps: int) -> Path:
         env_steps=env_steps, wall_s=61.0, mean=12.5, std=1.0, episodes=100,
     )  # fmt: skip
     write(folder / "evaluations.csv", EvaluationRecord, [row])
+    (folder / "job.json").write_bytes(msgspec.json.encode(one))
     return folder
 
 
