@@ -12,7 +12,7 @@ def target(**values: Any) -> ReturnInTime:
     return ReturnInTime(build(NetworkSettings, values))
 
 
-def test_counting_down_is_lines_8_9_and_11_of_algorithm_2() -> None:
+def test_countdown_equals_lines_8_9_and_11_of_algorithm_2() -> None:
     desired = np.array([[10.0, 5.0], [3.0, 1.0]])
     target().advance(desired, np.array([2.5, -1.0], np.float32))
     assert desired.tolist() == [[7.5, 4.0], [4.0, 0.0]]
@@ -25,7 +25,7 @@ def test_desired_return_never_exceeds_the_cap() -> None:
 
 
 @pytest.mark.parametrize(("horizon", "said"), [(7, 7), (0, 1), (-3, 1)])
-def test_horizon_is_one_step_at_least(horizon: int, said: int) -> None:
+def test_horizon_is_at_least_one_step(horizon: int, said: int) -> None:
     assert target().initial(2.5, horizon) == (2.5, said)
 
 
@@ -36,7 +36,7 @@ def test_horizon_that_follows_is_the_return_as_an_integer(desired_return: float,
     assert target(desired_horizon="return").initial(desired_return, 99) == (said, said)
 
 
-def test_networks_read_it_bounded_and_scaled() -> None:
+def test_network_inputs_are_bounded_and_scaled() -> None:
     usual = target(return_scale=0.5, horizon_scale=0.25)
     assert (usual.least, usual.scales) == ((-np.inf, 1.0), (0.5, 0.25))
     assert target(desired_horizon="return").least == (1.0, 1.0)
