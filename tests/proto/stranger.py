@@ -1,4 +1,4 @@
-"""An actor written from ``proto/README.md`` alone: nothing of this project is imported."""
+"""An actor written from ``proto/README.md`` alone, without any import of udrl."""
 
 import hashlib
 import math
@@ -49,7 +49,7 @@ def numbers(key: bytes, n: int) -> list[float]:
     return [(word >> 11) * 2.0**-53 for word in philox(key, n)]
 
 
-# Inference and the choice of an action.
+# Inference and action selection.
 
 
 class Network:
@@ -89,7 +89,7 @@ def leaves(spec: dict[str, Any]) -> list[tuple[list[Any], dict[str, Any]]]:
 
 
 def seen(observations: list[list[npt.NDArray[Any]]], stack: int) -> list[npt.NDArray[Any]]:
-    """Return the most recent of each leaf, oldest first; the first stands for those before it."""
+    """Return the most recent of each leaf, oldest first; the first fills the stack."""
     recent = [observations[max(len(observations) - 1 - k, 0)] for k in reversed(range(stack))]
     return [np.concatenate(list(map(np.atleast_1d, one))) for one in zip(*recent, strict=True)]
 
@@ -105,7 +105,7 @@ def choose(row: list[float], u: float, temperature: float) -> int:
 
 
 def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.NDArray[Any]]:
-    """Return the leaves of an observation of an environment as its space says."""
+    """Convert an environment's observation to leaves of the declared dtypes and shapes."""
     found = []
     for path, leaf in leaves(spec):
         value, of = observation, space
@@ -124,7 +124,7 @@ def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.
 
 
 def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDArray[Any]:
-    """Return an episode's observations as they are sent."""
+    """Return an episode's observations in wire format."""
     if spec["observation_space"]["kind"] != "record":
         return np.array([one for (one,) in steps])
     rows = [b"".join(leaf.tobytes() for leaf in step) for step in steps]
@@ -132,7 +132,7 @@ def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDA
 
 
 def components(spec: dict[str, Any]) -> list[int]:
-    """Return how many values there are of each component of an action."""
+    """Return the number of values of each component of an action."""
     space = spec["action_space"]
     return list(space["ns"]) if space["kind"] == "product" else [space["n"]]
 
@@ -151,7 +151,7 @@ def all_within(space: Any) -> list[Any]:
 
 
 def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
-    """Return an action as its environment takes it; the indices are used up."""
+    """Convert action indices to an action of the environment's space; consumes the indices."""
     dimensions = sum(math.prod(one.shape) for one in all_within(space) if is_box(one))
     m = config["action_bins"] or (11 if dimensions <= 2 else 7)
 
@@ -179,7 +179,7 @@ def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
 def run_episode(
     command: dict[str, Any], hello: dict[str, Any], network: Network | None
 ) -> dict[str, Any]:
-    """Carry out a command and return the arrays and flags of its episode."""
+    """Run a command; return the arrays and flags of its episode."""
     config, spec = hello["config"], hello["environment"]
     ns = components(spec)
     limited = {"max_episode_steps": command["max_steps"]} | config["environment_kwargs"]
@@ -269,7 +269,7 @@ def probe_weights(graph: bytes) -> Weights:
 def probe_rows(
     hello: dict[str, Any], state_size: int
 ) -> tuple[list[npt.NDArray[Any]], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return what the network sees in 16 rows, leaf by leaf, their commands and states."""
+    """Return the network inputs of 16 rows: observations by leaf, commands, states."""
     stack, sizes = hello["config"]["frame_stack"], []
     for _, space in leaves(hello["environment"]):
         names = ("size", "channels", "height", "width")
@@ -344,11 +344,11 @@ def environment_digest(hello: dict[str, Any]) -> str:
     return episode_digest(0, run_episode(command, hello, None)).hex()[:16]
 
 
-# The life of an actor.
+# The actor's main loop.
 
 
 class Problem(Exception):
-    """The answer is no; the argument is its code."""
+    """A problem reply; the argument is its code."""
 
 
 def ask(session: zenoh.Session, key: str, request: dict[str, Any]) -> dict[str, Any]:
@@ -371,7 +371,7 @@ def ask(session: zenoh.Session, key: str, request: dict[str, Any]) -> dict[str, 
 
 
 def act(session: zenoh.Session) -> int:
-    """Serve the only run on the router until it has ended; return the episodes delivered."""
+    """Serve the only run on the router until it has ended; return the delivered episodes."""
     (reply,) = session.get("udrl/*/*/hello", payload=b"\x80", timeout=3.0)
     assert reply.ok is not None
     run = str(reply.ok.key_expr).removesuffix("/hello")
