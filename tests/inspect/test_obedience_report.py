@@ -1,4 +1,4 @@
-"""The report on what an agent can be asked for: what it says, keeps and refuses."""
+"""The report on obedience: its text, its files, and what it rejects."""
 
 import csv
 from collections.abc import Callable
@@ -53,21 +53,21 @@ def report(
     )  # fmt: skip
 
 
-def test_the_answer_where_an_agent_obeys_in_part() -> None:
+def test_summary_of_an_agent_that_obeys_in_part() -> None:
     assert answer(report(obeyed=(30.0, 80.0), correlation=0.97)) == (
         "Command returns between 30 and 80; mean absolute error 7, correlation 0.97. "
         "Outside this range, do not expect the commanded return."
     )
 
 
-def test_the_answer_where_it_obeys_everywhere() -> None:
+def test_summary_of_an_agent_that_obeys_everywhere() -> None:
     assert answer(report(obeyed=(-20.0, 130.0), tolerance=4.0)) == (
         "Command returns between -20 and 130; mean absolute error 7.2, correlation 0.50. "
         "No other returns were measured."
     )
 
 
-def test_the_answer_where_it_follows_from_afar() -> None:
+def test_summary_of_an_agent_that_follows_at_a_distance() -> None:
     assert answer(report(lambda r: r / 2 - 100, correlation=0.99)) == (
         "Higher commands obtain more, but not what is commanded: commands from -20 to 130 obtain "
         "-110 to -35 on average; mean absolute error 7, correlation 0.99."
@@ -75,15 +75,15 @@ def test_the_answer_where_it_follows_from_afar() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.1, 0.99])
-def test_the_answer_where_it_does_not_follow(correlation: float) -> None:
-    """A correlation without differences that matter is not following either."""
+def test_summary_of_an_agent_that_does_not_follow(correlation: float) -> None:
+    """A correlation without relevant differences does not count."""
     assert answer(report(lambda r: 60 + r / 50, correlation=correlation)) == (
         "This agent does not follow its command: mean obtained returns vary by 3 over commands "
         f"from -20 to 130 (correlation {correlation:.2f})."
     )
 
 
-def test_the_other_sentences() -> None:
+def test_other_sentences_of_the_summary() -> None:
     told = report(lambda r: 100 - abs(r - 80))
     assert best(told) == (
         "Highest mean return: 100 (95 % interval 98 to 102), commanded 80 within 42 steps."
@@ -99,7 +99,7 @@ def test_the_other_sentences() -> None:
     )
 
 
-def test_a_tolerance_beyond_all_returns_hides_no_digits() -> None:
+def test_huge_tolerance_hides_no_digits() -> None:
     small = msgspec.structs.replace(
         report(lambda r: 0.0123, tolerance=5.0), reachable_low=0.0, reachable_high=0.5
     )
@@ -108,7 +108,7 @@ def test_a_tolerance_beyond_all_returns_hides_no_digits() -> None:
     assert "Highest mean return: 0.0123 (" in best(alike)
 
 
-def test_the_table_ends_with_the_answer() -> None:
+def test_table_ends_with_the_summary() -> None:
     told = report(obeyed=(30.0, 80.0))
     lines = table(told).splitlines()
     assert lines[0].startswith("Some-v0, weights version 7, temperature 1, 10 episodes")
@@ -120,7 +120,7 @@ def test_the_table_ends_with_the_answer() -> None:
     assert lines[-1] == answer(told)
 
 
-def test_a_card_has_the_table_and_begins_with_the_answer() -> None:
+def test_card_begins_with_the_summary_and_has_the_table() -> None:
     told = report(obeyed=(30.0, 80.0))
     text = markdown(told)
     assert text.startswith(f"**{answer(told)}**\n\n| desired return |")
@@ -129,7 +129,7 @@ def test_a_card_has_the_table_and_begins_with_the_answer() -> None:
     assert bars == {7}
 
 
-def test_the_csv_file_has_every_point(tmp_path: Path) -> None:
+def test_csv_file_has_every_point(tmp_path: Path) -> None:
     told = report(obeyed=(30.0, 80.0))
     csv_tables.write(tmp_path / "obedience.csv", Row, rows(told))
     with (tmp_path / "obedience.csv").open(newline="") as file:
@@ -142,7 +142,7 @@ def test_the_csv_file_has_every_point(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("obeyed", [None, (30.0, 80.0)])
-def test_the_picture_shows_the_range(tmp_path: Path, obeyed: tuple[float, float] | None) -> None:
+def test_figure_shows_the_obeyed_range(tmp_path: Path, obeyed: tuple[float, float] | None) -> None:
     told = report(obeyed=obeyed)
     for name in ("both.svg", "one.png", "one.pdf"):
         draw(told, tmp_path / "pictures" / name)
@@ -153,7 +153,7 @@ def test_the_picture_shows_the_range(tmp_path: Path, obeyed: tuple[float, float]
         draw(told, tmp_path / "picture.bmp")
 
 
-def test_what_is_kept_is_read(tmp_path: Path) -> None:
+def test_report_round_trips(tmp_path: Path) -> None:
     assert load_report(tmp_path) is None
     for told in (report(), report(obeyed=(30.0, 80.0))):
         assert save_report(tmp_path, told) == tmp_path / FILE
@@ -167,7 +167,7 @@ def test_what_is_kept_is_read(tmp_path: Path) -> None:
     [b"", b"\xff", b"[]", b'{"format": 1}', b'"format": 2', b'"tolerance": null',
      b'"correlation": 7', b'"surplus": 1, "format": 1'],
 )  # fmt: skip
-def test_a_report_that_nobody_wrote(tmp_path: Path, damage: bytes) -> None:
+def test_damaged_report_is_rejected(tmp_path: Path, damage: bytes) -> None:
     written = save_report(tmp_path, report()).read_bytes()
     if damage.startswith(b'"'):
         name = damage.split(b":")[0] if b"surplus" not in damage else b'"format"'
@@ -180,7 +180,7 @@ def test_a_report_that_nobody_wrote(tmp_path: Path, damage: bytes) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "5", "1:1", "2:1", "a:2", "1:nan", "1:2:3", "1e12:2e12"])
-def test_ranges_of_returns_that_are_none(text: str) -> None:
+def test_invalid_range_of_returns_is_rejected(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is not (LOW:HIGH|a number)"):
         RETURNS.convert(text, None, None)
     assert RETURNS.convert("-100:2.5", None, None) == (-100.0, 2.5)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-#: Frees 64 MB and allocates them again, a hundred times, in a thread as a service does.
+#: Frees and allocates 64 MB a hundred times, in a thread as services do.
 PROGRAM = """
 import resource, threading
 from udrl_launch.process import keep_freed_memory
@@ -78,7 +78,7 @@ def ended(body: str, *signals: int) -> tuple[int, str]:
     return process.returncode, said
 
 
-def test_service_has_the_main_thread_and_its_error_is_the_exit_code() -> None:
+def test_service_runs_in_the_main_thread_and_its_error_sets_the_exit_code() -> None:
     assert ended("pass") == (0, "")
     code, said = ended("raise StoreError('the disk is gone')")
     assert code == 8
@@ -95,7 +95,7 @@ def test_signal_stops_a_service(number: signal.Signals) -> None:
     assert "in the middle" in said
 
 
-def test_other_signals_are_the_environments_own() -> None:
+def test_other_signals_are_left_to_the_environment() -> None:
     body = (
         "signal.signal(signal.SIGALRM, lambda *_: None); "
         "signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01); time.sleep(0.2); "
@@ -104,7 +104,7 @@ def test_other_signals_are_the_environments_own() -> None:
     assert ended(body) == (0, "")
 
 
-def test_forked_child_has_its_signals_for_itself() -> None:
+def test_forked_child_handles_its_own_signals() -> None:
     body = (
         "import multiprocessing as m; context = m.get_context('fork'); up = context.Event(); "
         "child = context.Process(target=lambda: (up.set(), time.sleep(30))); child.start(); "
@@ -114,14 +114,14 @@ def test_forked_child_has_its_signals_for_itself() -> None:
     assert ended(body) == (0, "")
 
 
-def test_service_that_does_not_listen_is_abandoned() -> None:
+def test_unresponsive_service_is_abandoned() -> None:
     code, said = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
     assert "did not stop within 3 s; exiting" in said
 
 
 @pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])
-def test_as_many_files_may_be_open_as_the_system_allows(given: int, found: int) -> None:
+def test_limit_of_open_files_is_raised_to_the_maximum(given: int, found: int) -> None:
     program = (
         "from resource import RLIMIT_NOFILE, getrlimit, setrlimit\n"
         "from udrl_launch.process import allow_open_files\n"
