@@ -1,4 +1,4 @@
-"""What Prometheus is told, read by its own parser; and what the dashboard asks for."""
+"""Metrics for Prometheus, read by its own parser, and the dashboard's queries."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def scraped(status: Status | None) -> dict[tuple[str, tuple[tuple[str, str], ...
     }
 
 
-def test_every_number_of_the_status_is_told() -> None:
+def test_every_number_of_the_status_is_exported() -> None:
     told = scraped(FULL)
     assert told["udrl_up", ()] == 1
     assert told["udrl_env_steps_total", ()] == 12345
@@ -63,7 +63,7 @@ def test_every_number_of_the_status_is_told() -> None:
     assert told["udrl_quarantined_actors", ()] == 1
 
 
-def test_what_is_not_known_is_not_told() -> None:
+def test_unknown_values_are_not_exported() -> None:
     told = scraped(
         msgspec.structs.replace(STATUS, loss=None, time_left_s=None, evaluation=None, waiting=())
     )
@@ -72,7 +72,7 @@ def test_what_is_not_known_is_not_told() -> None:
     assert scraped(None) == {("udrl_up", ()): 0}
 
 
-def test_the_dashboard_asks_for_metrics_that_there_are() -> None:
+def test_dashboard_queries_existing_metrics() -> None:
     told = {name for name, _ in scraped(FULL)}
     dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text())
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
@@ -89,7 +89,7 @@ def test_every_metric_is_in_the_glossary() -> None:
     assert {name for name, _ in scraped(FULL)} == named
 
 
-def test_a_port_that_is_taken() -> None:
+def test_port_in_use_is_reported() -> None:
     with (
         closing(Exporter(lambda: None, "127.0.0.1", 0)) as first,
         pytest.raises(ConfigError, match=f"port {first.port}: .*a free port"),
@@ -97,7 +97,7 @@ def test_a_port_that_is_taken() -> None:
         Exporter(lambda: None, "127.0.0.1", first.port)
 
 
-def test_a_status_that_is_old_says_nothing_of_now() -> None:
+def test_outdated_status_is_not_exported_as_current() -> None:
     now = [0.0]
     watchers = Watchers(clock=lambda: now[0])
     assert watchers.latest() is None
