@@ -1,4 +1,4 @@
-"""``docker compose up``, what is done to it, and that the result is the one of a single process."""
+"""``docker compose up`` under faults gives the result of a single process."""
 
 import subprocess
 from collections.abc import Callable, Iterator
@@ -13,13 +13,13 @@ from whole_run import Cli, assert_conserved, digests, free_port, wait_for
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(2400)]
 
-#: Env steps that no test waits for.
+#: More env steps than any test waits for.
 ENDLESS = 10**9
 PLAIN = ("--connect", "tcp/127.0.0.1:7447")
 WITH_KEYS = ("--connect", "tls/127.0.0.1:7447", "--keys", "/keys")
 SECURE = ["compose.yaml", "compose.secure.yaml"]
 OUTSIDE = "udrl-test-outside"
-#: Of the network that the actor from outside is in; its gateway is this machine.
+#: Addresses of the external actor's network, whose gateway is this machine.
 SUBNET, GATEWAY = "10.213.7.0/24", "10.213.7.1"
 
 
@@ -35,13 +35,13 @@ def alone(cli: Callable[..., Cli], env_steps: int, run_dir: Path) -> Status:
 
 @pytest.fixture(scope="module", autouse=True)
 def image() -> None:
-    """The images of this checkout; nothing is done where there is no engine."""
+    """The images of this checkout; skips the tests without an engine."""
     Project("udrl-test-image", ["compose.yaml"], {}).compose("build", timeout=1800)
 
 
 @pytest.fixture
 def outside() -> Iterator[str]:
-    """A network that reaches nothing of the project but its published port."""
+    """A network that is connected to the project's published port only."""
     subprocess.run(["docker", "network", "rm", OUTSIDE], capture_output=True, timeout=60)
     run("docker", "network", "create", "--subnet", SUBNET, "--gateway", GATEWAY, OUTSIDE)
     yield OUTSIDE
@@ -49,14 +49,14 @@ def outside() -> Iterator[str]:
 
 
 def finished(project: Project, *up: str) -> Status:
-    """Let a run, which has no end in sight, end soon, and return what became of it.
+    """Extend a run's budget so that it ends soon; return its final status.
 
     Args:
-        project: not up, or without what is given here.
-        up: what ``docker compose up`` is given.
+        project: not running, except for services given here.
+        up: arguments of ``docker compose up``.
     """
     status = project.store()
-    # Longer than it takes until a new replay service is found healthy, and the others start.
+    # Longer than it takes to find a new replay service healthy and to start the others.
     steps = status.env_steps + 150_000
     project.give(ARGS=arguments(steps))
     project.compose("up", "--detach", *up)
@@ -67,7 +67,7 @@ def finished(project: Project, *up: str) -> Status:
     return ended
 
 
-def test_down_and_up_go_on_and_no_port_is_published(
+def test_down_and_up_resumes_and_no_port_is_published(
     cli: Callable[..., Cli], tmp_path: Path
 ) -> None:
     variables = {"ENV": "CartPole-v1", "ARGS": arguments(ENDLESS)}
@@ -79,14 +79,14 @@ def test_down_and_up_go_on_and_no_port_is_published(
                 assert run("docker", "port", container) == ""
         project.compose("stop")
         for service in ("replay", "learner", "actor"):
-            # By themselves: none had to be killed when its time was over.
+            # They exited by themselves, before the timeout of Compose.
             assert set(project.exit_codes(service)) <= {0, 143}, service
         project.compose("down")
         ended = finished(project)
     assert digests(ended) == digests(alone(cli, ended.max_env_steps, tmp_path / "alone"))
 
 
-def test_faults_and_an_actor_from_outside_change_nothing(
+def test_faults_and_an_external_actor_change_nothing(
     cli: Callable[..., Cli], tmp_path: Path, outside: str
 ) -> None:
     port = free_port()
@@ -94,7 +94,7 @@ def test_faults_and_an_actor_from_outside_change_nothing(
     secure = Project("udrl-test-secure", SECURE, variables | {"UDRL_PORT": str(port)})
 
     def goes_on(what: str, actors: int | None = None) -> None:
-        """Wait until two more iterations are done, with so many actors."""
+        """Wait until two more iterations are complete, with the given number of actors."""
         first: list[int] = []
 
         def further() -> bool:
@@ -104,7 +104,7 @@ def test_faults_and_an_actor_from_outside_change_nothing(
             first.append(status.iteration)
             return status.iteration > first[0] + 1
 
-        wait_for(further, f"the run to go on {what}", 120)
+        wait_for(further, f"progress {what}", 120)
 
     with secure as project:
         project.compose("up", "--detach")
@@ -122,7 +122,7 @@ def test_faults_and_an_actor_from_outside_change_nothing(
         network = f"{project.name}_run"
         run("docker", "network", "disconnect", network, actor)
         wait_for(
-            lambda: (s := project.live(*WITH_KEYS)) and not s.actors, "the actor to be missed", 60
+            lambda: (s := project.live(*WITH_KEYS)) and not s.actors, "the actor to be removed", 60
         )
         run("docker", "network", "connect", network, actor)
         goes_on("after the network was cut", 1)
@@ -143,12 +143,12 @@ def test_faults_and_an_actor_from_outside_change_nothing(
 
 
 def inside_of(image: str) -> list[str]:
-    """Return what runs a line of shell in an image."""
+    """Return the command that runs a line of shell in an image."""
     return ["docker", "run", "--rm", "--read-only", "--entrypoint", "sh", image, "-c"]
 
 
 @pytest.mark.parametrize("image", [IMAGE, LEARNER_IMAGE])
-def test_image_runs_as_nobody_special_and_holds_nothing_to_build_with(image: str) -> None:
+def test_image_runs_unprivileged_and_has_no_build_tools(image: str) -> None:
     inside = inside_of(image)
     assert run(*inside, "id -u").strip() == "10001"
     tools = "for tool in cc gcc c++ ld make cmake; do command -v $tool || true; done"
@@ -167,19 +167,19 @@ def test_torch_is_in_the_image_of_the_learner_only() -> None:
     assert run(*inside_of(IMAGE), "find / -xdev -name 'libtorch*' 2>/dev/null || true") == ""
 
 
-# What is wrong is told in the log of the container that suffers, and by its exit code.
+# Errors are in the log and exit code of the container that fails.
 
 
 def told(*arguments: str, options: tuple[str, ...] = (), image: str = IMAGE) -> tuple[int, str]:
-    """Return exit code and log of a container that ends by itself."""
+    """Return exit code and log of a container that exits by itself."""
     command = ["docker", "run", "--rm", "--init", "--read-only", "--tmpfs", "/tmp", *options]
     done = subprocess.run([*command, image, *arguments], capture_output=True, text=True, timeout=90)
     assert "Traceback" not in done.stderr
     return done.returncode, done.stderr
 
 
-def test_volume_that_may_not_be_written_is_told(tmp_path: Path) -> None:
-    tmp_path.chmod(0o755)  # of whoever runs the tests, and not of user 10001
+def test_unwritable_volume_is_reported(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)  # owned by the user of the tests instead of user 10001
     code, log = told(
         "replay", "CartPole-v1", "--run-dir", "/runs/one", "--listen", "tcp/127.0.0.1:7447",
         options=("--volume", f"{tmp_path}:/runs"),
@@ -189,14 +189,14 @@ def test_volume_that_may_not_be_written_is_told(tmp_path: Path) -> None:
     assert "Permission denied" in log
 
 
-def test_keys_that_are_not_there_are_told() -> None:
+def test_missing_keys_are_reported() -> None:
     code, log = told("actor", "--connect", "tls/replay:7447", "--keys", "/keys")
     assert code == 2
     assert "/keys/actor/ca.pem: No such file" in log
     assert "udrl keys create" in log
 
 
-def test_replay_service_that_does_not_come_is_told() -> None:
+def test_missing_replay_service_is_reported() -> None:
     code, log = told(
         "learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3", image=LEARNER_IMAGE
     )
@@ -204,13 +204,13 @@ def test_replay_service_that_does_not_come_is_told() -> None:
     assert "no reply from 'tcp/127.0.0.1:7447' after 3 s; start `udrl replay" in log
 
 
-def test_learner_without_torch_is_told() -> None:
+def test_learner_without_torch_is_reported() -> None:
     code, log = told("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
     assert code == 2
     assert 'training needs torch; install it with: pip install "udrl[train]"' in log
 
 
-def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
+def test_image_of_another_protocol_is_reported(tmp_path: Path) -> None:
     tag = "udrl-test-other-protocol"
     (tmp_path / "Dockerfile").write_text(
         f"FROM {IMAGE}\nUSER root\n"
@@ -226,5 +226,5 @@ def test_image_of_another_protocol_is_told(tmp_path: Path) -> None:
         assert code == 2
         assert f"the run speaks protocol {PROTOCOL}, this program speaks 999" in log
         assert "install the same version of udrl on both sides" in log
-        wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "the run to go on", 120)
+        wait_for(lambda: (s := project.live(*PLAIN)) and s.iteration > 3, "progress", 120)
     run("docker", "image", "rm", tag)

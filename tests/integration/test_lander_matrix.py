@@ -1,4 +1,4 @@
-"""The determinism matrix on LunarLander: the same digests whoever runs it and whatever dies."""
+"""Determinism on LunarLander: equal digests for all fleets, kills and interruptions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +28,7 @@ Runner = Callable[..., Status]
 
 @pytest.fixture(scope="module")
 def expected() -> dict[int, Any]:
-    """Digests of the undisturbed run with one actor in one process, by lead."""
+    """Digests, by lead, of the undisturbed run with one actor in one process."""
     return {}
 
 
@@ -55,7 +55,7 @@ def test_reference_equals_the_services_at_lead_0(run: Runner) -> None:
 @pytest.mark.parametrize(
     ("actors", "envs", "in_process"), [(2, 16, False), (4, 3, True), (1, 40, True)]
 )
-def test_fleet_does_not_matter(
+def test_result_is_independent_of_the_fleet(
     lead: int, actors: int, envs: int, in_process: bool, run: Runner, same: Same
 ) -> None:
     config = lander(lead=lead)
@@ -63,7 +63,7 @@ def test_fleet_does_not_matter(
 
 
 @pytest.mark.parametrize("lead", LEADS)
-def test_kills_do_not_matter(
+def test_result_is_independent_of_kills(
     lead: int, cli: Callable[..., Cli], same: Same, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "killed"
@@ -74,7 +74,9 @@ def test_kills_do_not_matter(
 
 
 @pytest.mark.parametrize("lead", LEADS)
-def test_stops_do_not_matter(lead: int, run: Runner, same: Same, tmp_path: Path) -> None:
+def test_result_is_independent_of_interruptions(
+    lead: int, run: Runner, same: Same, tmp_path: Path
+) -> None:
     config, run_dir = lander(lead=lead), tmp_path / "stopped"
     run(config, 6_000, run_dir=run_dir)
     run(config, 12_000, run_dir=run_dir, resume=True, actors=2)

@@ -1,4 +1,4 @@
-"""Runs that are watched by TensorBoard and Prometheus, each read by the project's own tools."""
+"""Monitoring with TensorBoard and Prometheus, read by their own libraries."""
 
 import csv
 import re
@@ -19,7 +19,7 @@ from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 
 def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return (env steps, value) by tag, as TensorBoard reads them."""
+    """Return (env steps, value) by tag, as read by TensorBoard."""
     found = EventAccumulator(str(run_dir / FOLDER), size_guidance={"scalars": 0})
     found.Reload()
     return {
@@ -29,7 +29,7 @@ def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def hyperparameters(run_dir: Path) -> dict[str, object]:
-    """Return the hyperparameters that TensorBoard's HPARAMS page shows."""
+    """Return the hyperparameters of TensorBoard's HPARAMS page."""
     found = EventAccumulator(str(run_dir / FOLDER))
     found.Reload()
     content = found.SummaryMetadata(SESSION_START_INFO_TAG).plugin_data.content
@@ -42,7 +42,7 @@ def metrics(run_dir: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_event_files_equal_the_metrics(cli: Callable[..., Cli], tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     for budget in (3000, 4500):
         cli(
@@ -50,7 +50,7 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
         ).status()
         told, rows = read(run_dir), metrics(run_dir)
         assert set(told) == {*TAGS, *EVALUATION_TAGS, *DERIVED_TAGS}
-        # Iterations may be complete in the same moment; between them there is no speed.
+        # Iterations may be complete at the same time; between them there is no speed.
         walls = [0.0, *(float(r["wall_s"]) for r in rows)]
         timed = [
             int(row["env_steps"]) for row, was in zip(rows, walls[:-1], strict=True)
@@ -94,7 +94,7 @@ def scrape(port: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def test_prometheus_sees_a_run_while_it_goes_on(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_prometheus_scrapes_a_live_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
     port, run_dir = free_port(), tmp_path / "run"
     cli(*arguments(SMALL, 10_000_000, run_dir), "--metrics-port", str(port), "--actors", "1")
     wait_for(lambda: scrape(port).get("udrl_iteration", 0) > 2, "some iterations")
@@ -109,7 +109,7 @@ def test_prometheus_sees_a_run_while_it_goes_on(cli: Callable[..., Cli], tmp_pat
     assert scrape(int(said[1]))["udrl_actors"] == 1
 
 
-def test_the_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
     endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
     training = cli(*arguments(SMALL, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
     wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 0, "an iteration")
@@ -119,4 +119,4 @@ def test_the_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) 
     assert scrape(port)["udrl_up"] == 1
     training.process.terminate()
     training.finish()
-    wait_for(lambda: scrape(port).get("udrl_up") == 0, "nobody to answer")
+    wait_for(lambda: scrape(port).get("udrl_up") == 0, "the run to be unreachable")

@@ -1,4 +1,4 @@
-"""The wheel holds all that is needed, outside the checkout."""
+"""The wheel is complete and works outside the checkout."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def outside(site: Path, *command: str) -> str:
-    """Run Python where only the wheel's packages can be the ones imported."""
+    """Run Python with the wheel's packages only."""
     environment = os.environ | {"PYTHONPATH": str(site)}
     done = subprocess.run(
         [sys.executable, "-W", "error", *command],
