@@ -66,14 +66,14 @@ def test_torch_is_in_the_image_of_the_learner_only() -> None:
 
 def test_documented_custom_images_match_the_dockerfile() -> None:
     """The documented build depends on these places of the Dockerfile."""
-    told = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
-    told = told.split("\n#### An environment of your own\n")[1].split("\n### ")[0]
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    page = page.split("\n#### An environment of your own\n")[1].split("\n### ")[0]
     dockerfile = (ROOT / "Dockerfile").read_text(encoding="utf-8")
-    assert "pip --python /opt/udrl/bin/python install" in told
+    assert "pip --python /opt/udrl/bin/python install" in page
     assert "RUN python3 -m venv /opt/udrl" in dockerfile
     assert "pip uninstall --yes pip" in dockerfile, "so that PATH finds the base image's pip"
     actor, learner = dockerfile.split(" AS actor\n")[1].split("FROM actor AS learner")
-    assert "USER udrl" in told
+    assert "USER udrl" in page
     assert "\nUSER udrl\n" in actor
     assert "PYTHONPATH" not in actor, "custom images may set it"
     assert "PYTHONPATH=/opt/torch" in learner

@@ -104,7 +104,7 @@ def test_resuming_can_allow_inexact_results_but_not_forbid_them(run_dir: Path) -
 
 def test_message_flow_diagram_matches_the_rights_of_each_role() -> None:
     drawn: dict[str, set[str]] = {role: set() for role in RIGHTS}
-    says: dict[str, set[str]] = {role: set() for role in RIGHTS}
+    publishes: dict[str, set[str]] = {role: set() for role in RIGHTS}
     joins = set()
     lines = re.findall(
         r"^    (\w+) +-+ (.+?) -+> +(\w+)$",
@@ -117,13 +117,13 @@ def test_message_flow_diagram_matches_the_rights_of_each_role() -> None:
         elif what.endswith(", published"):
             name = what.removesuffix(", published")
             assert name in RIGHTS[receiver].subscribes
-            if sender in says:
-                says[sender].add(name)
+            if sender in publishes:
+                publishes[sender].add(name)
         else:
             assert receiver == "replay"
             drawn[sender] |= set(what.split(", "))
     assert drawn == {role: set(verbs.asked_by(role)) for role in RIGHTS}
-    assert says == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
+    assert publishes == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
     assert joins == {role for role, rights in RIGHTS.items() if rights.joins}
 
 

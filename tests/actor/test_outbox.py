@@ -180,11 +180,11 @@ def test_delivery_gives_up_after_repeated_join_first(scripted: Scripted, asker: 
 
 def test_failure_is_delivered(scripted: Scripted, asker: Asker) -> None:
     scripted.answers(verbs.FAILURE, lambda _: Acknowledged())
-    told = Command(
+    command = Command(
         id=8, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=1,
         stream_key=bytes(16), weights_version=0, max_steps=1,
     )  # fmt: skip
-    assert deliver(asker, JOIN, Failure(told, EnvironmentFault("it broke"))) == 8
+    assert deliver(asker, JOIN, Failure(command, EnvironmentFault("it broke"))) == 8
     (message,) = scripted.requests(verbs.FAILURE)
     assert (message.actor, message.command_id, message.error) == ("a", 8, "it broke")
 

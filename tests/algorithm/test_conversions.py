@@ -181,7 +181,7 @@ def spoil(where: Callable[[Any], Any]) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("value", "says"),
+    ("value", "message"),
     [
         (spoil(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
          r"observation\['map'\] an array of uint8, shape \(4, 5\), declared is Box"),
@@ -194,8 +194,8 @@ def spoil(where: Callable[[Any], Any]) -> Any:
         (None, r"None \(NoneType\), without observation\['inventory'\]\[0\]"),
     ],
 )  # fmt: skip
-def test_invalid_observation_is_rejected_with_its_leaf(value: Any, says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_invalid_observation_is_rejected_with_its_leaf(value: Any, message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         observation_conversion(DICT).one(value)
 
 
@@ -208,7 +208,7 @@ def test_action_component_out_of_range_is_rejected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("space", "says"),
+    ("space", "message"),
     [
         (spaces.Text(4), "its observation is Text.*Box, Discrete.*vary.*TransformObservation"),
         (
@@ -228,13 +228,13 @@ def test_action_component_out_of_range_is_rejected() -> None:
     ],
     ids=str,
 )
-def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, says: str) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, message: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=message):
         observation_conversion(space)
 
 
 @pytest.mark.parametrize(
-    ("space", "says", "bins"),
+    ("space", "message", "bins"),
     [
         (spaces.Text(4), "its action is Text.*Discrete, MultiDiscrete.*TransformAction", None),
         (
@@ -253,9 +253,9 @@ def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, says
     ids=str,
 )
 def test_unsupported_action_space_is_rejected_by_name(
-    space: AnySpace, says: str, bins: int | None
+    space: AnySpace, message: str, bins: int | None
 ) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+    with pytest.raises(UnsupportedEnvironment, match=message):
         action_conversion(space, ActionSettings(action_bins=bins))
 
 

@@ -53,10 +53,10 @@ def test_cost_includes_the_memory() -> None:
 
 def test_large_images_are_warned_of_with_the_remedy() -> None:
     screen = spec(Image(channels=3, height=210, width=160))
-    said = slow_training_warning(settings(), screen)
-    assert "every iteration will train for about 12 minutes" in said
-    assert "100 updates of 768 examples of" in said
-    assert "ResizeObservation" in said
+    warning = slow_training_warning(settings(), screen)
+    assert "every iteration will train for about 12 minutes" in warning
+    assert "100 updates of 768 examples of" in warning
+    assert "ResizeObservation" in warning
     assert slow_training_warning(settings(n_updates_per_iter=5), screen) == ""
     assert slow_training_warning(settings(device="cuda"), screen) == ""
     assert slow_training_warning(settings(), spec(Vector(size=8))) == ""

@@ -222,7 +222,7 @@ def test_discrete_actions_with_offset_are_shifted_to_zero(register: Register) ->
 
 
 @pytest.mark.parametrize(
-    ("observations", "actions", "says"),
+    ("observations", "actions", "message"),
     [
         (spaces.Text(4), spaces.Discrete(2), "its observation is Text"),
         (VECTOR, spaces.Box(-np.inf, np.inf, (2,)), "has no bounds"),
@@ -231,10 +231,10 @@ def test_discrete_actions_with_offset_are_shifted_to_zero(register: Register) ->
     ids=str,
 )
 def test_unsupported_space_is_rejected_and_the_environment_closed(
-    register: Register, observations: spaces.Space[Any], actions: spaces.Space[Any], says: str
+    register: Register, observations: spaces.Space[Any], actions: spaces.Space[Any], message: str
 ) -> None:
     blank = Blank(observations, actions)
-    with pytest.raises(UnsupportedEnvironment, match=says):
+    with pytest.raises(UnsupportedEnvironment, match=message):
         make(register(lambda: blank))
     assert blank.closed
 

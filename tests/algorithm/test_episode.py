@@ -62,7 +62,7 @@ def test_valid_episode_has_no_faults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         ({"rewards": np.zeros(0, np.float32)}, r"rewards are float32 (0,), expected float32, one"),
         ({"rewards": np.zeros(5, np.float32)}, r"one dimension of 1 to 4 steps"),
@@ -79,7 +79,7 @@ def test_valid_episode_has_no_faults() -> None:
         ({"terminated": False}, "it neither terminated nor was truncated"),
     ],
 )  # fmt: skip
-def test_invalid_episode_is_described(wrong: dict[str, Any], says: str) -> None:
+def test_invalid_episode_is_described(wrong: dict[str, Any], message: str) -> None:
     found = fault(dataclasses.replace(episode([0.0, 1.0]), **wrong), SPEC)
     assert found is not None
-    assert says in found
+    assert message in found

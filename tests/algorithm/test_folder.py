@@ -61,16 +61,16 @@ def test_policy_makes_its_environment(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("changed", "message"),
     [
         (b"{", "export the run again"),
         (b'{"format": 2}', "missing required field"),
         (b'{"format": 2, "surplus": 2}', "export the run again"),
     ],
 )
-def test_invalid_description_is_rejected(saved: Path, changed: bytes, says: str) -> None:
+def test_invalid_description_is_rejected(saved: Path, changed: bytes, message: str) -> None:
     (saved / "config.json").write_bytes(changed)
-    with pytest.raises(InvalidData, match=says):
+    with pytest.raises(InvalidData, match=message):
         udrl.load(saved)
 
 

@@ -125,7 +125,7 @@ def test_rollout_takes_allowed_actions_only() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "message"),
     [
         ({"fault": "no mask"}, "a dict of nothing as info, without 'action_mask'"),
         (
@@ -134,15 +134,15 @@ def test_rollout_takes_allowed_actions_only() -> None:
         ),
     ],
 )
-def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], says: str) -> None:
+def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], message: str) -> None:
     generator = EpisodeGenerator(config("info", given), 1)
     commands = CommandSampler(config(), generator.spec).warm_up()
-    with pytest.raises(EnvironmentFault, match=says):
+    with pytest.raises(EnvironmentFault, match=message):
         generate_episodes(generator, commands, None)
 
 
 @pytest.mark.parametrize(
-    ("mask", "given", "says"),
+    ("mask", "given", "message"),
     [
         (
             "walls",
@@ -152,8 +152,8 @@ def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], says
         ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
     ],
 )
-def test_invalid_mask_entry_is_rejected(mask: str, given: dict[str, Any], says: str) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+def test_invalid_mask_entry_is_rejected(mask: str, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=message):
         EpisodeGenerator(config(mask, given), 1)
 
 

@@ -41,9 +41,9 @@ def test_horizon_is_at_least_one_step() -> None:
 
 def test_given_horizon_is_ignored_where_horizons_follow_from_returns() -> None:
     agent = policy(desired_horizon="return")
-    told = agent.logits(SEEN, 100.5, 3).tolist()
-    assert told == agent.logits(SEEN, 100.5, 77).tolist()
-    assert told != policy().logits(SEEN, 100.5, 3).tolist()
+    found = agent.logits(SEEN, 100.5, 3).tolist()
+    assert found == agent.logits(SEEN, 100.5, 77).tolist()
+    assert found != policy().logits(SEEN, 100.5, 3).tolist()
 
 
 @pytest.mark.parametrize("temperature", [0.3, 1.0, 4.0])
@@ -74,7 +74,7 @@ def test_actions_repeat_under_the_same_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "desired", "says"),
+    ("seen", "desired", "message"),
     [
         (SEEN[:3], (1.0, 1.0), r"an observation of shape \(3,\): expected \(4,\).*CartPole-v1"),
         (SEEN, (math.nan, 1.0), "desired return nan.*finite"),
@@ -82,8 +82,8 @@ def test_actions_repeat_under_the_same_seed() -> None:
         ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation.*expected finite numbers"),
     ],
 )
-def test_invalid_input_is_rejected(seen: Any, desired: tuple[float, float], says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_invalid_input_is_rejected(seen: Any, desired: tuple[float, float], message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         policy().predict(seen, *desired)
 
 
@@ -180,7 +180,7 @@ def test_rows_of_a_batch_are_reset_independently() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "desired", "says"),
+    ("seen", "desired", "message"),
     [
         (SEEN, ([1.0, 2.0], 1), r"an observation of shape \(4,\): expected \(2, 4\)"),
         ([SEEN, SEEN], (1.0, 1), r"an observation of shape \(2, 4\): expected \(4,\)"),
@@ -189,6 +189,6 @@ def test_rows_of_a_batch_are_reset_independently() -> None:
         ([SEEN, SEEN], ([1.0, math.nan], 1), "expected finite numbers"),
     ],
 )
-def test_mismatched_batch_is_rejected(seen: Any, desired: Any, says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_mismatched_batch_is_rejected(seen: Any, desired: Any, message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         policy().predict(seen, *desired)

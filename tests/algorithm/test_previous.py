@@ -197,7 +197,7 @@ def test_wrappers_take_literal_arguments() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrapper", "says"),
+    ("wrapper", "message"),
     [
         ("FlattenObservation", "there is no colon"),
         ("gymnasium.wrappers:FrameStackObservation(3)", "arguments need names"),
@@ -209,9 +209,9 @@ def test_wrappers_take_literal_arguments() -> None:
         ("gymnasium.wrappers:TransformObservation", "TypeError"),
     ],
 )
-def test_inapplicable_wrapper_is_rejected(wrapper: str, says: str) -> None:
+def test_inapplicable_wrapper_is_rejected(wrapper: str, message: str) -> None:
     with pytest.raises(
-        UnsupportedEnvironment, match=f"{re.escape(wrapper)}.*{says}.*package.module:Wrapper"
+        UnsupportedEnvironment, match=f"{re.escape(wrapper)}.*{message}.*package.module:Wrapper"
     ):
         make_environment(config(wrappers=[wrapper]))
 

@@ -192,12 +192,12 @@ def test_policy_keeps_its_state_until_reset_and_rollout_has_its_own() -> None:
     assert actions == episode.actions.tolist()
 
     first, _ = env.reset(seed=1)
-    told = policy.logits(first, 1.0, 5).tolist()
-    assert policy.logits(first, 1.0, 5).tolist() == told
+    logits = policy.logits(first, 1.0, 5).tolist()
+    assert policy.logits(first, 1.0, 5).tolist() == logits
     policy.predict(first, 1.0, 5)
-    assert policy.logits(first, 1.0, 5).tolist() != told
+    assert policy.logits(first, 1.0, 5).tolist() != logits
     policy.reset()
-    assert policy.logits(first, 1.0, 5).tolist() == told
+    assert policy.logits(first, 1.0, 5).tolist() == logits
 
 
 def test_all_segments_have_no_windows() -> None:

@@ -45,7 +45,7 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
 
 
 @pytest.mark.parametrize(
-    ("told", "settings"),
+    ("given", "settings"),
     [
         ({}, {}),
         ({"temperature": 0.0}, {}),
@@ -59,10 +59,10 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
     ],
 )
 def test_rollout_makes_the_episode_of_its_command(
-    told: dict[str, Any], settings: dict[str, Any]
+    given: dict[str, Any], settings: dict[str, Any]
 ) -> None:
     policy, env = agent(**settings)
-    order = command(**told)
+    order = command(**given)
     (expected,) = generate_episodes(EpisodeGenerator(policy.config, 3), [order], policy.behavior)
     rollout = Rollout(policy, env, order)
     actions, rewards = [], []

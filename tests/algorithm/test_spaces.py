@@ -104,17 +104,17 @@ def test_elements_of_a_record_are_structures_without_padding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("leaf", "value", "says"),
+    ("leaf", "value", "message"),
     [
         ("['bag'][0]", np.nan, "not all finite numbers in ['bag'][0]"),
         ("['bag'][1]['deep']", 2, "not all 0 or 1 in ['bag'][1]['deep']"),
         ("['here']", 7, "from 0 to 7, expected 0 to 6 in ['here']"),
     ],
 )
-def test_fault_in_a_record_names_the_leaf(leaf: str, value: Any, says: str) -> None:
+def test_fault_in_a_record_names_the_leaf(leaf: str, value: Any, message: str) -> None:
     values = np.zeros(3, RECORD.dtype)
     values[leaf][1] = value
-    assert RECORD.fault(values, 3) == says
+    assert RECORD.fault(values, 3) == message
     assert "expected" in str(RECORD.fault(values["['bag'][0]"], 3))
 
 

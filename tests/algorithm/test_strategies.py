@@ -118,15 +118,15 @@ def test_evaluation_commands_do_not_use_the_strategy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("cautious", r"expected uniform, ranked, maximum, or a class of your own"),
         ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
         ("udrl.strategies:Missing", "AttributeError"),
     ],
 )
-def test_strategy_that_fails_to_import_is_rejected(name: str, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_strategy_that_fails_to_import_is_rejected(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         strategy(name)
 
 
@@ -156,8 +156,10 @@ def test_invalid_desired_return_is_rejected(asked: Any) -> None:
         choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5)
 
 
-@pytest.mark.parametrize(("horizon", "said"), [(0, 1), (-5, 1), (2.9, 2)])
-def test_horizon_is_truncated_to_a_whole_number_of_at_least_one(horizon: float, said: int) -> None:
+@pytest.mark.parametrize(("horizon", "expected"), [(0, 1), (-5, 1), (2.9, 2)])
+def test_horizon_is_truncated_to_a_whole_number_of_at_least_one(
+    horizon: float, expected: int
+) -> None:
     class Odd:
         def __init__(self, config: Config) -> None:
             pass
@@ -165,4 +167,4 @@ def test_horizon_is_truncated_to_a_whole_number_of_at_least_one(horizon: float, 
         def __call__(self, best: Sequence[Entry], u: float) -> Any:
             return 1.0, horizon
 
-    assert choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, said)
+    assert choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, expected)

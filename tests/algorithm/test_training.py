@@ -241,7 +241,7 @@ def test_agent_obeys_its_commands(segments: str, temperature: float, slips: int)
     state = untrained(config, generator.spec)
     train(state, experience.by_rank(sorted(experience.ids())), config)
 
-    told = [
+    issued = [
         Command(
             id=i,
             kind="explore",
@@ -256,10 +256,10 @@ def test_agent_obeys_its_commands(segments: str, temperature: float, slips: int)
         for i in range(180)
     ]
     act = ActingFunction(acting_graph(config.network, generator.spec), state.weights)
-    did = generate_episodes(generator, told, act)
+    outcomes = generate_episodes(generator, issued, act)
     disobeyed = [
         command
-        for command, episode in zip(told, did, strict=True)
+        for command, episode in zip(issued, outcomes, strict=True)
         if episode.episode_return != command.desired_return
     ]
     assert len(disobeyed) <= slips

@@ -47,7 +47,7 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
         finish(tmp_path, one)
     place = StudyFolders(tmp_path, tmp_path / "lander")
     place.folder.mkdir()
-    said = study.report(place)
+    output = study.report(place)
 
     points = read(place.folder / "curves.csv", CurvePoint)
     assert {(point.algorithm, point.variant) for point in points} == {
@@ -58,7 +58,7 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
     picture = (place.folder / "learning-curves.svg").read_text(encoding="utf-8")
     for label in ("UDRL (2 seeds)", "UDRL-paper (2 seeds)"):
         assert f">{label}</text>" in picture
-    assert "LunarLander: UDRL-paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
+    assert "LunarLander: UDRL-paper: mean return 3.5 after 100,000 env steps, seeds: 2" in output
 
 
 def test_wall_times_are_compared_on_one_kind_of_machine_only(tmp_path: Path) -> None:

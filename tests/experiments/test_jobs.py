@@ -115,12 +115,12 @@ def quietly(text: str) -> None:
 
 def test_finished_run_is_not_repeated(tmp_path: Path, program: Callable[[str], None]) -> None:
     program(FINISH)
-    said: list[str] = []
+    printed: list[str] = []
     planned = [job(seed=n) for n in (1, 2, 3)]
-    run_jobs(planned[:2], tmp_path, 2, threading.Event(), said.append)
-    assert len(said) == 2
-    run_jobs(planned, tmp_path, 2, threading.Event(), said.append)
-    assert said[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+    run_jobs(planned[:2], tmp_path, 2, threading.Event(), printed.append)
+    assert len(printed) == 2
+    run_jobs(planned, tmp_path, 2, threading.Event(), printed.append)
+    assert printed[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
     assert read_job(planned[2].folder(tmp_path)) == planned[2]
 
 
@@ -150,10 +150,10 @@ def test_records_of_finished_runs_are_copied_and_not_repeated(
     program(FINISH)
     run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
     run_jobs([job(2000, seed=2)], second, 1, threading.Event(), quietly)
-    said: list[str] = []
+    printed: list[str] = []
     wanted = [job(seed=1), job(2000, seed=2), job(seed=3)]
-    copy_finished(wanted, here, [first, second], said.append)
-    assert said == [
+    copy_finished(wanted, here, [first, second], printed.append)
+    assert printed == [
         f"copied from {first}: UDRL, CartPole-v1, seed 1: 1,000 env steps",
         f"copied from {second}: UDRL, CartPole-v1, seed 2: 2,000 env steps",
     ]
@@ -163,10 +163,10 @@ def test_records_of_finished_runs_are_copied_and_not_repeated(
             kept = one.folder(here) / name
             assert kept.read_bytes() == (one.folder(source) / name).read_bytes()
 
-    del said[:]
-    copy_finished(wanted, here, [first, second], said.append)  # they have been copied
-    run_jobs(wanted, here, 1, threading.Event(), said.append)
-    assert said == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+    del printed[:]
+    copy_finished(wanted, here, [first, second], printed.append)  # they have been copied
+    run_jobs(wanted, here, 1, threading.Event(), printed.append)
+    assert printed == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
 
 
 def test_folder_without_runs_is_rejected(tmp_path: Path) -> None:
@@ -221,10 +221,10 @@ def is_running(pid: int) -> bool:
 
 def test_stop_ends_active_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
     program(LAST)
-    stop, said = WhenItRuns(job().folder(tmp_path)), list[str]()
+    stop, printed = WhenItRuns(job().folder(tmp_path)), list[str]()
     with pytest.raises(Interrupted, match="--resume"):
-        run_jobs([job()], tmp_path, 1, stop, said.append)
-    assert "--resume" in said[-1]
+        run_jobs([job()], tmp_path, 1, stop, printed.append)
+    assert "--resume" in printed[-1]
     assert not is_running(stop.pid)
 
 

@@ -63,7 +63,7 @@ def test_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path
         (job.folder(tmp_path) / "done.json").write_text(done)
     place = StudyFolders(tmp_path, tmp_path / "search")
     place.folder.mkdir()
-    said = study.report(place)
+    text = study.report(place)
 
     found = read(place.folder / "scores.csv", Scored)
     assert len(found) == 8
@@ -72,7 +72,7 @@ def test_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path
     best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score or -math.inf)
     kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
     drawn = shipped_space("LunarLanderSparse-v3").draw("UDRL", best.configuration)
-    assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in said
+    assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in text
     assert kept == preset("LunarLanderSparse-v3-paper") | drawn
     assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()
 
@@ -86,8 +86,8 @@ def test_searched_setting_cannot_be_set(name: str) -> None:
 def test_no_preset_is_written_without_a_score(tmp_path: Path) -> None:
     study = search(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()
-    said = study.report(StudyFolders(tmp_path, tmp_path / "search"))
-    assert "every configuration has a failed run" in said
+    text = study.report(StudyFolders(tmp_path, tmp_path / "search"))
+    assert "every configuration has a failed run" in text
     assert not list((tmp_path / "search").glob("*.toml"))
 
 

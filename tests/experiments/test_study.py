@@ -43,7 +43,7 @@ class World:
             self.done = list(planned)
 
         study = Study("try", jobs, self.report, run_jobs)
-        self.said = run_study(
+        self.output = run_study(
             study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
             echo=lambda text: None,
         )  # fmt: skip
@@ -58,7 +58,7 @@ def test_report_follows_the_runs(world: World) -> None:
     world.conduct(job(1), job(2))
     assert world.done == [job(1), job(2)]
     assert world.reported == [StudyFolders(world.root, world.root / "try")]
-    assert world.said == "all is well"
+    assert world.output == "all is well"
 
 
 def test_finished_study_is_recorded(world: World) -> None:
@@ -164,9 +164,11 @@ def test_runs_are_taken_from_other_folders(
         return str(job(1).evaluations(place.root)[0].mean)
 
     study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
-    said = run_study(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
-                   echo=lambda text: None, runs_from=[other])  # fmt: skip
-    assert said == "2.0"
+    output = run_study(
+        study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
+        echo=lambda text: None, runs_from=[other],
+    )  # fmt: skip
+    assert output == "2.0"
 
 
 def test_source_without_runs_creates_no_study(world: World, tmp_path: Path) -> None:

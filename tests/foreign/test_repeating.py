@@ -64,18 +64,18 @@ def test_run_of_an_unseeded_environment_resumes_with_other_actors(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"),
+    ("kind", "message"),
     [
         (Changing, "its first steps differ"),
         (ChangingLate, r"in episode \d+ the reward of step 7\d is 10, it was 1"),
     ],
 )
 def test_changed_environment_is_detected_on_resume(
-    kind: type[Changing], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: type[Changing], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(kind, tmp_path / "run")
     monkeypatch.setattr(kind, "today", 10.0)
-    with pytest.raises(OtherConfiguration, match=rf"has changed .*{says}.*--allow-inexact"):
+    with pytest.raises(OtherConfiguration, match=rf"has changed .*{message}.*--allow-inexact"):
         train(kind, tmp_path / "run", resume=True, max_env_steps=800)
     assert read_status(tmp_path / "run").exact, (
         "no episode of the changed environment is in the run"
@@ -122,8 +122,8 @@ def test_difference_is_the_first_differing_step() -> None:
 
     assert found() is None
     paid = episode.rewards[41]
-    says = f"the reward of step 41 is {paid:g}, it was {paid + 1:g}"
-    assert found(rewards=changed(episode.rewards, 41)) == says
+    message = f"the reward of step 41 is {paid:g}, it was {paid + 1:g}"
+    assert found(rewards=changed(episode.rewards, 41)) == message
     assert (
         found(observations=changed(episode.observations, 3)) == "the observation of step 3 differs"
     )

@@ -65,16 +65,16 @@ def test_unsupported_environment_is_rejected() -> None:
 
 
 def test_command_prints_lines_or_json() -> None:
-    told = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
-    assert "repeats       yes, from its seed" in told.stdout
-    assert "verdict       supported; train with: udrl train CartPole-v1" in told.stdout
-    told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
-    assert json.loads(told.stdout)["max_episode_steps"] == 500
-    told = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
+    result = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
+    assert "repeats       yes, from its seed" in result.stdout
+    assert "verdict       supported; train with: udrl train CartPole-v1" in result.stdout
+    result = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
+    assert json.loads(result.stdout)["max_episode_steps"] == 500
+    result = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
     chosen = "baseline = value, held_actions = 0.25, held_rate = 0.05, hold_steps = 32"
-    assert f"settings      {chosen}" in told.stdout
+    assert f"settings      {chosen}" in result.stdout
     assert (
-        "All random episodes return" not in told.stdout
+        "All random episodes return" not in result.stdout
     )  # with actions held for 32 steps, some episodes succeed
 
 

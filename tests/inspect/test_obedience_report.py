@@ -84,16 +84,16 @@ def test_summary_of_an_agent_that_does_not_follow(correlation: float) -> None:
 
 
 def test_other_sentences_of_the_summary() -> None:
-    told = report(lambda r: 100 - abs(r - 80))
-    assert best(told) == (
+    example = report(lambda r: 100 - abs(r - 80))
+    assert best(example) == (
         "Highest mean return: 100 (95 % interval 98 to 102), commanded 80 within 42 steps."
     )
-    assert horizons(told) == (
+    assert horizons(example) == (
         "Horizons from 10 to 20 steps, commanded with a return of 100: mean lengths from 15 to 25 "
         "steps, mean absolute error 5, correlation 1.00."
     )
-    assert horizons(msgspec.structs.replace(told, by_horizon=[], all_horizons=None)) == ""
-    assert rule(told).startswith("Obeyed: the mean lies within 20 of the command (10 % of")
+    assert horizons(msgspec.structs.replace(example, by_horizon=[], all_horizons=None)) == ""
+    assert rule(example).startswith("Obeyed: the mean lies within 20 of the command (10 % of")
     assert rule(report(tolerance=30.0)) == (
         "Obeyed: the mean lies within 30 of the command, and increases with it."
     )
@@ -109,55 +109,55 @@ def test_huge_tolerance_hides_no_digits() -> None:
 
 
 def test_table_ends_with_the_summary() -> None:
-    told = report(obeyed=(30.0, 80.0))
-    lines = table(told).splitlines()
+    example = report(obeyed=(30.0, 80.0))
+    lines = table(example).splitlines()
     assert lines[0].startswith("Some-v0, weights version 7, temperature 1, 10 episodes")
     assert [line.split() for line in lines[3:5]] == [
         ["-20", "40", "-20", "-22", "to", "-18", "50"],
         ["30", "41", "30", "28", "to", "32", "50", "obeyed"],
     ]
     assert sum(line.endswith("obeyed") for line in lines) == 2
-    assert lines[-1] == answer(told)
+    assert lines[-1] == answer(example)
 
 
 def test_card_begins_with_the_summary_and_has_the_table() -> None:
-    told = report(obeyed=(30.0, 80.0))
-    text = markdown(told)
-    assert text.startswith(f"**{answer(told)}**\n\n| desired return |")
+    example = report(obeyed=(30.0, 80.0))
+    text = markdown(example)
+    assert text.startswith(f"**{answer(example)}**\n\n| desired return |")
     assert "| 30 | 41 | 30 | 28 to 32 | 50 | obeyed |" in text
     bars = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert bars == {7}
 
 
 def test_csv_file_has_every_point(tmp_path: Path) -> None:
-    told = report(obeyed=(30.0, 80.0))
-    csv_tables.write(tmp_path / "obedience.csv", Row, rows(told))
+    example = report(obeyed=(30.0, 80.0))
+    csv_tables.write(tmp_path / "obedience.csv", Row, rows(example))
     with (tmp_path / "obedience.csv").open(newline="") as file:
         found = list(csv.DictReader(file))
     assert [row["sweep"] for row in found] == ["return"] * 4 + ["horizon"] * 2
     assert [row["obeyed"] for row in found] == ["False", "True", "True", "False"] + ["False"] * 2
     shared = [f.name for f in msgspec.structs.fields(ObediencePoint)]
-    for row, measured in zip(found, told.by_return + told.by_horizon, strict=True):
+    for row, measured in zip(found, example.by_return + example.by_horizon, strict=True):
         assert [float(row[name]) for name in shared] == list(msgspec.structs.astuple(measured))
 
 
 @pytest.mark.parametrize("obeyed", [None, (30.0, 80.0)])
 def test_figure_shows_the_obeyed_range(tmp_path: Path, obeyed: tuple[float, float] | None) -> None:
-    told = report(obeyed=obeyed)
+    example = report(obeyed=obeyed)
     for name in ("both.svg", "one.png", "one.pdf"):
-        draw(told, tmp_path / "pictures" / name)
-        told = msgspec.structs.replace(told, by_horizon=[], all_horizons=None)
+        draw(example, tmp_path / "pictures" / name)
+        example = msgspec.structs.replace(example, by_horizon=[], all_horizons=None)
     ElementTree.fromstring((tmp_path / "pictures" / "both.svg").read_text())
     assert (tmp_path / "pictures" / "one.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
-        draw(told, tmp_path / "picture.bmp")
+        draw(example, tmp_path / "picture.bmp")
 
 
 def test_report_round_trips(tmp_path: Path) -> None:
     assert load_report(tmp_path) is None
-    for told in (report(), report(obeyed=(30.0, 80.0))):
-        assert save_report(tmp_path, told) == tmp_path / FILE
-        assert load_report(tmp_path) == told
+    for example in (report(), report(obeyed=(30.0, 80.0))):
+        assert save_report(tmp_path, example) == tmp_path / FILE
+        assert load_report(tmp_path) == example
     with pytest.raises(StoreError, match="make the directory writable"):
         save_report(tmp_path / "nowhere", report())
 

@@ -31,9 +31,9 @@ def test_training_equals_that_of_the_command(run: Callable[..., Status], tmp_pat
     assert seen[-1] == trained.status
     assert trained.status.state == "ended"
     assert trained.run_dir == tmp_path / "api"
-    told = trained.policy
+    trained_policy = trained.policy
     seen_now = [0.0, 0.1, 0.0, -0.1]
-    assert told.logits(seen_now, 50.0, 50).tolist() == (
+    assert trained_policy.logits(seen_now, 50.0, 50).tolist() == (
         load_agent(tmp_path / "api").policy.logits(seen_now, 50.0, 50).tolist()
     )
 

@@ -308,9 +308,9 @@ def test_pause_step_and_a_changed_command(client: TestClient) -> None:
         socket.send_json(
             {"do": "change", "desired_return": 90.0, "desired_horizon": 70, "temperature": 0.0}
         )
-        told = next(seen)
-        assert (told["desired_return"], told["desired_horizon"]) == (90.0, 70)
-        assert (told["step"], told["is_changed"], told["temperature"]) == (2, True, 0.0)
+        changed = next(seen)
+        assert (changed["desired_return"], changed["desired_horizon"]) == (90.0, 70)
+        assert (changed["step"], changed["is_changed"], changed["temperature"]) == (2, True, 0.0)
         socket.send_json({"do": "pause", "paused": False})
         last = ending(socket)
         assert last["is_changed"]
@@ -570,9 +570,9 @@ def test_listening_beyond_loopback_creates_a_token(
 ) -> None:
     process = cli("board", str(ended_run), "--host", "0.0.0.0").process
     assert process.stdout is not None
-    said = process.stdout.readline()
+    line = process.stdout.readline()
     # By a name that other machines may use, unlike 0.0.0.0.
-    assert said.startswith(f"board: http://{socket.gethostname()}:")
-    assert len(said.split("?token=")[1].strip()) >= 20
+    assert line.startswith(f"board: http://{socket.gethostname()}:")
+    assert len(line.split("?token=")[1].strip()) >= 20
     process.terminate()
     assert process.wait(20) == 128 + signal.SIGTERM

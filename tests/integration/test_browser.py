@@ -102,9 +102,9 @@ def board(cli: Callable[..., Cli]) -> Callable[..., str]:
     def start(*words: object) -> str:
         process = cli("board", *map(str, words)).process
         assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.startswith("board: "), said
-        return said.split()[1]
+        line = process.stdout.readline()
+        assert line.startswith("board: "), line
+        return line.split()[1]
 
     return start
 
@@ -341,14 +341,14 @@ def test_map_shows_the_obeyed_returns(
 ) -> None:
     run_dir = Path(shutil.copytree(obedient, tmp_path / "run"))
     page = pages(board(run_dir))
-    said, shaded = page.locator("#obeys"), page.locator("#map rect.obeys")
-    expect(said).to_contain_text(f"udrl obedience {run_dir}", timeout=SOON)
+    caption, shaded = page.locator("#obeys"), page.locator("#map rect.obeys")
+    expect(caption).to_contain_text(f"udrl obedience {run_dir}", timeout=SOON)
     expect(shaded).to_have_count(0)
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=5, episodes=20, temperature=0.0))
     save_report(run_dir, report)
-    expect(said).to_have_text(summary(report), timeout=SOON)
-    expect(said).to_contain_text("Command returns between 0 and 4")
+    expect(caption).to_have_text(summary(report), timeout=SOON)
+    expect(caption).to_contain_text("Command returns between 0 and 4")
     expect(shaded).to_have_count(1)
     left, right = shaded.bounding_box(), page.locator("#map svg").bounding_box()
     assert left is not None
@@ -356,7 +356,7 @@ def test_map_shows_the_obeyed_returns(
     assert 0.5 * right["width"] < left["width"] < right["width"]
     latest = report.weights_version
     save_report(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
-    expect(said).to_contain_text(
+    expect(caption).to_contain_text(
         f"Measured with weights version {latest - 1}; the latest is {latest}.", timeout=SOON
     )
     expect(shaded).to_have_count(0)
@@ -386,17 +386,17 @@ def test_cursor_reads_the_curve(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     page = pages(board(ended_run))
-    said, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
+    caption, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
     final = read_status(ended_run).final_evaluation
     assert final is not None
-    expect(said).to_contain_text("best evaluation", timeout=SOON)
-    summary = said.inner_text()
+    expect(caption).to_contain_text("best evaluation", timeout=SOON)
+    summary = caption.inner_text()
     box = curve.bounding_box()
     assert box is not None
     curve.hover(position={"x": box["width"] - 2, "y": 20})
-    expect(said).to_contain_text(f"final evaluation {final.mean:,.1f}".removesuffix(".0"))
+    expect(caption).to_contain_text(f"final evaluation {final.mean:,.1f}".removesuffix(".0"))
     page.mouse.move(0, 0)
-    expect(said).to_have_text(summary)
+    expect(caption).to_have_text(summary)
 
 
 def test_failed_run_shows_the_reason_and_how_to_resume(

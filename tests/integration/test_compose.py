@@ -170,7 +170,9 @@ def test_torch_is_in_the_image_of_the_learner_only() -> None:
 # Errors are in the log and exit code of the container that fails.
 
 
-def told(*arguments: str, options: tuple[str, ...] = (), image: str = IMAGE) -> tuple[int, str]:
+def outcome_of(
+    *arguments: str, options: tuple[str, ...] = (), image: str = IMAGE
+) -> tuple[int, str]:
     """Return exit code and log of a container that exits by itself."""
     command = ["docker", "run", "--rm", "--init", "--read-only", "--tmpfs", "/tmp", *options]
     done = subprocess.run([*command, image, *arguments], capture_output=True, text=True, timeout=90)
@@ -180,7 +182,7 @@ def told(*arguments: str, options: tuple[str, ...] = (), image: str = IMAGE) -> 
 
 def test_unwritable_volume_is_reported(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)  # owned by the user of the tests instead of user 10001
-    code, log = told(
+    code, log = outcome_of(
         "replay", "CartPole-v1", "--run-dir", "/runs/one", "--listen", "tcp/127.0.0.1:7447",
         options=("--volume", f"{tmp_path}:/runs"),
     )  # fmt: skip
@@ -190,14 +192,14 @@ def test_unwritable_volume_is_reported(tmp_path: Path) -> None:
 
 
 def test_missing_keys_are_reported() -> None:
-    code, log = told("actor", "--connect", "tls/replay:7447", "--keys", "/keys")
+    code, log = outcome_of("actor", "--connect", "tls/replay:7447", "--keys", "/keys")
     assert code == 2
     assert "/keys/actor/ca.pem: No such file" in log
     assert "udrl keys create" in log
 
 
 def test_missing_replay_service_is_reported() -> None:
-    code, log = told(
+    code, log = outcome_of(
         "learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3", image=LEARNER_IMAGE
     )
     assert code == 6
@@ -205,7 +207,7 @@ def test_missing_replay_service_is_reported() -> None:
 
 
 def test_learner_without_torch_is_reported() -> None:
-    code, log = told("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
+    code, log = outcome_of("learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3")
     assert code == 2
     assert 'training needs torch; install it with: pip install "udrl[train]"' in log
 
@@ -222,7 +224,7 @@ def test_image_of_another_protocol_is_reported(tmp_path: Path) -> None:
     with Project("udrl-test-other", ["compose.yaml"], variables) as project:
         project.compose("up", "--detach")
         network = ("--network", f"{project.name}_run")
-        code, log = told("actor", "--connect", "tcp/replay:7447", options=network, image=tag)
+        code, log = outcome_of("actor", "--connect", "tcp/replay:7447", options=network, image=tag)
         assert code == 2
         assert f"the run speaks protocol {PROTOCOL}, this program speaks 999" in log
         assert "install the same version of udrl on both sides" in log

@@ -85,11 +85,11 @@ def test_earlier_weights_have_their_own_evaluation(ended_run: Path, tmp_path: Pa
         version = store.evaluations(-1, 10**9)[0].iteration - small().lead
     export(ended_run, "--folder", tmp_path / "best", "--weights", version)
     card = (tmp_path / "best" / "README.md").read_text()
-    told = re.search(r"\*\*Mean return.*desired return of (\S+) within (\d+) steps", card)
-    assert told is not None
+    found = re.search(r"\*\*Mean return.*desired return of (\S+) within (\d+) steps", card)
+    assert found is not None
     loaded = udrl.load(tmp_path / "best")
-    assert f"{loaded.desired_return:.1f}" == told[1]
-    assert str(loaded.desired_horizon) == told[2]
+    assert f"{loaded.desired_return:.1f}" == found[1]
+    assert str(loaded.desired_horizon) == found[2]
     # The command does not end with these weights, and the card must not claim so.
     assert f"version {version} of this command's run has bit-identical weights" in card
     assert "this command trains bit-identical weights" not in card

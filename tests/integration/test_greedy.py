@@ -60,8 +60,8 @@ def test_one_bad_episode_is_not_warned_of(
 def test_incomparable_evaluations_are_not_warned_of(
     agent: Agent, ended_run: Path, greedy: Command
 ) -> None:
-    for told in (replace(greedy, temperature=1.0), replace(greedy, desired_return=1.0)):
-        assert not caution(agent, ended_run, told, [-1e6] * 20)
+    for other in (replace(greedy, temperature=1.0), replace(greedy, desired_return=1.0)):
+        assert not caution(agent, ended_run, other, [-1e6] * 20)
     of_greedy_run = agent._replace(config=change(agent.config, eval_temperature=0.0))
     assert not caution(of_greedy_run, ended_run, greedy, [-1e6] * 20)
 
@@ -75,11 +75,11 @@ def test_commands_print_the_warning_to_stderr(
 ) -> None:
     given: list[float] = []
 
-    def said(agent: Agent, run_dir: Path, told: Command, returns: list[float]) -> str:
+    def fake_caution(agent: Agent, run_dir: Path, other: Command, returns: list[float]) -> str:
         given.extend(returns)
-        return f"temperature {told.temperature:g}"
+        return f"temperature {other.temperature:g}"
 
-    monkeypatch.setattr(f"udrl_launch.subcommands.{module}.caution", said)
+    monkeypatch.setattr(f"udrl_launch.subcommands.{module}.caution", fake_caution)
     result = CliRunner().invoke(
         cli, [command, str(ended_run), "--episodes", "2", "--greedy", "--json"],
         standalone_mode=False, catch_exceptions=False,

@@ -60,8 +60,8 @@ def test_greedy_play_shows_the_episodes_of_evaluate(ended_run: Path) -> None:
              "--desired-horizon", 50, "--json")
     )  # fmt: skip
     assert [p["episode_return"] for p in played] == counted.returns
-    told = {"desired_return": 60.0, "desired_horizon": 50, "temperature": 0.0}
-    assert all(told.items() <= p.items() for p in played)
+    expected = {"desired_return": 60.0, "desired_horizon": 50, "temperature": 0.0}
+    assert all(expected.items() <= p.items() for p in played)
     assert all(
         p["length"] == p["episode_return"] for p in played
     )  # on CartPole, returns equal lengths
@@ -116,9 +116,11 @@ def test_batched_evaluations_equal_single_ones(ended_run: Path) -> None:
 
 
 def test_play_prints_desired_and_obtained_return(ended_run: Path) -> None:
-    said = call("play", ended_run, "--episodes", 1, "--desired-return", 60, "--desired-horizon", 50)
-    assert "desired return 60.0 within 50 steps (temperature 1, weights version" in said
-    assert ": return " in said
+    output = call(
+        "play", ended_run, "--episodes", 1, "--desired-return", 60, "--desired-horizon", 50
+    )
+    assert "desired return 60.0 within 50 steps (temperature 1, weights version" in output
+    assert ": return " in output
 
 
 def test_seed_reproduces_episodes_and_consecutive_seeds_share_them(
@@ -146,15 +148,17 @@ def test_video_has_a_frame_for_every_moment(ended_run: Path, tmp_path: Path, kin
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("film.avi", "ends with .mp4 or .gif"),
         ("taken/film.gif", "choose a writable file"),
     ],
 )
-def test_invalid_video_is_rejected(ended_run: Path, tmp_path: Path, name: str, says: str) -> None:
+def test_invalid_video_is_rejected(
+    ended_run: Path, tmp_path: Path, name: str, message: str
+) -> None:
     (tmp_path / "taken").write_text("a file where a folder should be")
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
 
 
@@ -185,12 +189,12 @@ def test_video_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> 
 
 def test_wrong_extension_is_rejected_before_anything_is_loaded(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
-    for arguments, says in [
+    for arguments, message in [
         (("play", nowhere, "--video", tmp_path / "film.avi"), "ends with .mp4 or .gif"),
         (("obedience", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
         (("plot", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
     ]:
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=message):
             call(*arguments)
 
 

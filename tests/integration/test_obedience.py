@@ -54,7 +54,7 @@ def run_dir(ended_run: Path, tmp_path: Path) -> Path:
 
 
 def test_obedient_agent_is_reported_as_such(obedient: Path) -> None:
-    said, _ = call("obedience", obedient, "--episodes", 30, "--points", 5, "--greedy")
+    text, _ = call("obedience", obedient, "--episodes", 30, "--points", 5, "--greedy")
     report = load_report(obedient)
     assert report is not None
     assert [p.desired_return for p in report.by_return] == [0, 1, 2, 3, 4]
@@ -63,8 +63,8 @@ def test_obedient_agent_is_reported_as_such(obedient: Path) -> None:
     assert report.obeyed is not None
     assert (report.obeyed.low, report.obeyed.high) == (0.0, 4.0)
     assert report.obeyed.correlation > 0.99
-    assert said.splitlines()[-1] == answer(report)
-    assert "Command returns between 0 and 4; mean absolute error 0.0" in said
+    assert text.splitlines()[-1] == answer(report)
+    assert "Command returns between 0 and 4; mean absolute error 0.0" in text
 
 
 def test_output_is_one_document_and_reproducible(run_dir: Path) -> None:
@@ -201,7 +201,7 @@ def test_custom_path_of_the_figure(run_dir: Path, tmp_path: Path) -> None:
 
 def test_unwritable_directory_does_not_lose_the_report(run_dir: Path) -> None:
     (run_dir / "obedience.json.part").mkdir()
-    said, problem = call("obedience", run_dir, "--episodes", 2, "--points", 2)
-    assert "Highest mean return" in said
+    text, problem = call("obedience", run_dir, "--episodes", 2, "--points", 2)
+    assert "Highest mean return" in text
     assert "the report cannot be written to" in problem
     assert "make the directory writable" in problem

@@ -88,7 +88,7 @@ def test_existing_or_unknown_name_is_rejected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         (replace(VECTOR, observation_space=Vector(size=5)),
          r"has observations Box.* and actions .* environment has Vector\(size=5\)"),
@@ -98,9 +98,9 @@ def test_existing_or_unknown_name_is_rejected() -> None:
         (IMAGE, "name a dataset of the run's environment"),
     ],
 )  # fmt: skip
-def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, says: str) -> None:
+def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, message: str) -> None:
     write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         read_dataset("some/ours-v0", small(), spec)
 
 

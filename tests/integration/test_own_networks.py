@@ -59,7 +59,7 @@ def test_run_equals_the_reference_and_its_folder_needs_no_class(
     assert digests(status) == digests(reference(config, 3000))
     agent = load_agent(run_dir)
     export_folder(agent, run_dir, tmp_path / "folder")
-    told = agent.policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist()
+    logits = agent.policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist()
     program = (
         "import sys, udrl\n"
         f"policy = udrl.load({str(tmp_path / 'folder')!r})\n"
@@ -69,7 +69,7 @@ def test_run_equals_the_reference_and_its_folder_needs_no_class(
     found = subprocess.run(
         [sys.executable, "-c", program], check=True, capture_output=True, text=True
     )
-    assert found.stdout.strip() == str(told)
+    assert found.stdout.strip() == str(logits)
 
 
 def test_initial_weights_are_a_function_of_the_seed() -> None:
@@ -85,7 +85,7 @@ def test_initial_weights_are_a_function_of_the_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("NoSuchClass", "AttributeError.*importable here, as package.module:Class"),
         ("NoModule", "is NoModule, expected a torch.nn.Module"),
@@ -95,8 +95,8 @@ def test_initial_weights_are_a_function_of_the_seed() -> None:
         ("Broken", "cannot be computed or exported: RuntimeError: not today"),
     ],
 )
-def test_invalid_module_is_rejected_when_the_run_is_created(name: str, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_invalid_module_is_rejected_when_the_run_is_created(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         algorithm1(settings(name), Budget(max_env_steps=100))
 
 

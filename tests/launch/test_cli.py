@@ -22,7 +22,7 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["trian", "CartPole-v1"], "no command 'trian'; did you mean 'train'? (see udrl --help)"),
         (["bord"], "no command 'bord'; did you mean 'board'? (see udrl --help)"),
@@ -43,9 +43,9 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
         ),
     ],
 )
-def test_error_is_one_line_with_the_remedy(arguments: list[str], says: str) -> None:
+def test_error_is_one_line_with_the_remedy(arguments: list[str], message: str) -> None:
     ended = udrl(*arguments)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {says}\n")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {message}\n")
 
 
 def test_error_of_a_service_has_the_same_form(tmp_path: Path) -> None:

@@ -74,25 +74,25 @@ def ended(body: str, *signals: int) -> tuple[int, str]:
         assert process.stdout.readline() == "up\n"
         for number in signals:
             process.send_signal(number)
-        _, said = process.communicate(timeout=30)
-    return process.returncode, said
+        _, log = process.communicate(timeout=30)
+    return process.returncode, log
 
 
 def test_service_runs_in_the_main_thread_and_its_error_sets_the_exit_code() -> None:
     assert ended("pass") == (0, "")
-    code, said = ended("raise StoreError('the disk is gone')")
+    code, log = ended("raise StoreError('the disk is gone')")
     assert code == 8
-    assert said == "udrl: error: the disk is gone\n"
+    assert log == "udrl: error: the disk is gone\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_stops_a_service(number: signal.Signals) -> None:
-    code, said = ended("assert stop.wait(20)", number)
+    code, log = ended("assert stop.wait(20)", number)
     assert code == 128 + number
-    assert "stopped" in said
-    code, said = ended("assert stop.wait(20); raise Interrupted('in the middle')", number, number)
+    assert "stopped" in log
+    code, log = ended("assert stop.wait(20); raise Interrupted('in the middle')", number, number)
     assert code == 128 + number
-    assert "in the middle" in said
+    assert "in the middle" in log
 
 
 def test_other_signals_are_left_to_the_environment() -> None:
@@ -115,9 +115,9 @@ def test_forked_child_handles_its_own_signals() -> None:
 
 
 def test_unresponsive_service_is_abandoned() -> None:
-    code, said = ended("time.sleep(20)", signal.SIGTERM)
+    code, log = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
-    assert "did not stop within 3 s; exiting" in said
+    assert "did not stop within 3 s; exiting" in log
 
 
 @pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])

@@ -65,8 +65,8 @@ def test_permanent_error_is_not_retried(supervisor: Supervisor, code: int) -> No
 
 def test_child_that_dies_without_progress_is_given_up(supervisor: Supervisor) -> None:
     start(supervisor, "child", "print('why'); raise SystemExit(1)")
-    says = "child ended with code 1 6 times without progress:\nwhy"
-    with pytest.raises(RunFailed, match=says):
+    message = "child ended with code 1 6 times without progress:\nwhy"
+    with pytest.raises(RunFailed, match=message):
         check_until(supervisor, lambda: False)
 
 
@@ -85,8 +85,8 @@ def test_child_that_makes_progress_is_always_restarted(supervisor: Supervisor) -
 
 def test_signal_is_reported_with_its_name_and_usual_cause(supervisor: Supervisor) -> None:
     start(supervisor, "child", "import os; os.kill(os.getpid(), 9)")
-    says = r"child ended by SIGKILL \(killed, or out of memory\) 6 times"
-    with pytest.raises(RunFailed, match=says):
+    message = r"child ended by SIGKILL \(killed, or out of memory\) 6 times"
+    with pytest.raises(RunFailed, match=message):
         check_until(supervisor, lambda: False)
     assert module.how_it_ended(-11) == "ended by SIGSEGV (a crash in native code)"
     assert module.how_it_ended(-40) == "ended by signal 40"

@@ -381,8 +381,8 @@ def test_table_of_rights_is_documented() -> None:
     for line in section("docs/protocol.md", "## Permissions").splitlines():
         if line.startswith("| `"):
             cells = [re.findall(r"`([^`]+)`", cell) for cell in line.strip("|").split("|")]
-            (role,), asks, hears, says, tokens = cells
-            found[role] = set(asks), set(hears), set(says), tokens
+            (role,), asks, hears, publishes, tokens = cells
+            found[role] = set(asks), set(hears), set(publishes), tokens
     assert found == {
         role: (
             set(verbs.asked_by(role)),

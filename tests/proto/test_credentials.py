@@ -88,17 +88,17 @@ def _from_tomorrow(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (_until_a_minute_ago, "expired at 20.*UTC; create new keys"),
         (_from_tomorrow, "valid from 20.*clock here says 20.*correct the clock"),
     ],
 )
 def test_certificate_outside_its_validity_period_is_reported(
-    make: Callable[[Path], None], said: str, tmp_path: Path
+    make: Callable[[Path], None], message: str, tmp_path: Path
 ) -> None:
     make(tmp_path)
-    with pytest.raises(ConfigError, match=rf"ca\.pem.*{said}"):
+    with pytest.raises(ConfigError, match=rf"ca\.pem.*{message}"):
         load(tmp_path, "actor")
 
 

@@ -111,9 +111,11 @@ def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
 
 def assert_same_class(config: Config) -> None:
     generator = EpisodeGenerator(config, 1)
-    said = hello(config, generator.spec)
-    assert stranger.numerics_class(said) == acting_class(said["graph"], generator.spec.action_space)
-    assert stranger.environment_digest(said) == environment_digest(generator)
+    run_hello = hello(config, generator.spec)
+    assert stranger.numerics_class(run_hello) == acting_class(
+        run_hello["graph"], generator.spec.action_space
+    )
+    assert stranger.environment_digest(run_hello) == environment_digest(generator)
     generator.close()
 
 
@@ -194,15 +196,15 @@ def assert_same_episodes(
         )
         for index in range(5)
     ]
-    said = hello(config, generator.spec)
+    run_hello = hello(config, generator.spec)
     behavior = network = None
     if version:
         weights = untrained(config, generator.spec).weights
-        behavior = ActingFunction(said["graph"], weights)
-        network = stranger.Network(said["graph"], weights)
+        behavior = ActingFunction(run_hello["graph"], weights)
+        network = stranger.Network(run_hello["graph"], weights)
     for ours in generate_episodes(generator, commands, behavior):
         command = msgspec.to_builtins(commands[ours.command_id], builtin_types=(bytes,))
-        theirs = stranger.run_episode(command, said, network)
+        theirs = stranger.run_episode(command, run_hello, network)
         assert stranger.episode_digest(ours.command_id, theirs) == episode_digest(ours)
 
 

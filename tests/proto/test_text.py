@@ -20,7 +20,7 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize(
-    ("said", "shown"),
+    ("raw", "shown"),
     [
         ("", ""),
         ("läuft ± 3.5 観測 🙂", "läuft ± 3.5 観測 🙂"),
@@ -32,8 +32,8 @@ HOSTILE = (
         (ValueError("two\nlines"), r"two\nlines"),
     ],
 )
-def test_control_sequences_are_escaped(said: object, shown: str) -> None:
-    assert printable(said) == shown
+def test_control_sequences_are_escaped(raw: object, shown: str) -> None:
+    assert printable(raw) == shown
 
 
 @given(st.text())

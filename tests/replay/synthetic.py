@@ -91,8 +91,8 @@ def join(name: str, environments: int = 4) -> JoinRequest:
 
 def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
     """Run a command; ``other``: with the result of a machine that rounds differently."""
-    told = f"{command.id}|{command.desired_return}|{command.desired_horizon}"
-    cause = hashlib.sha256(told.encode() + weights).digest()
+    text = f"{command.id}|{command.desired_return}|{command.desired_horizon}"
+    cause = hashlib.sha256(text.encode() + weights).digest()
     length = 1 + cause[0] % command.max_steps
     return Episode(
         command_id=command.id,

@@ -31,12 +31,12 @@ def run(make_run: Callable[..., StoredRun]) -> StoredRun:
 
 
 def test_advice_is_given_after_a_third_of_the_budget_without_learning(run: StoredRun) -> None:
-    said = advice(run)
-    assert said.startswith(
+    text = advice(run)
+    assert text.startswith(
         "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
     )
-    assert said.endswith("See 'Signs of trouble' in docs/metrics.md")
-    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == said
+    assert text.endswith("See 'Signs of trouble' in docs/metrics.md")
+    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == text
     run.budget = Budget(max_env_steps=3 * run.progress.env_steps + 1)
     assert advice(run) == ""
 

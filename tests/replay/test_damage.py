@@ -72,17 +72,17 @@ def test_damaged_page_is_detected_or_harmless(written: Path) -> None:
     whole = written.read_bytes()
     expected = read_everything(written.parent)
     size = int.from_bytes(whole[16:18], "big")
-    told = 0
+    detected = 0
     for start in range(0, len(whole), size):
         for junk in (bytes(size), b"\xa5" * size):
             written.write_bytes(whole[:start] + junk + whole[start + size :])
             try:
                 assert read_everything(written.parent) == expected
             except DamagedStore:
-                told += 1
+                detected += 1
     written.write_bytes(whole)
     assert read_everything(written.parent) == expected
-    assert told > len(whole) // size
+    assert detected > len(whole) // size
 
 
 @pytest.mark.parametrize("left", [0, 1, 100, 5000, -4096, -1])
@@ -237,7 +237,7 @@ def test_flipped_bits_are_detected_or_harmless(written: Path) -> None:
     chance = random.Random(1)
     whole = written.read_bytes()
     expected = read_everything(written.parent)
-    told = 0
+    detected = 0
     for _ in range(300):
         broken = bytearray(whole)
         broken[chance.randrange(len(broken))] ^= 1 << chance.randrange(8)
@@ -246,8 +246,8 @@ def test_flipped_bits_are_detected_or_harmless(written: Path) -> None:
             assert read_everything(written.parent) == expected
         except (DamagedStore, OtherConfiguration) as error:
             assert str(written) in str(error)  # noqa: PT017 - either outcome is correct
-            told += 1
-    assert told > 100
+            detected += 1
+    assert detected > 100
 
 
 def test_file_truncated_anywhere_is_detected(written: Path) -> None:

@@ -65,10 +65,10 @@ def test_hostile_text_forges_no_log_line(
 ) -> None:
     with caplog.at_level(logging.INFO, "udrl"):
         status = send_hostile_text(transport)
-    said = [record.getMessage() for record in caplog.records]
+    logged = [record.getMessage() for record in caplog.records]
     for part in ("joined from no", " connected", " disconnected", "invalid commands: ",
                  "refused join: ", "failed on command", "failed three times"):  # fmt: skip
-        assert any(part in line for line in said), part
-    assert [line for line in said if not line.isprintable()] == []
+        assert any(part in line for line in logged), part
+    assert [line for line in logged if not line.isprintable()] == []
     assert status.state == "failed"
     assert status.problem.isprintable()
