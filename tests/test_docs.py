@@ -260,7 +260,7 @@ def test_every_warning_and_error_of_the_log_is_documented() -> None:
 LITERALS = re.sub(r'"\s*\n?\s*f?"', "", " ".join(text_of(path) for path in SOURCES))
 
 
-def is_in_the_code(message: str) -> bool:
+def is_in_source(message: str) -> bool:
     """Return whether the code has a message, in which … stands for variable parts."""
     pattern = r"[^\n]{1,80}?".join(re.escape(part) for part in message.split("…"))
     return re.search(pattern, LITERALS) is not None
@@ -268,7 +268,7 @@ def is_in_the_code(message: str) -> bool:
 
 def test_documented_log_lines_exist() -> None:
     for line in names(section("docs/operations-reference.md", "## Log lines"), "line"):
-        assert is_in_the_code(line), line
+        assert is_in_source(line), line
 
 
 def test_messages_in_troubleshooting_exist() -> None:
@@ -276,7 +276,7 @@ def test_messages_in_troubleshooting_exist() -> None:
     messages = {*names(text, "message"), *re.findall(r"\*\*`([^`]+)`\*\*", text)}
     assert len(messages) > 12
     for message in messages:
-        assert is_in_the_code(message), message
+        assert is_in_source(message), message
 
 
 def test_every_extra_is_documented() -> None:

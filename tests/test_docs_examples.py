@@ -183,7 +183,7 @@ _PATH = re.compile(r"(udrl|proto|services|tests|docs|benchmarks|experiments|\.ci
 _DOTTED = re.compile(r"(udrl|udrl_(?:proto|actor|learner|replay|launch))(\.\w+)+")
 
 
-def is_there(dotted: str) -> bool:
+def exists(dotted: str) -> bool:
     """Return whether a dotted name is a module, or an attribute of one."""
     module, _, rest = dotted.partition(".")
     found = importlib.import_module(module)
@@ -208,7 +208,7 @@ def test_code_named_in_the_documentation_exists(page: Path) -> None:
         if "/" in name and _PATH.fullmatch(name):
             assert (ROOT / name).exists() or (ROOT / page).parent.joinpath(name).exists(), name
         elif _DOTTED.fullmatch(name):
-            assert is_there(name), f"{page}: {name}"
+            assert exists(name), f"{page}: {name}"
         elif re.fullmatch(r"\w+\.py", name):
             assert name in modules, f"{page}: {name}"
 

@@ -285,10 +285,10 @@ class Spy:
         self.rows: list[int] = []
 
     def call(self, n: int) -> Call:
-        return _SpiedOn(self, n)
+        return _SpyCall(self, n)
 
 
-class _SpiedOn:
+class _SpyCall:
     def __init__(self, spy: Spy, n: int) -> None:
         self.seen: Seen = (np.zeros((n, *spy.shape), np.float32),)
         self.state = self.next_state = np.zeros((n, 0), np.float32)
@@ -454,14 +454,14 @@ def test_rewards_are_rounded_to_float32_before_they_are_subtracted() -> None:
     assert spy.commands[1][0] == np.float32(0.1 - float(np.float32(0.1)))
 
 
-def long_ones(seed: int) -> list[float]:
+def long_script(seed: int) -> list[float]:
     return [float((seed * t) % 7 - 3) for t in range(1100 * seed)]
 
 
 @pytest.mark.parametrize("n_environments", [1, 2, 4])
 def test_episodes_longer_than_the_initial_storage_are_complete(n_environments: int) -> None:
     # The initial storage has 1024 steps; these episodes have 1100, 2200 and 3300.
-    config, world = settings(), World(script=long_ones)
+    config, world = settings(), World(script=long_script)
     generator = EpisodeGenerator(config, n_environments, world.make)
     behavior = behavior_of(config, generator.spec)
     commands: list[Order] = [
@@ -471,7 +471,7 @@ def test_episodes_longer_than_the_initial_storage_are_complete(n_environments: i
     ]
     outcomes = run_commands(generator, commands)
     assert digests(outcomes) == {
-        command.id: episode_digest(algorithm2(config, command, behavior, World(long_ones).make))
+        command.id: episode_digest(algorithm2(config, command, behavior, World(long_script).make))
         for command, behavior in commands
     }
 
@@ -552,7 +552,7 @@ def test_episodes_are_returned_in_order_of_command_id() -> None:
     assert [(e.command_id, e.length) for e in episodes] == list(lengths.items())
 
 
-def fails(times: int) -> Callable[[int], list[float]]:
+def fails_at_first(times: int) -> Callable[[int], list[float]]:
     """A script that fails for seed 2 the first ``times`` times."""
     failures = iter([True] * times)
 
@@ -568,14 +568,14 @@ def test_generate_retries_after_a_fault_with_the_same_result() -> None:
     commands = [make_command(i) for i in range(5)]
     smooth, rough = (
         generate_episodes(EpisodeGenerator(settings(), 2, world.make), commands, None)
-        for world in (World(), World(script=fails(times=2)))
+        for world in (World(), World(script=fails_at_first(times=2)))
     )
     assert digests(rough) == digests(smooth)
     assert [episode.command_id for episode in rough] == [0, 1, 2, 3, 4]
 
 
 def test_generate_raises_the_fault_of_a_command_that_keeps_failing() -> None:
-    generator = EpisodeGenerator(settings(), 2, World(script=fails(times=3)).make)
+    generator = EpisodeGenerator(settings(), 2, World(script=fails_at_first(times=3)).make)
     with pytest.raises(EnvironmentFault, match=r"under command 2 .*reset\(\) .* not yet"):
         generate_episodes(generator, [make_command(i) for i in range(5)], None)
 

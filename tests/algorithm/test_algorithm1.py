@@ -63,29 +63,29 @@ def history(
 
 
 @cache
-def usual_history() -> list[tuple[Any, ...]]:
+def default_history() -> list[tuple[Any, ...]]:
     return history(settings())
 
 
 @pytest.mark.parametrize("n_environments", [1, 3, 20])
 def test_run_is_independent_of_the_number_of_environments(n_environments: int) -> None:
-    assert history(settings(), n_environments=n_environments) == usual_history()
+    assert history(settings(), n_environments=n_environments) == default_history()
 
 
 def test_run_is_repeatable() -> None:
-    assert history(settings()) == usual_history()
+    assert history(settings()) == default_history()
 
 
 def test_another_seed_changes_the_first_iteration() -> None:
     other = history(settings(seed=2))
-    assert other[0][2] != usual_history()[0][2]
-    assert other[0][3] != usual_history()[0][3]
+    assert other[0][2] != default_history()[0][2]
+    assert other[0][3] != default_history()[0][3]
 
 
 def test_larger_budget_extends_a_smaller_run() -> None:
     longer = history(settings(), Budget(max_env_steps=600))
-    assert len(longer) > len(usual_history())
-    assert longer[: len(usual_history())] == usual_history()
+    assert len(longer) > len(default_history())
+    assert longer[: len(default_history())] == default_history()
 
 
 @pytest.mark.parametrize("recent_size", [0, 8])
@@ -185,15 +185,15 @@ def test_evaluations_do_not_change_training() -> None:
 
 
 def test_run_stops_when_an_evaluation_reaches_the_stop_return() -> None:
-    means = {i: e.mean for i, _, _, _, e in usual_history() if e is not None}
+    means = {i: e.mean for i, _, _, _, e in default_history() if e is not None}
     first, mean = next(iter(means.items()))
-    assert len(usual_history()) > first + 1
+    assert len(default_history()) > first + 1
     stopped = history(settings(), Budget(max_env_steps=400, stop_return=mean))
-    assert stopped == usual_history()[: first + 1]
+    assert stopped == default_history()[: first + 1]
 
 
 def test_unreached_stop_return_has_no_effect() -> None:
-    assert history(settings(), Budget(max_env_steps=400, stop_return=1e9)) == usual_history()
+    assert history(settings(), Budget(max_env_steps=400, stop_return=1e9)) == default_history()
 
 
 def test_buffer_discards_all_but_the_best_episodes() -> None:

@@ -168,28 +168,28 @@ DICT = spaces.Dict(
 )
 
 
-def good() -> Any:
+def valid_element() -> Any:
     return {
         "inventory": (1, np.zeros(2, np.float32), np.zeros(2, np.int8)),
         "map": np.zeros((4, 4), np.uint8),
     }
 
 
-def spoil(where: Callable[[Any], Any]) -> Any:
-    value = good()
+def corrupt(where: Callable[[Any], Any]) -> Any:
+    value = valid_element()
     return where(value)
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (spoil(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
+        (corrupt(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
          r"observation\['map'\] an array of uint8, shape \(4, 5\), declared is Box"),
-        (spoil(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
+        (corrupt(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
          r"observation\['inventory'\]\[0\] 3 \(int.*\), declared is Discrete\(3\)"),
-        (spoil(lambda v: v | {"inventory": v["inventory"][:2]}),
+        (corrupt(lambda v: v | {"inventory": v["inventory"][:2]}),
          r"a dict of 'inventory', 'map', without observation\['inventory'\]\[2\]"),
-        (spoil(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
+        (corrupt(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
         (np.zeros(3, np.float32), r"an array of float32, shape \(3,\), without observation"),
         (None, r"None \(NoneType\), without observation\['inventory'\]\[0\]"),
     ],

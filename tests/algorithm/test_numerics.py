@@ -102,11 +102,11 @@ def test_acting_class_depends_on_the_last_bit(monkeypatch: pytest.MonkeyPatch) -
     expected = class_of(config)
     advance = ActingFunction.advance
 
-    def rounds_otherwise(self: ActingFunction, *rows: Any) -> Any:
+    def round_differently(self: ActingFunction, *rows: Any) -> Any:
         logits, state = advance(self, *rows)
         return np.nextafter(logits, np.float32(np.inf)), state
 
-    monkeypatch.setattr(ActingFunction, "advance", rounds_otherwise)
+    monkeypatch.setattr(ActingFunction, "advance", round_differently)
     assert class_of(config) != expected
 
 
@@ -118,10 +118,10 @@ def test_training_class_depends_on_the_last_bit(
     assert training_class(config, LANDER) == expected
     forward_relative = BehaviorFunction.forward_relative
 
-    def rounds_otherwise(self: BehaviorFunction, *inputs: Any) -> Tensor:
+    def round_differently(self: BehaviorFunction, *inputs: Any) -> Tensor:
         return forward_relative(self, *inputs) * (1 + 2**-23)
 
-    monkeypatch.setattr(BehaviorFunction, "forward_relative", rounds_otherwise)
+    monkeypatch.setattr(BehaviorFunction, "forward_relative", round_differently)
     assert training_class(config, LANDER) != expected
 
 

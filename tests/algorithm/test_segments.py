@@ -210,16 +210,16 @@ def test_memory_is_allocated_on_demand_for_any_step_limit() -> None:
 def test_insufficient_memory_is_rejected_with_the_settings_to_lower(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def none_left(array: Any, more: int) -> Any:
+    def no_memory(array: Any, more: int) -> Any:
         raise MemoryError
 
     held = experience(replay_size=3, max_steps=200)
-    monkeypatch.setattr(segments, "_longer", none_left)
+    monkeypatch.setattr(segments, "_longer", no_memory)
     with pytest.raises(ConfigError, match=r"memory for 16,384 steps.*lower replay_size"):
         held.add(random_episode(1, 100))
 
 
-class ExperienceAsADictionary(RuleBasedStateMachine):
+class ExperienceMachine(RuleBasedStateMachine):
     """Random additions and removals, compared with a dictionary."""
 
     replay_size, max_steps = 4, 150
@@ -270,5 +270,5 @@ class ExperienceAsADictionary(RuleBasedStateMachine):
         assert all(i in self.held for i in self.model)
 
 
-TestExperienceAsADictionary = ExperienceAsADictionary.TestCase
-TestExperienceAsADictionary.settings = settings(max_examples=50, stateful_step_count=30)
+TestExperienceMachine = ExperienceMachine.TestCase
+TestExperienceMachine.settings = settings(max_examples=50, stateful_step_count=30)

@@ -76,7 +76,7 @@ def test_strategy_is_a_function_of_its_arguments(name: str) -> None:
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def custom_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (tmp_path / "own_strategies.py").write_text(
         "class Patient:\n"
         "    def __init__(self, config):\n"
@@ -104,8 +104,8 @@ def buffer() -> ReplayBuffer:
     return ReplayBuffer(config().buffer, [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
 
 
-def test_custom_strategy_is_named_by_module_and_class(own: str) -> None:
-    sampler = CommandSampler(config(command_strategy=f"{own}:Patient", seed=9), SPEC)
+def test_custom_strategy_is_named_by_module_and_class(custom_module: str) -> None:
+    sampler = CommandSampler(config(command_strategy=f"{custom_module}:Patient", seed=9), SPEC)
     commands = sampler.explore(1, buffer())
     assert {(c.desired_return, c.desired_horizon) for c in commands} == {(10.0, 40)}
 
@@ -130,14 +130,14 @@ def test_strategy_that_fails_to_import_is_rejected(name: str, message: str) -> N
         strategy(name)
 
 
-def test_strategy_that_cannot_be_constructed_is_rejected(own: str) -> None:
+def test_strategy_that_cannot_be_constructed_is_rejected(custom_module: str) -> None:
     with pytest.raises(ConfigError, match=r"own_strategies:Needy.*TypeError"):
-        strategy(f"{own}:Needy")
+        strategy(f"{custom_module}:Needy")
 
 
-def test_exception_of_a_strategy_is_reported(own: str) -> None:
+def test_exception_of_a_strategy_is_reported(custom_module: str) -> None:
     with pytest.raises(ConfigError, match="Broken failed: ZeroDivisionError"):
-        choose_command(strategy(f"{own}:Broken"), [Entry(1.0, 1, 1)], 0.5)
+        choose_command(strategy(f"{custom_module}:Broken"), [Entry(1.0, 1, 1)], 0.5)
 
 
 @pytest.mark.parametrize(

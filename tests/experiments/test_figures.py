@@ -120,17 +120,17 @@ def test_references_are_labelled_lines() -> None:
 
 
 def test_algorithms_have_fixed_styles() -> None:
-    def look(line: Line2D) -> tuple[str, object, object]:
+    def style(line: Line2D) -> tuple[str, object, object]:
         return to_hex(line.get_color()), line.get_linestyle(), line.get_marker()
 
-    one = {label: look(line) for label, line in labelled(learning_curves(ALL, "")).items()}
+    one = {label: style(line) for label, line in labelled(learning_curves(ALL, "")).items()}
     other = labelled(learning_curves(ALL[::-1], ""))
-    assert one == {label: look(line) for label, line in other.items()}
+    assert one == {label: style(line) for label, line in other.items()}
     assert one["UDRL (20 seeds)"][0] == GREEN
     assert len({colour for colour, _, _ in one.values()}) == 5
     for algorithm, variant in (("DQN", ""), ("UDRL", "paper")):
         ((label, alone),) = labelled(learning_curves(curve(algorithm, variant), "")).items()
-        assert look(alone) == one[label]
+        assert style(alone) == one[label]
 
 
 @pytest.mark.parametrize(

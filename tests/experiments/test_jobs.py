@@ -109,7 +109,7 @@ json.dump({{'max_env_steps': asked}}, open(folder + '/done.json', 'w'))
 LAST = "open(folder + '/pid', 'w').write(str(os.getpid())); time.sleep(600)"
 
 
-def quietly(text: str) -> None:
+def ignore(text: str) -> None:
     """Print nothing."""
 
 
@@ -133,7 +133,7 @@ def test_number_of_concurrent_runs_is_limited(
         "time.sleep(0.5); n = sum(f.endswith('.on') for f in os.listdir(root)); "
         "open(folder + '.count', 'w').write(str(n)); os.remove(mark)\n" + FINISH
     )
-    run_jobs([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), quietly)
+    run_jobs([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), ignore)
     counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
     assert len(counts) == 4
     assert max(counts) == 2
@@ -148,8 +148,8 @@ def test_records_of_finished_runs_are_copied_and_not_repeated(
 ) -> None:
     first, second, here = (tmp_path / name for name in ("first", "second", "here"))
     program(FINISH)
-    run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
-    run_jobs([job(2000, seed=2)], second, 1, threading.Event(), quietly)
+    run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), ignore)
+    run_jobs([job(2000, seed=2)], second, 1, threading.Event(), ignore)
     printed: list[str] = []
     wanted = [job(seed=1), job(2000, seed=2), job(seed=3)]
     copy_finished(wanted, here, [first, second], printed.append)
@@ -174,7 +174,7 @@ def test_folder_without_runs_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"--runs-from .*runs: expected a folder of studies.*--folder"
     ):
-        copy_finished([job()], tmp_path, [tmp_path / "runs"], quietly)
+        copy_finished([job()], tmp_path, [tmp_path / "runs"], ignore)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_run_with_records_only_starts_from_the_beginning(
     assert (tmp_path / "done.json").exists() is kept
 
 
-class WhenItRuns(threading.Event):
+class SetWhenRunning(threading.Event):
     """Set as soon as a run has written its process's id."""
 
     def __init__(self, folder: Path) -> None:
@@ -221,7 +221,7 @@ def is_running(pid: int) -> bool:
 
 def test_stop_ends_active_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
     program(LAST)
-    stop, printed = WhenItRuns(job().folder(tmp_path)), list[str]()
+    stop, printed = SetWhenRunning(job().folder(tmp_path)), list[str]()
     with pytest.raises(Interrupted, match="--resume"):
         run_jobs([job()], tmp_path, 1, stop, printed.append)
     assert "--resume" in printed[-1]
@@ -239,9 +239,9 @@ def test_failure_is_reported_with_its_last_output_and_ends_the_others(
         "print('no such luck', file=sys.stderr); sys.exit(7)"
     )
     with pytest.raises(RunFailed, match="no such luck") as raised:
-        run_jobs([lasting, job(seed=2)], tmp_path, 2, threading.Event(), quietly)
+        run_jobs([lasting, job(seed=2)], tmp_path, 2, threading.Event(), ignore)
     assert raised.value.exit_code == 7
-    assert not is_running(WhenItRuns(lasting.folder(tmp_path)).pid)
+    assert not is_running(SetWhenRunning(lasting.folder(tmp_path)).pid)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_failure_is_one_line_with_its_cause(
     (folder / "log.txt").write_text("udrl: error: of an earlier process\n", encoding="utf-8")
     program(line)
     with pytest.raises(RunFailed, match=message) as raised:
-        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+        run_jobs([job()], tmp_path, 1, threading.Event(), ignore)
     assert "\n" not in str(raised.value)
 
 
@@ -273,7 +273,7 @@ def test_run_without_evaluations_is_reported(
 ) -> None:
     program("")
     with pytest.raises(RunFailed, match=r"without an evaluation within 1,000 env steps; raise"):
-        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+        run_jobs([job()], tmp_path, 1, threading.Event(), ignore)
 
 
 def test_run_is_locked_against_other_processes(tmp_path: Path) -> None:

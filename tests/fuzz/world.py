@@ -148,7 +148,7 @@ class World:
 def valid_requests() -> list[tuple[str, bytes]]:
     """Return the requests of a learner and an actor in a run's first iterations, encoded.
 
-    A fresh world that is asked these in order accepts them all.
+    A new world accepts them all in this order.
     """
     world, asked = World(), []
     generator = EpisodeGenerator(CONFIG, 4)

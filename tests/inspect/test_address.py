@@ -9,7 +9,7 @@ import pytest
 from udrl_inspect.address import announced, host_name, is_of_this_machine, served_at, unique_name
 
 
-def on(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def set_hostname(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "node", lambda: host)
 
 
@@ -21,9 +21,9 @@ def test_names_are_distinct_and_recognised_as_local() -> None:
 
 
 def test_host_with_a_longer_name_is_another_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    on("gpu-2", monkeypatch)
+    set_hostname("gpu-2", monkeypatch)
     name = unique_name("actor")
-    on("gpu", monkeypatch)
+    set_hostname("gpu", monkeypatch)
     assert not is_of_this_machine(name, "actor")
 
 
@@ -33,7 +33,7 @@ def test_long_names_are_truncated_and_stay_distinct(monkeypatch: pytest.MonkeyPa
         "research-team-alpha-actor-7d9c5b6f4d-abcde",
         "research-team-alpha-actor-7d9c5b6f4d-f",
     ):
-        on(pod, monkeypatch)
+        set_hostname(pod, monkeypatch)
         names.append(host_name("actor"))
         assert len(unique_name("actor")) <= 64
     assert names[0] != names[1]
@@ -43,7 +43,7 @@ def test_long_names_are_truncated_and_stay_distinct(monkeypatch: pytest.MonkeyPa
 def test_name_of_any_host_is_valid_in_a_key_expression(
     host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on(host, monkeypatch)
+    set_hostname(host, monkeypatch)
     assert set(host_name("actor")) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ-")
 
 

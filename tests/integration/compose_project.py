@@ -38,15 +38,15 @@ def compose_command() -> list[str]:
     Skips the test without a running engine.
     """
     if shutil.which("docker") is None:
-        pytest.skip("no Docker here: the command docker is not installed")
+        pytest.skip("docker is not installed")
     engine = subprocess.run(["docker", "info"], capture_output=True, text=True, timeout=30)
     if engine.returncode != 0:
-        pytest.skip(f"no Docker engine answers: {engine.stderr.strip().splitlines()[-1]}")
+        pytest.skip(f"no Docker engine replies: {engine.stderr.strip().splitlines()[-1]}")
     plugin = subprocess.run(["docker", "compose", "version"], capture_output=True, timeout=30)
     if plugin.returncode == 0:
         return ["docker", "compose"]
     if shutil.which("docker-compose") is None:
-        pytest.skip("no Docker Compose here, neither `docker compose` nor `docker-compose`")
+        pytest.skip("neither `docker compose` nor `docker-compose` is installed")
     return ["docker-compose"]
 
 
@@ -78,7 +78,7 @@ class Project:
             error.add_note(self.compose("logs", "--no-color", "--timestamps", "--tail", "50"))
         self.down()
 
-    def give(self, **variables: str) -> None:
+    def set_variables(self, **variables: str) -> None:
         """Set variables for later commands."""
         self._variables |= variables
 

@@ -41,13 +41,13 @@ def test_training_equals_that_of_the_command(run: Callable[..., Status], tmp_pat
 def test_callback_stops_a_run_that_can_be_resumed(
     run: Callable[..., Status], tmp_path: Path
 ) -> None:
-    def enough(status: Status) -> bool:
+    def stop(status: Status) -> bool:
         return status.iteration < 2
 
     others: list[int] = []
     stopped = udrl.train(
         "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
-        callbacks=[enough, lambda status: others.append(status.iteration)], **SETTINGS,
+        callbacks=[stop, lambda status: others.append(status.iteration)], **SETTINGS,
     )  # fmt: skip
     assert stopped.status.state == "stopped"
     assert stopped.status.ended_because == "stopped on request"
@@ -106,11 +106,11 @@ def test_failed_run_calls_on_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_event_callback_can_stop_a_run(event: str, tmp_path: Path) -> None:
     seen: list[object] = []
 
-    def enough(found: object) -> bool:
+    def stop(found: object) -> bool:
         seen.append(found)
         return False
 
-    callback: dict[str, Any] = {event: enough}
+    callback: dict[str, Any] = {event: stop}
     stopped = udrl.train(
         "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
         **callback, **SETTINGS,

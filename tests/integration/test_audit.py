@@ -48,16 +48,16 @@ def test_liar_fails_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     monkeypatch.setattr(udrl_actor.outbox, "encode_episode", lie)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
-    def go(*, resume: bool) -> None:
+    def run_training(*, resume: bool) -> None:
         train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
               resume=resume)  # fmt: skip
 
     with pytest.raises(UdrlError, match=r"lied|quarantined"):
-        go(resume=False)
+        run_training(resume=False)
     status = status_of(tmp_path / "run")
     assert status.state == "failed"
     assert [actor.id for actor in status.quarantined] == liars
     assert f"actor {liars[0]} lied" in status.problem
     assert_conserved(status)
     with pytest.raises(Deceived, match=liars[0]):
-        go(resume=True)
+        run_training(resume=True)

@@ -139,13 +139,13 @@ def test_commands_are_within_the_range_of_the_buffer(ended_run: Path) -> None:
     assert plan.total == 2 * len(plan.by_return + plan.by_horizon)
 
 
-def with_horizons_that_follow(agent: Agent) -> Agent:
+def with_horizons_from_returns(agent: Agent) -> Agent:
     config = change(agent.config, desired_horizon="return")
     return agent._replace(config=config)
 
 
 def test_horizons_that_follow_from_returns_are_not_varied(ended_run: Path) -> None:
-    agent = with_horizons_that_follow(load_agent(ended_run))
+    agent = with_horizons_from_returns(load_agent(ended_run))
     plan = plan_commands(agent, points=9, episodes=2, desired_returns=(1.0, 4.0))
     asked = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
     assert asked == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]

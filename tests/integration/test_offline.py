@@ -42,7 +42,7 @@ def _datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
 
 
-def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Episode]:
+def some_episodes(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Episode]:
     rng = np.random.default_rng(1)
 
     def observations(n: int) -> Any:
@@ -66,7 +66,7 @@ def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Ep
 
 @pytest.mark.parametrize("spec", [VECTOR, IMAGE], ids=["vector", "image"])
 def test_dataset_round_trips_bit_identically(spec: EnvironmentSpec) -> None:
-    episodes = some(spec)
+    episodes = some_episodes(spec)
     write_dataset("some/ours-v0", episodes, small(), spec)
     assert dataset_digest(read_dataset("some/ours-v0", small(), spec)) == dataset_digest(episodes)
     # As Minari itself reads it.
@@ -80,9 +80,9 @@ def test_dataset_round_trips_bit_identically(spec: EnvironmentSpec) -> None:
 
 
 def test_existing_or_unknown_name_is_rejected() -> None:
-    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+    write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"already exists.*another name, or a new version"):
-        write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+        write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"not found locally.*minari list local"):
         read_dataset("some/thing-v0", small(), VECTOR)
 
@@ -99,7 +99,7 @@ def test_existing_or_unknown_name_is_rejected() -> None:
     ],
 )  # fmt: skip
 def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, message: str) -> None:
-    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+    write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=message):
         read_dataset("some/ours-v0", small(), spec)
 
@@ -110,7 +110,7 @@ def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, messa
 def test_name_that_minari_does_not_allow_is_rejected(name: str, tmp_path: Path) -> None:
     found = set(minari.list_local_datasets())
     with pytest.raises(ConfigError, match=r"a name with a version.*e\.g\. CartPole/mine-v0"):
-        write_dataset(name, some(VECTOR), small(), VECTOR)
+        write_dataset(name, some_episodes(VECTOR), small(), VECTOR)
     assert set(minari.list_local_datasets()) == found, "no files must remain"
 
 

@@ -35,7 +35,7 @@ Series = dict[str, list[tuple[int, float]]]
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _local_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Keep all logs on this machine."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
@@ -155,7 +155,7 @@ class ServedRun:
     def finish(self) -> None: ...
 
 
-def shorten(run_dir: Path, share: float) -> str:
+def truncate_metrics(run_dir: Path, share: float) -> str:
     """Truncate ``metrics.csv`` as if the run had been stopped; return the whole text."""
     path = run_dir / "metrics.csv"
     text = path.read_text()
@@ -170,7 +170,7 @@ def test_resumed_run_continues_at_weights_and_biases(
 ) -> None:
     served = ServedRun()
     monkeypatch.setattr(wandb, "init", served.init)
-    text = shorten(run_dir, 0.5)
+    text = truncate_metrics(run_dir, 0.5)
     assert log(run_dir, "wandb", stopped=True) == [served.url]
     half = len(served.rows)
     assert half > 0
@@ -190,7 +190,7 @@ def test_resumed_run_continues_at_weights_and_biases(
     }
 
 
-def logged_to_mlflow(place: str) -> tuple[Run, Series]:
+def mlflow_run(place: str) -> tuple[Run, Series]:
     """Return the only run of the experiment, and its metrics."""
     client = mlflow.MlflowClient()
     experiment = client.get_experiment_by_name("udrl")
@@ -204,14 +204,14 @@ def logged_to_mlflow(place: str) -> tuple[Run, Series]:
 
 
 def test_mlflow_log_equals_the_event_files_after_resuming(run_dir: Path) -> None:
-    text = shorten(run_dir, 0.5)
-    run, found = logged_to_mlflow(*log(run_dir, "mlflow", stopped=True))
+    text = truncate_metrics(run_dir, 0.5)
+    run, found = mlflow_run(*log(run_dir, "mlflow", stopped=True))
     assert run.info.status == "KILLED"
     assert len(found["time/iterations"]) == len((run_dir / "metrics.csv").read_text().split()) - 1
     (run_dir / "metrics.csv").write_text(text)
     expected = event_files(run_dir)
     for _ in range(2):  # the second call has nothing to add
-        run, found = logged_to_mlflow(*log(run_dir, "mlflow"))
+        run, found = mlflow_run(*log(run_dir, "mlflow"))
         assert_same(found, expected)
         assert (run.info.status, run.info.run_name) == ("FINISHED", run_dir.name)
         assert run.data.tags["udrl.ended_because"] == read_status(run_dir).ended_because
@@ -260,7 +260,7 @@ def test_weights_and_biases_without_a_login_does_not_prompt(run_dir: Path, tmp_p
     assert "No API key configured" in done.stderr
 
 
-class Stuck:
+class HangingWriter:
     """A writer whose server does not respond."""
 
     place = ""
@@ -280,7 +280,7 @@ class Stuck:
 
 
 def test_hanging_log_is_abandoned(run_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
-    writer = Stuck()
+    writer = HangingWriter()
     hanging = RunLog(run_dir, "stuck", writer)
     hanging.show(read_status(run_dir))
     hanging.finish()

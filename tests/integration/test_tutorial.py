@@ -38,7 +38,7 @@ def masked(output: str) -> list[str]:
     return [line for line in lines if line not in ("", "...")]
 
 
-def left_out(printed: list[str], page: list[str]) -> list[str]:
+def omitted_lines(printed: list[str], page: list[str]) -> list[str]:
     """Return the printed lines that the page omits; all lines of the page must be printed."""
     lines = iter(printed)
     missing = []
@@ -52,7 +52,7 @@ def left_out(printed: list[str], page: list[str]) -> list[str]:
     return [*missing, *lines]
 
 
-def follow(command: list[str], folder: Path) -> str:
+def run_command(command: list[str], folder: Path) -> str:
     """Run one command of the page; return its output without progress lines."""
     program = {"udrl": [sys.executable, "-m", "udrl_launch"], "python": [sys.executable]}
     done = subprocess.run(
@@ -77,9 +77,9 @@ def test_tutorial_runs_and_has_the_printed_output(tmp_path: Path) -> None:
         elif language == "sh":
             for command in commands(text):
                 if command[0] != "pip":
-                    printed = follow(command, tmp_path)
+                    printed = run_command(command, tmp_path)
         else:
-            differences = left_out(masked(printed), masked(text))
+            differences = omitted_lines(masked(printed), masked(text))
             assert not differences or "..." in text, f"the page lacks {differences}:\n{printed}"
 
     first, second = (tmp_path / "runs" / name for name in ("first", "second"))

@@ -25,7 +25,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "site"
 
 
-def outside(site: Path, *command: str) -> str:
+def run_outside(site: Path, *command: str) -> str:
     """Run Python with the wheel's packages only."""
     environment = os.environ | {"PYTHONPATH": str(site)}
     done = subprocess.run(
@@ -41,9 +41,9 @@ def outside(site: Path, *command: str) -> str:
 
 
 def test_installed_wheel_trains(site: Path) -> None:
-    imported = outside(site, "-c", "import udrl, udrl_launch; print(udrl.__file__)")
+    imported = run_outside(site, "-c", "import udrl, udrl_launch; print(udrl.__file__)")
     assert Path(imported.strip()).is_relative_to(site)
-    trained = outside(
+    trained = run_outside(
         site, "-m", "udrl_launch", *arguments(TOY, 100, site.parent / "run"), "--in-process"
     )
     assert '"state":"ended"' in trained

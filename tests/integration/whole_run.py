@@ -198,11 +198,11 @@ def configured_router(endpoint: str, keys_dir: Path) -> zenoh.Session:
 def kill_at(process: Cli, run_dir: Path, role: str, iteration: int) -> None:
     """Kill a service at a given iteration, and wait for its replacement."""
 
-    def far_enough() -> bool:
+    def is_reached() -> bool:
         status = live_status(run_dir)
         return status is not None and status.iteration >= iteration
 
-    wait_for(far_enough, f"iteration {iteration}")
+    wait_for(is_reached, f"iteration {iteration}")
     pid = children(process.process.pid)[role]
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: not is_running(pid), f"{role} to exit")

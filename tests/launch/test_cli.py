@@ -140,7 +140,7 @@ cli.main()
 
 
 def test_numpy_computes_in_one_thread() -> None:
-    """Its threads spin while they wait: two actors on two cores made a fifth of their env steps."""
+    """More threads spin while they wait: two actors on two cores reached a fifth of their speed."""
     program = """
 import os, sys, click
 from udrl_launch import cli

@@ -32,7 +32,7 @@ thread.join()
 """
 
 
-def said_by(program: str) -> int:
+def number_printed_by(program: str) -> int:
     """Return the number that a program prints."""
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
@@ -42,9 +42,9 @@ def said_by(program: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is a setting of glibc")
 def test_freed_memory_is_kept() -> None:
-    assert said_by(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
+    assert number_printed_by(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
     # The control: 64 MB are 16,384 pages.
-    assert said_by(PROGRAM.replace("KEEP", "")) > 1000
+    assert number_printed_by(PROGRAM.replace("KEEP", "")) > 1000
 
 
 SERVICE = """
@@ -129,4 +129,4 @@ def test_limit_of_open_files_is_raised_to_the_maximum(given: int, found: int) ->
         "allow_open_files()\n"
         "print(getrlimit(RLIMIT_NOFILE)[0])"
     )
-    assert said_by(program) == found
+    assert number_printed_by(program) == found

@@ -74,13 +74,13 @@ def test_child_that_makes_progress_is_always_restarted(supervisor: Supervisor) -
     supervisor.start("actor-1", "actor", prefix=(sys.executable, "-c", "raise SystemExit(1)"))
     child, started = supervisor.children[0], set[int]()
 
-    def often() -> bool:
+    def has_restarted_often() -> bool:
         assert child.process is not None
         started.add(child.process.pid)
         supervisor.work["actor"] = len(started) // 4
         return len(started) >= 20
 
-    check_until(supervisor, often)
+    check_until(supervisor, has_restarted_often)
 
 
 def test_signal_is_reported_with_its_name_and_usual_cause(supervisor: Supervisor) -> None:

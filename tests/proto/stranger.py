@@ -88,7 +88,9 @@ def leaves(spec: dict[str, Any]) -> list[tuple[list[Any], dict[str, Any]]]:
     return [(list(leaf["path"]), leaf["space"]) for leaf in space["leaves"]]
 
 
-def seen(observations: list[list[npt.NDArray[Any]]], stack: int) -> list[npt.NDArray[Any]]:
+def stack_observations(
+    observations: list[list[npt.NDArray[Any]]], stack: int
+) -> list[npt.NDArray[Any]]:
     """Return the most recent of each leaf, oldest first; the first fills the stack."""
     recent = [observations[max(len(observations) - 1 - k, 0)] for k in reversed(range(stack))]
     return [np.concatenate(list(map(np.atleast_1d, one))) for one in zip(*recent, strict=True)]
@@ -104,7 +106,9 @@ def choose(row: list[float], u: float, temperature: float) -> int:
     return min(sum(c <= u * total for c in cumulative), len(row) - 1)
 
 
-def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.NDArray[Any]]:
+def convert_observation(
+    observation: Any, space: Any, spec: dict[str, Any]
+) -> list[npt.NDArray[Any]]:
     """Convert an environment's observation to leaves of the declared dtypes and shapes."""
     found = []
     for path, leaf in leaves(spec):
@@ -123,7 +127,9 @@ def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.
     return found
 
 
-def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDArray[Any]:
+def encode_observations(
+    steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]
+) -> npt.NDArray[Any]:
     """Return an episode's observations in wire format."""
     if spec["observation_space"]["kind"] != "record":
         return np.array([one for (one,) in steps])
@@ -141,18 +147,18 @@ def is_box(space: Any) -> bool:
     return isinstance(space, gym.spaces.Box)
 
 
-def all_within(space: Any) -> list[Any]:
+def nested_spaces(space: Any) -> list[Any]:
     """Return the spaces in dictionaries and tuples."""
     if isinstance(space, gym.spaces.Dict):
-        return [leaf for inner in space.spaces.values() for leaf in all_within(inner)]
+        return [leaf for inner in space.spaces.values() for leaf in nested_spaces(inner)]
     if isinstance(space, gym.spaces.Tuple):
-        return [leaf for inner in space.spaces for leaf in all_within(inner)]
+        return [leaf for inner in space.spaces for leaf in nested_spaces(inner)]
     return [space]
 
 
-def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
+def convert_action(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
     """Convert action indices to an action of the environment's space; consumes the indices."""
-    dimensions = sum(math.prod(one.shape) for one in all_within(space) if is_box(one))
+    dimensions = sum(math.prod(one.shape) for one in nested_spaces(space) if is_box(one))
     m = config["action_bins"] or (11 if dimensions <= 2 else 7)
 
     def one(inner: Any) -> Any:
@@ -197,7 +203,7 @@ def run_episode(
     while not (terminated or truncated):
         if command["cap"] is not None:
             desired = min(desired, command["cap"])
-        observations.append(as_promised(observation, env.observation_space, spec))
+        observations.append(convert_observation(observation, env.observation_space, spec))
         t = len(actions)
         since = t - command["random_from"]
         if command["random_rate"] and t >= held_until and begins[t] < command["random_rate"]:
@@ -206,7 +212,7 @@ def run_episode(
             held_until = t + command["random_hold"] * multiple
         row: list[float] = []
         if network is not None:
-            stacked = seen(observations, config["frame_stack"])
+            stacked = stack_observations(observations, config["frame_stack"])
             found, state = network.logits(stacked, [desired, horizon], state)
             row = found.tolist()
         decides = t
@@ -221,7 +227,7 @@ def run_episode(
             first += n
             action.append(choose(own, number, command["temperature"]) if own else int(number * n))
         actions.append(action)
-        taken = as_declared(list(action), env.action_space, config)
+        taken = convert_action(list(action), env.action_space, config)
         observation, reward, terminated, truncated, _ = env.step(taken)
         rewards.append(np.float32(reward))
         desired -= float(rewards[-1])
@@ -229,7 +235,7 @@ def run_episode(
     env.close()
     done = np.array(actions, "|u1" if max(ns) <= 256 else "<i4")
     return {
-        "observations": packed(observations, spec),
+        "observations": encode_observations(observations, spec),
         "actions": done if spec["action_space"]["kind"] == "product" else done[:, 0],
         "rewards": np.array(rewards, "<f4"),
         "terminated": terminated,

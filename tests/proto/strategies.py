@@ -52,7 +52,7 @@ def setting_fields(kind: type[msgspec.Struct]) -> Iterator[inspect.Field]:
 
 def configs() -> st.SearchStrategy[Config]:
     """Return a strategy for valid configurations."""
-    return _fields(setting_fields(Config)).map(lambda given: build(Config, _possible(given)))
+    return _fields(setting_fields(Config)).map(lambda given: build(Config, _consistent(given)))
 
 
 def _fields(fields: Iterable[inspect.Field]) -> st.SearchStrategy[dict[str, Any]]:
@@ -109,7 +109,7 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
     raise NotImplementedError(node)
 
 
-def _possible(values: dict[str, Any]) -> dict[str, Any]:
+def _consistent(values: dict[str, Any]) -> dict[str, Any]:
     """Make a combination of settings consistent."""
     last_few = min(values.get("last_few", 75), 1_000_000)
     values |= {"last_few": last_few, "replay_size": max(values.get("replay_size", 500), last_few)}

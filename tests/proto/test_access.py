@@ -53,7 +53,7 @@ class Replay:
         for verb in verbs.BY_NAME:
             key = key_expressions.key("run", verb)
             self.session.declare_queryable(key, partial(self._answer, key), complete=True)
-        self.heard = Heard(session, "**")
+        self.heard = RecordingSubscriber(session, "**")
         self.session.liveliness().declare_subscriber(
             key_expressions.alive("run", "*", "*"), self._note
         )
@@ -105,7 +105,7 @@ def ask(session: zenoh.Session, verb: str) -> list[str]:
     return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
 
 
-class Heard:
+class RecordingSubscriber:
     """Messages of a subscriber; ``wait_for`` waits for one of them."""
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
@@ -130,7 +130,7 @@ class Heard:
 # Connecting.
 
 
-def raw(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
+def raw_config(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
     """Return a raw Zenoh configuration."""
     config = zenoh.Config()
     given = {f"transport/link/tls/{name}": str(value) for name, value in tls.items()}
@@ -151,7 +151,7 @@ def test_connection_without_certificate_is_refused(
     replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
 ) -> None:
     with pytest.raises(zenoh.ZError):
-        zenoh.open(raw(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
+        zenoh.open(raw_config(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
     with pytest.raises(Unreachable, match="no reply from"):
         sessions.connect(secure_endpoint.replace("tls", "tcp"), patience_s=0.1)
     assert ask(connect("actor"), verbs.HELLO.name) == ["replay"]
@@ -234,7 +234,7 @@ def test_wildcards_grant_no_additional_access(
     assert replay.asked == [key_expressions.key("run", verbs.HELLO.name)]
 
 
-def pose_as_replay(thief: zenoh.Session) -> list[str]:
+def impersonate_replay(thief: zenoh.Session) -> list[str]:
     """Declare every verb; return the list that receives the intercepted requests."""
     stolen: list[str] = []
 
@@ -251,7 +251,7 @@ def pose_as_replay(thief: zenoh.Session) -> list[str]:
 
 
 def test_actor_cannot_impersonate_the_replay_service(replay: Replay, connect: Connect) -> None:
-    stolen = pose_as_replay(connect("actor"))
+    stolen = impersonate_replay(connect("actor"))
     assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", "actor", "thief")
     for role, asked in MAY_ASK.items():
         victim = connect(role)
@@ -269,10 +269,10 @@ def test_peer_with_an_actors_key_has_the_rights_of_a_client(
         "connect_certificate": own.certificate,
         "connect_private_key": own.key,
     }
-    config = raw(secure_endpoint, mode="peer", **tls)
+    config = raw_config(secure_endpoint, mode="peer", **tls)
     config.insert_json5("transport/link/tls/enable_mtls", "true")
     with zenoh.open(config) as thief:
-        stolen = pose_as_replay(thief)
+        stolen = impersonate_replay(thief)
         assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive(
             "run", "actor", "thief"
         )
@@ -288,7 +288,7 @@ def test_impersonation_succeeds_without_access_control(endpoint: str) -> None:
         sessions.connect(endpoint, DEADLINE_S) as thief,
         sessions.connect(endpoint, DEADLINE_S) as victim,
     ):
-        stolen = pose_as_replay(thief)
+        stolen = impersonate_replay(thief)
         replay.tokens.get(timeout=DEADLINE_S)
         assert "thief" in ask(victim, verbs.STATE.name)
         assert stolen
@@ -302,7 +302,7 @@ def test_only_the_learner_can_publish_weights(
     mallory: str, replay: Replay, connect: Connect
 ) -> None:
     listener, thief = connect("actor"), connect(mallory)
-    heard = Heard(listener, key_expressions.key("run", key_expressions.NEW_WEIGHTS))
+    heard = RecordingSubscriber(listener, key_expressions.key("run", key_expressions.NEW_WEIGHTS))
     ask(listener, verbs.HELLO.name)  # once this returns, the router knows the subscription
     for name in (key_expressions.NEW_WEIGHTS, key_expressions.PROGRESS, verbs.EPISODE.name):
         thief.put(key_expressions.key("run", name), b"false")
@@ -325,8 +325,11 @@ def test_each_role_receives_its_own_publications(replay: Replay, connect: Connec
     )
     everything = ("udrl/**", progress, weights)
     learner, actor = connect("learner"), connect("actor")
-    of_learner, of_actor = Heard(learner, *everything), Heard(actor, *everything)
-    of_observer = Heard(connect("observer"), *everything)
+    of_learner, of_actor = (
+        RecordingSubscriber(learner, *everything),
+        RecordingSubscriber(actor, *everything),
+    )
+    of_observer = RecordingSubscriber(connect("observer"), *everything)
     for client in (learner, actor):
         ask(client, verbs.HELLO.name)  # once this returns, the router knows the subscriptions
     connect("learner").put(weights, b"weights")
@@ -340,7 +343,7 @@ def test_each_role_receives_its_own_publications(replay: Replay, connect: Connec
 
 def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> None:
     learner, listener = connect("learner"), connect("learner")
-    heard = Heard(listener, key_expressions.key("run", key_expressions.PROGRESS))
+    heard = RecordingSubscriber(listener, key_expressions.key("run", key_expressions.PROGRESS))
     ask(listener, verbs.HELLO.name)  # once this returns, the router knows the subscription
     learner.put(key_expressions.key("run", key_expressions.PROGRESS), b"false")
     ask(learner, verbs.HELLO.name)

@@ -125,7 +125,7 @@ def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch
     now = 0.0
     attempts: list[float] = []
 
-    class Slow:
+    class SilentTransport:
         def ask(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
             nonlocal now
             now += timeout_s
@@ -137,7 +137,7 @@ def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch
             return False
 
     monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
-    asker = Asker(cast(Transport, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
+    asker = Asker(cast(Transport, SilentTransport()), RUN, "learner l", NoPause(), patience_s=100.0)
     with pytest.raises(Unreachable):
         asker.ask(verbs.STATE, REQUEST)
     assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]

@@ -107,7 +107,7 @@ def rows_of(kind: type[msgspec.Struct]) -> list[list[str]]:
     return [[f"`{f.encode_name}`", described(f.type), default_of(f)] for f in setting_fields(kind)]
 
 
-def table_in(page: str, heading: str) -> list[list[str]]:
+def rows_below(page: str, heading: str) -> list[list[str]]:
     """Return the rows below a heading, without the table's header."""
     text = re.split(r"\n#+ ", page.split(f"\n{heading}\n", 1)[1], maxsplit=1)[0]
     lines = [line for line in text.splitlines() if line.startswith("| ")]
@@ -120,7 +120,7 @@ def test_every_message_is_described_field_by_field(kind: type[Any]) -> None:
     if not expected:
         assert f"\n#### {kind.__name__}\n" in PAGE
         return
-    rows = table_in(PAGE, f"#### {kind.__name__}")
+    rows = rows_below(PAGE, f"#### {kind.__name__}")
     assert [row[:3] for row in rows] == expected
     assert all(row[3] for row in rows)
 
@@ -134,7 +134,7 @@ def size(n: int) -> str:
 
 
 def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
-    rows = {row[0].strip("`"): row[1:] for row in table_in(PAGE, "### Verbs")}
+    rows = {row[0].strip("`"): row[1:] for row in rows_below(PAGE, "### Verbs")}
     assert list(rows) == list(verbs.BY_NAME)
     for name, verb in verbs.BY_NAME.items():
         askers, request, reply, limit = rows[name]
@@ -169,7 +169,7 @@ def test_every_key_expression_is_described() -> None:
     assert key_expressions.RUN_ID.pattern in PAGE
 
 
-def codes_in_the_code() -> set[str]:
+def codes_in_source() -> set[str]:
     """Return the codes of all refusals and problems in the source."""
     found = set()
     for path in ROOT.glob("services/*/*/*.py"):
@@ -186,8 +186,8 @@ def codes_in_the_code() -> set[str]:
 
 @pytest.mark.parametrize(("page", "heading"), [(PAGE, "## Errors"), (REASONS, "## Error codes")])
 def test_every_error_code_is_described(page: str, heading: str) -> None:
-    rows = table_in(page, heading)
-    assert {row[0].strip("`") for row in rows} == codes_in_the_code()
+    rows = rows_below(page, heading)
+    assert {row[0].strip("`") for row in rows} == codes_in_source()
     assert all(len(row) >= 3 and all(row) for row in rows)
 
 

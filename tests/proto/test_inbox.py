@@ -46,8 +46,8 @@ def test_size_is_bounded_but_a_single_item_always_fits() -> None:
 def test_must_put_ignores_the_bounds() -> None:
     inbox: Inbox[str] = Inbox(1, 10)
     assert inbox.put("question", 10)
-    inbox.must_put("somebody left")
-    assert inbox.take(5, 100, NOW) == ["question", "somebody left"]
+    inbox.must_put("departure")
+    assert inbox.take(5, 100, NOW) == ["question", "departure"]
 
 
 def test_batch_is_bounded_in_bytes() -> None:

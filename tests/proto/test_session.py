@@ -144,19 +144,19 @@ def test_client_connects_to_a_router_that_starts_later(endpoint: str) -> None:
 def test_starting_router_causes_no_warning(
     endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class AtFirst(threading.Event):
+    class StopsAtFirstWait(threading.Event):
         def wait(self, timeout: float | None = None) -> bool:
             return True
 
     caplog.set_level(logging.INFO, "udrl")
     with pytest.raises(Interrupted):
-        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+        sessions.connect(endpoint, patience_s=60.0, stop=StopsAtFirstWait())
     assert [(r.levelname, r.message) for r in caplog.records] == [
         ("INFO", f"waiting for a replay service or router at {endpoint}")
     ]
     monkeypatch.setattr(sessions, "QUIET_S", 0.0)
     with pytest.raises(Interrupted):
-        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+        sessions.connect(endpoint, patience_s=60.0, stop=StopsAtFirstWait())
     assert caplog.records[-1].levelname == "WARNING"
     assert f"router at {endpoint}, for " in caplog.text
 

@@ -253,7 +253,7 @@ class RunMachine(RuleBasedStateMachine):
     # Invariants.
 
     @invariant()
-    def nothing_is_created_or_lost(self) -> None:
+    def ledgers_balance(self) -> None:
         shown = status(self.run, Throughput(), Waits(), 0.0, self.now)
         assert_conserved(shown)
         assert shown.episodes.accepted >= len(self.accepted)
@@ -281,7 +281,7 @@ class RunMachine(RuleBasedStateMachine):
                 weights_of(self.run, command)
 
     @invariant()
-    def everything_is_on_disk(self) -> None:
+    def progress_is_on_disk(self) -> None:
         assert self.run.store.fact("progress", RunProgress) == self.run.progress
 
     @invariant()
@@ -359,7 +359,7 @@ def deliver(run: StoredRun, command: Command, other: bool = False) -> str:
             run.save()
 
 
-def until_closing(run: StoredRun) -> None:
+def work_until_final_evaluation(run: StoredRun) -> None:
     """Work until only the final evaluation is left."""
     while run.progress.state == "running":
         work(run)
@@ -440,7 +440,7 @@ def test_final_evaluation_has_the_final_weights_and_fresh_seeds(make_run: MakeRu
     while run.progress.state == "running":
         seeds |= {c.environment_seed for c in outstanding(run)}
         work(run)
-    until_closing(run)
+    work_until_final_evaluation(run)
     final = run.progress.iteration
     assert [c.id for c in outstanding(run)] == [
         final * COMMANDS_PER_ITERATION + FINAL_EVALUATION + n
@@ -452,7 +452,7 @@ def test_final_evaluation_has_the_final_weights_and_fresh_seeds(make_run: MakeRu
 
 def test_repeated_episode_of_the_final_evaluation_is_a_duplicate(make_run: MakeRun) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     final = outstanding(run)
     assert [deliver(run, c) for c in final + final] == ["accepted"] * 2 + ["duplicate"] * 2
     assert run.progress.state == "ended"
@@ -518,7 +518,7 @@ def test_stopped_run_differs_from_a_killed_one(
     make_run: MakeRun, reopened: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     with run.store.transaction():
         run.save()
     assert read_status(tmp_path).state == "stopped"
@@ -616,7 +616,7 @@ def test_failed_run_retries_when_it_is_resumed(make_run: MakeRun, reopened: Make
 
 def test_failed_final_evaluation_is_retried(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     for actors in ("ab", "a"):
         fail(run, outstanding(run)[0].id, *actors)
     assert run.progress.state == "failed"
