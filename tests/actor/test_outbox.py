@@ -167,7 +167,7 @@ def test_episode_is_redelivered_to_a_restarted_service(scripted: Scripted, asker
     scripted.answers(verbs.JOIN, join)
     scripted.answers(verbs.EPISODE, accept)
     assert deliver(asker, JOIN, episode(7)) == 7
-    assert [name for name, _ in scripted.asked] == ["episode", "join", "episode"]
+    assert [name for name, _ in scripted.received] == ["episode", "join", "episode"]
 
 
 def test_delivery_gives_up_after_repeated_join_first(scripted: Scripted, asker: Asker) -> None:

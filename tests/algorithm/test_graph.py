@@ -120,8 +120,8 @@ def picked(seen: Seen, rows: Any) -> Seen:
 
 
 def fill(call: Call, seen: Seen, command: np.ndarray[Any, Any]) -> None:
-    for asked, one in zip(call.seen, seen, strict=True):
-        asked[:] = one
+    for target, one in zip(call.seen, seen, strict=True):
+        target[:] = one
     call.command[:] = command
 
 
@@ -209,10 +209,10 @@ def test_rows_are_computed_one_by_one_where_batches_change_bits(
 ) -> None:
     config = settings()
     graph = acting_graph(config.network, VECTOR)
-    asked = []
+    sizes = []
 
     def never(graph: bytes, n: int) -> bool:
-        asked.append(n)
+        sizes.append(n)
         return False
 
     monkeypatch.setattr(module, "is_exact_in_batch", never)
@@ -224,7 +224,7 @@ def test_rows_are_computed_one_by_one_where_batches_change_bits(
         fill(call, picked(seen, rows), command[rows])
         call.run()
         assert np.array_equal(call.logits, function.logits(picked(seen, rows), command[rows]))
-    assert asked == [6]
+    assert sizes == [6]
 
 
 def test_batch_dependent_rounding_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -219,8 +219,8 @@ def test_auto_selects_precision_and_device_of_the_machine(monkeypatch: pytest.Mo
 def test_resumed_run_keeps_its_precision_and_device() -> None:
     held = settings(precision="bfloat16", device="cpu", seed=3)
     assert resolve_as(held, settings(precision="auto", device="auto", seed=3)) == held
-    asked = settings(precision="float32", device="auto", seed=3)
-    assert resolve_as(held, asked).arithmetic.precision == "float32"
+    requested = settings(precision="float32", device="auto", seed=3)
+    assert resolve_as(held, requested).arithmetic.precision == "float32"
 
 
 @pytest.mark.parametrize(

@@ -46,10 +46,10 @@ def test_uniform_draws_returns_from_m_to_m_plus_s_with_the_mean_length(
 @given(BEST)
 def test_ranked_draws_one_of_the_k_best_with_probability_sqrt_k_of_n(best: list[Entry]) -> None:
     n, tries = len(best), 1_000
-    asked = [strategy("ranked")(best, (i + 0.5) / tries) for i in range(tries)]
+    drawn = [strategy("ranked")(best, (i + 0.5) / tries) for i in range(tries)]
     for k in range(1, n + 1):
         kept = [(e.episode_return, e.length) for e in best[n - k :]]
-        share = sum(one in kept for one in asked) / tries
+        share = sum(one in kept for one in drawn) / tries
         others = [(e.episode_return, e.length) for e in best[: n - k]]
         if not set(kept) & set(others):
             assert abs(share - sqrt(k / n)) < 2 / tries
@@ -141,16 +141,16 @@ def test_exception_of_a_strategy_is_reported(custom_module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "desired",
     [(float("nan"), 3), (float("inf"), 3), (1e300, 3), (1.0, 2**31), None, (1.0,), ("a lot", 3)],
 )
-def test_invalid_desired_return_is_rejected(asked: Any) -> None:
+def test_invalid_desired_return_is_rejected(desired: Any) -> None:
     class Odd:
         def __init__(self, config: Config) -> None:
             pass
 
         def __call__(self, best: Sequence[Entry], u: float) -> Any:
-            return asked
+            return desired
 
     with pytest.raises(ConfigError, match="Odd"):
         choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5)

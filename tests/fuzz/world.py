@@ -150,14 +150,14 @@ def valid_requests() -> list[tuple[str, bytes]]:
 
     A new world accepts them all in this order.
     """
-    world, asked = World(), []
+    world, requests = World(), []
     generator = EpisodeGenerator(CONFIG, 4)
     states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
     graph = acting_graph(CONFIG.network, generator.spec)
 
     def ask(verb: str, request: Message | bytes) -> Message:
         data = request if isinstance(request, bytes) else encode(request)
-        asked.append((verb, data))
+        requests.append((verb, data))
         answer = world.send_raw(verb, data)
         assert not isinstance(answer, Problem), answer
         return answer
@@ -214,7 +214,7 @@ def valid_requests() -> list[tuple[str, bytes]]:
     ask(verbs.CONTENTS.name, ContentsRequest())
     generator.close()
     world.close()
-    return asked
+    return requests
 
 
 def _train(world: World, version: int, states: list[TrainingState]) -> TrainingState:

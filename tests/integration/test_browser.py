@@ -70,7 +70,7 @@ def pages(browser: Browser) -> Iterator[Callable[..., Page]]:
 
     def watch(url: str) -> None:
         if urlsplit(url).hostname not in ("127.0.0.1", None):
-            wrong.append(f"asked for {url}")
+            wrong.append(f"requested {url}")
 
     def start(url: str, **options: Any) -> Page:
         contexts.append(browser.new_context(**options))

@@ -125,14 +125,14 @@ def test_commands_are_within_the_range_of_the_buffer(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     plan = plan_commands(agent, points=4, episodes=2)
     returns = sorted(e.episode_return for e in agent.buffer)
-    asked = [commands[0] for commands in plan.by_return]
-    assert plan.reachable == (asked[0].desired_return, asked[-1].desired_return)
+    commanded = [commands[0] for commands in plan.by_return]
+    assert plan.reachable == (commanded[0].desired_return, commanded[-1].desired_return)
     # Rounded to at most a tenth of their spacing.
     room = (returns[-1] - returns[0]) / 3 / 10
     assert plan.reachable[0] == pytest.approx(returns[(len(returns) - 1) // 20], abs=room)
     assert plan.reachable[1] == pytest.approx(returns[-1], abs=room)
     lengths = [e.length for e in agent.buffer]
-    assert all(min(lengths) <= c.desired_horizon <= max(lengths) for c in asked)
+    assert all(min(lengths) <= c.desired_horizon <= max(lengths) for c in commanded)
     wider = plan_commands(agent, points=3, episodes=2, desired_returns=(0.0, 1000.0))
     assert [c[0].desired_return for c in wider.by_return] == [0.0, 500.0, 1000.0]
     assert wider.reachable == plan.reachable
@@ -147,8 +147,8 @@ def with_horizons_from_returns(agent: Agent) -> Agent:
 def test_horizons_that_follow_from_returns_are_not_varied(ended_run: Path) -> None:
     agent = with_horizons_from_returns(load_agent(ended_run))
     plan = plan_commands(agent, points=9, episodes=2, desired_returns=(1.0, 4.0))
-    asked = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
-    assert asked == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]
+    commanded = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
+    assert commanded == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]
     assert plan.by_horizon == []
 
 

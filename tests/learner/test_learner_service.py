@@ -127,15 +127,17 @@ def test_only_new_episodes_are_fetched(replay: Scripted, run: Callable[[], None]
 def test_next_buffer_is_requested_during_training(
     replay: Scripted, run: Callable[[], None]
 ) -> None:
-    asked = threading.Event()
+    is_requested = threading.Event()
 
     def changes(request: ChangesRequest) -> ChangesReply:
         if request.version == 2:
-            asked.set()
+            is_requested.set()
         return ChangesReply(ids=(1, 2)) if request.version == 1 else ChangesReply(ended=True)
 
     def version(message: VersionMessage) -> VersionReply:
-        assert asked.wait(10.0), "version 1 was delivered before the next buffer was requested"
+        assert is_requested.wait(10.0), (
+            "version 1 was delivered before the next buffer was requested"
+        )
         return VersionReply(result="accepted")
 
     replay.answers(verbs.CHANGES, changes)

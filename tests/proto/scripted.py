@@ -19,20 +19,20 @@ class Scripted:
 
     Attributes:
         transport: connects to it.
-        asked: verb and message of each request, in order.
+        received: verb and message of each request, in order.
     """
 
     def __init__(self, run_id: str) -> None:
         self._run_id = run_id
         self.transport = MemoryTransport(Exchange())
-        self.asked: list[tuple[str, Any]] = []
+        self.received: list[tuple[str, Any]] = []
 
     def answers(self, verb: Verb[Any, Any], script: Callable[[Any], Message]) -> None:
         """Reply to a verb's requests by a function of the request."""
 
         def receive(query: Query) -> None:
             request = decode(query.data, verb.request, verb.limit)
-            self.asked.append((verb.name, request))
+            self.received.append((verb.name, request))
             answer = script(request)
             query.reply(Answer(encode(answer), is_problem=isinstance(answer, Problem)))
 
@@ -44,4 +44,4 @@ class Scripted:
 
     def requests(self, verb: Verb[Any, Any]) -> list[Any]:
         """Return the requests of a verb."""
-        return [request for name, request in self.asked if name == verb.name]
+        return [request for name, request in self.received if name == verb.name]

@@ -48,7 +48,7 @@ class Replay:
     def __init__(self, session: zenoh.Session, *, hosts_router: bool) -> None:
         self.session = session
         self.hosts_router = hosts_router
-        self.asked: list[str] = []
+        self.received: list[str] = []
         self.tokens: queue.Queue[str] = queue.Queue()
         for verb in verbs.BY_NAME:
             key = key_expressions.key("run", verb)
@@ -60,7 +60,7 @@ class Replay:
 
     def _answer(self, key: str, query: zenoh.Query) -> None:
         with query:
-            self.asked.append(key)
+            self.received.append(key)
             query.reply(key, b"replay")
 
     def _note(self, token: zenoh.Sample) -> None:
@@ -218,7 +218,7 @@ def test_role_gets_replies_to_its_own_verbs_only(
 ) -> None:
     client = connect(role)
     assert {verb for verb in verbs.BY_NAME if ask(client, verb)} == MAY_ASK[role]
-    assert replay.asked == [
+    assert replay.received == [
         key_expressions.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
     ]
 
@@ -231,7 +231,7 @@ def test_wildcards_grant_no_additional_access(
     expression = expression.replace("st*", "st$*")
     assert list(client.get(expression, timeout=DEADLINE_S, target=zenoh.QueryTarget.ALL)) == []
     assert len(list(client.get(key_expressions.every_hello(), timeout=DEADLINE_S))) == 1
-    assert replay.asked == [key_expressions.key("run", verbs.HELLO.name)]
+    assert replay.received == [key_expressions.key("run", verbs.HELLO.name)]
 
 
 def impersonate_replay(thief: zenoh.Session) -> list[str]:
@@ -253,9 +253,9 @@ def impersonate_replay(thief: zenoh.Session) -> list[str]:
 def test_actor_cannot_impersonate_the_replay_service(replay: Replay, connect: Connect) -> None:
     stolen = impersonate_replay(connect("actor"))
     assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", "actor", "thief")
-    for role, asked in MAY_ASK.items():
+    for role, allowed in MAY_ASK.items():
         victim = connect(role)
-        for verb in asked:
+        for verb in allowed:
             assert ask(victim, verb) == ["replay"]
     assert stolen == []
 

@@ -290,12 +290,12 @@ def test_contents_have_the_buffer_and_the_commands_drawn_from_it(make_run: MakeR
     best = run.buffer.best(run.config.commands.last_few)
     mean = math.fsum(e.episode_return for e in best) / len(best)
     assert found.desired_return == pytest.approx(mean)
-    asked = [
+    dealt = [
         (o.command.desired_return, o.command.desired_horizon)
         for o in run.dealer.outstanding.values() if o.command.kind == "explore"
     ]  # fmt: skip
-    assert asked
-    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == asked
+    assert dealt
+    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == dealt
     assert set(found.versions) == set(run.store.versions_kept())
 
 

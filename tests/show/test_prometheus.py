@@ -75,9 +75,11 @@ def test_unknown_values_are_not_exported() -> None:
 def test_dashboard_queries_existing_metrics() -> None:
     metrics = {name for name, _ in scraped(FULL)}
     dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text())
-    asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
-    assert len(asked) > 10
-    for expression in asked:
+    queries = [
+        target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])
+    ]
+    assert len(queries) > 10
+    for expression in queries:
         found = re.findall(r"udrl_\w+", expression)
         assert found, expression
         assert set(found) <= metrics, expression
