@@ -9,13 +9,13 @@ import pytest
 from udrl.training import use_one_thread
 from udrl_launch import authority
 
-# Box2D's types warn while it is imported; as an error, such a warning kills the interpreter.
+# Box2D's types warn on import. As an error, such a warning kills the interpreter.
 if find_spec("Box2D") is not None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("Box2D")
 
-# The same examples in every run, and no deadline: machines are slow at times.
+# The same examples in every run, and no deadline, because machines are sometimes slow.
 hypothesis.settings.register_profile("udrl", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("udrl")
 
@@ -35,7 +35,7 @@ def keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def foreign_keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys for all roles, of an authority that nobody here trusts."""
+    """Keys for all roles of an untrusted authority."""
     folder = tmp_path_factory.mktemp("foreign")
     authority.create(folder)
     return folder

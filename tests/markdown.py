@@ -1,4 +1,4 @@
-"""Reading the repository's Markdown pages, as far as the tests need to."""
+"""A reader of the repository's Markdown pages."""
 
 import re
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def files(pattern: str) -> list[Path]:
-    """Return the repository's files of a kind, relative to its root; not what was built or run."""
+    """Return the repository's files that match, relative to its root, without generated ones."""
     folders = [
         folder
         for folder in ROOT.iterdir()
@@ -36,12 +36,12 @@ _INLINE = re.compile(r"`((?:[^`\n]|\n(?!\n))+)`")
 
 
 class Block(NamedTuple):
-    """What stands in a fence.
+    """A fenced block.
 
     Attributes:
-        language: after its backticks; empty for output and drawings.
-        title: name of the file that the reader is to write; mostly empty.
-        text: what stands in it.
+        language: the info string's first word; empty for output and drawings.
+        title: name of the file that the reader writes; usually empty.
+        text: its content.
     """
 
     language: str
@@ -50,11 +50,11 @@ class Block(NamedTuple):
 
 
 class Page:
-    """A page, taken apart.
+    """A parsed page.
 
     Attributes:
-        blocks: what stands in fences.
-        prose: all but that.
+        blocks: the fenced blocks.
+        prose: everything else.
         inline: code in the prose, each on one line.
         words: the prose without it.
     """
@@ -74,7 +74,7 @@ class Page:
 
     @property
     def code(self) -> list[tuple[str, str]]:
-        """What stands in fences, each with its language."""
+        """The contents of the fenced blocks, each with its language."""
         return [(block.language, block.text) for block in self.blocks]
 
     def _keep(self, match: re.Match[str]) -> str:

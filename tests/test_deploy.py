@@ -1,4 +1,4 @@
-"""Where containers run: the files agree with each other, with the schemas, and with the program."""
+"""Deployment files agree with each other, with their schemas, and with the program."""
 
 import re
 import shlex
@@ -18,7 +18,7 @@ KUBERNETES = ROOT / "deploy" / "kubernetes"
 MANIFESTS = sorted(KUBERNETES.glob("*.yaml"))
 VERSION = "1.31"
 
-#: What a Swarm reads elsewhere, below ``deploy`` or ``volumes``, or not at all.
+#: Keys that Swarm reads elsewhere, below ``deploy`` or ``volumes``, or ignores.
 ONLY_COMPOSE = {"build", "depends_on", "restart", "scale", "security_opt", "tmpfs"}
 
 
@@ -64,29 +64,29 @@ def test_torch_is_in_the_image_of_the_learner_only() -> None:
     assert "TORCH_INDEX" not in compose["replay"]["build"]["args"]
 
 
-def test_images_of_ones_own_are_built_on_what_there_is() -> None:
-    """What the documentation tells to build is not built here; it names these places."""
-    told = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
-    told = told.split("\n#### An environment of your own\n")[1].split("\n### ")[0]
+def test_documented_custom_images_match_the_dockerfile() -> None:
+    """The documented build depends on these places of the Dockerfile."""
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    page = page.split("\n#### An environment of your own\n")[1].split("\n### ")[0]
     dockerfile = (ROOT / "Dockerfile").read_text(encoding="utf-8")
-    assert "pip --python /opt/udrl/bin/python install" in told
+    assert "pip --python /opt/udrl/bin/python install" in page
     assert "RUN python3 -m venv /opt/udrl" in dockerfile
     assert "pip uninstall --yes pip" in dockerfile, "so that PATH finds the base image's pip"
     actor, learner = dockerfile.split(" AS actor\n")[1].split("FROM actor AS learner")
-    assert "USER udrl" in told
+    assert "USER udrl" in page
     assert "\nUSER udrl\n" in actor
-    assert "PYTHONPATH" not in actor, "an image of one's own may set it"
+    assert "PYTHONPATH" not in actor, "custom images may set it"
     assert "PYTHONPATH=/opt/torch" in learner
     images = {name: service["image"] for name, service in services("compose.yaml").items()}
     assert images["actor"] == images["replay"] == "${UDRL_IMAGE:-udrl}"
     assert "${ENV:-" in services("compose.yaml")["replay"]["command"]
 
 
-def test_no_override_publishes_a_port_where_nobody_is_asked() -> None:
+def test_insecure_overrides_publish_no_port() -> None:
     overrides = ["compose.secure.yaml", "compose.gpu.yaml"]
     assert "--insecure" in services("compose.yaml")["replay"]["command"]
     assert not any("ports" in service for service in services("compose.yaml").values())
-    # Whatever the order: nobody but the secure file says what a service does, or publishes.
+    # Independent of the order of files, only the secure one may set commands or publish ports.
     for file in overrides:
         for service in services(file).values():
             assert file == "compose.secure.yaml" or not {"command", "ports"} & service.keys()
@@ -105,7 +105,7 @@ def commands(file: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("file", ["compose.yaml", "compose.secure.yaml", "deploy/stack.yaml"])
-def test_containers_are_given_commands_that_there_are(file: str) -> None:
+def test_container_commands_are_valid(file: str) -> None:
     found = list(commands(file))
     assert found
     for words in found:
@@ -113,13 +113,13 @@ def test_containers_are_given_commands_that_there_are(file: str) -> None:
 
 
 @pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.name)
-def test_kubernetes_accepts_the_manifests(path: Path) -> None:
+def test_manifests_match_the_kubernetes_schemas(path: Path) -> None:
     for document in documents(path):
-        if document["kind"] != "Kustomization":  # it is for a program, not for the cluster
+        if document["kind"] != "Kustomization":  # for a program, not for the cluster
             kubernetes_validate.validate(document, VERSION, strict=True)
 
 
-def test_the_schemas_refuse_a_misspelt_field() -> None:
+def test_schemas_reject_a_misspelt_field() -> None:
     document = next(documents(KUBERNETES / "actor.yaml"))
     document["spec"]["replica"] = 2
     with pytest.raises(kubernetes_validate.ValidationError):
@@ -149,17 +149,17 @@ def test_kubernetes_runs_the_services_of_compose() -> None:
                 check_udrl(arguments)
 
 
-def test_an_autoscaler_may_scale_actors_and_nothing_else() -> None:
+def test_autoscaler_scales_actors_only() -> None:
     counted = {w["metadata"]["name"]: w["spec"].get("replicas") for w in workloads()}
     assert counted == {"replay": 1, "learner": 1, "actor": None}
 
 
-def test_kustomization_names_every_manifest() -> None:
+def test_kustomization_lists_every_manifest() -> None:
     named = load(KUBERNETES / "kustomization.yaml")["resources"]
     assert sorted([*named, "kustomization.yaml"]) == [path.name for path in MANIFESTS]
 
 
-def test_kustomization_names_every_image() -> None:
+def test_kustomization_lists_every_image() -> None:
     named = {image["name"] for image in load(KUBERNETES / "kustomization.yaml")["images"]}
     used = {
         container["image"]
@@ -169,7 +169,7 @@ def test_kustomization_names_every_image() -> None:
     assert named == used
 
 
-def test_slurm_script_says_what_it_needs() -> None:
+def test_slurm_script_requests_its_resources() -> None:
     script = ROOT / "deploy" / "slurm" / "actors.sbatch"
     done = subprocess.run(
         ["bash", str(script)], capture_output=True, text=True, timeout=10, env={"PATH": "/bin"}

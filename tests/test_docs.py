@@ -1,4 +1,4 @@
-"""The reference in the documentation says what is there, all of it, and nothing else."""
+"""The reference in the documentation is complete and matches the code."""
 
 import ast
 import importlib.util
@@ -39,7 +39,7 @@ from udrl_replay.store import COLUMNS, Store
 # Studies.
 
 
-def test_studies_name_what_other_algorithms_need() -> None:
+def test_studies_list_the_dependencies_of_other_algorithms() -> None:
     text = " ".join(section("docs/studies.md", "## Participants").split())
     needs = text[text.index("DQN, A2C and PPO are") :]
     for words in ('pip install "udrl[studies]"', "discrete actions and one vector or image"):
@@ -50,7 +50,7 @@ def test_studies_name_what_other_algorithms_need() -> None:
 
 
 def number(value: float) -> str:
-    """Return a bound as the tables have it: powers of two from 2^16 as such."""
+    """Format a bound as in the tables: powers of two from 2^16 as such."""
     whole = int(value)
     if whole != value:
         return str(value)
@@ -67,7 +67,7 @@ def bounds(kind: Any) -> str:
 
 
 def described(kind: inspect.Type) -> tuple[str, str]:
-    """Return how the tables name a type, and the values that it allows."""
+    """Return the name of a type in the tables, and the allowed values."""
     match kind:
         case inspect.UnionType():
             (held,) = (t for t in kind.types if not isinstance(t, inspect.NoneType))
@@ -89,7 +89,7 @@ def described(kind: inspect.Type) -> tuple[str, str]:
             name, allowed = described(kind.item_type)
             count = f"{kind.min_length} to {kind.max_length}"
             return f"list of {name}s", f"{count} of them, each {allowed}"
-    raise AssertionError(f"teach this test to describe {kind}")
+    raise AssertionError(f"this test cannot describe {kind}")
 
 
 def default_of(field: inspect.Field) -> str:
@@ -123,7 +123,7 @@ def test_every_setting_is_documented_with_its_type_default_and_range(
     assert all(row[4] for row in rows)
 
 
-def test_every_preset_is_documented_with_what_differs_from_the_defaults() -> None:
+def test_every_preset_is_documented_with_its_differences_from_the_defaults() -> None:
     defaults = {
         field.name: list(field.default) if isinstance(field.default, tuple) else field.default
         for kind in (Config, Budget, Fleet)
@@ -141,7 +141,7 @@ def test_every_preset_is_documented_with_what_differs_from_the_defaults() -> Non
     assert {name: tomllib.loads(settings) for name, settings in blocks} == expected
 
 
-def test_every_preset_is_documented_with_what_it_is_for() -> None:
+def test_every_preset_is_documented_with_its_purpose() -> None:
     rows = records(section("docs/configuration.md", "## Presets"), "preset")
     assert sorted(name for row in rows for name in codes(row[0])) == preset_names()
     assert all(row[1] for row in rows)
@@ -176,7 +176,7 @@ def fields(kind: inspect.Type, prefix: str = "") -> Iterator[str]:
             yield prefix
 
 
-def test_every_metrics_column_is_documented_in_the_files_order() -> None:
+def test_every_metrics_column_is_documented_in_file_order() -> None:
     rows = records(section("docs/metrics.md", "## metrics.csv"), "column")
     assert [codes(row[0])[0] for row in rows] == list(COLUMNS)
     assert all(row[2] for row in rows)
@@ -204,7 +204,7 @@ def test_every_error_is_documented_with_its_exit_code() -> None:
     assert found == {error.__name__: error.exit_code for error in ERRORS}
 
 
-def test_exit_codes_say_which_children_are_started_again() -> None:
+def test_documented_exit_codes_state_which_children_are_restarted() -> None:
     rows = records(section("docs/operations-reference.md", "## Exit codes"), "code")
     assert {int(row[0]) for row in rows if row[4] == "no"} == FINAL_CODES
     assert {int(row[0]) for row in rows if row[4] == "yes"} == {
@@ -250,7 +250,7 @@ def log_formats() -> Iterator[tuple[Path, str]]:
                 yield path, ast.literal_eval(node.args[0])
 
 
-def test_every_log_line_of_weight_is_documented() -> None:
+def test_every_warning_and_error_of_the_log_is_documented() -> None:
     documented = names(section("docs/operations-reference.md", "## Log lines"), "line")
     for path, line in log_formats():
         shown = re.sub(r"%(\.\d+)?[srdf]", "…", line)
@@ -260,23 +260,23 @@ def test_every_log_line_of_weight_is_documented() -> None:
 LITERALS = re.sub(r'"\s*\n?\s*f?"', "", " ".join(text_of(path) for path in SOURCES))
 
 
-def is_in_the_code(message: str) -> bool:
-    """Say whether the code has a message, in which … stands for what varies."""
+def is_in_source(message: str) -> bool:
+    """Return whether the code has a message, in which … stands for variable parts."""
     pattern = r"[^\n]{1,80}?".join(re.escape(part) for part in message.split("…"))
     return re.search(pattern, LITERALS) is not None
 
 
-def test_no_log_line_is_documented_that_is_not_there() -> None:
+def test_documented_log_lines_exist() -> None:
     for line in names(section("docs/operations-reference.md", "## Log lines"), "line"):
-        assert is_in_the_code(line), line
+        assert is_in_source(line), line
 
 
-def test_messages_in_troubleshooting_are_those_of_the_code() -> None:
+def test_messages_in_troubleshooting_exist() -> None:
     text = Page("docs/troubleshooting.md").prose
     messages = {*names(text, "message"), *re.findall(r"\*\*`([^`]+)`\*\*", text)}
     assert len(messages) > 12
     for message in messages:
-        assert is_in_the_code(message), message
+        assert is_in_source(message), message
 
 
 def test_every_extra_is_documented() -> None:

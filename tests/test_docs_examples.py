@@ -1,4 +1,4 @@
-"""What the documentation names exists: commands, code, files, links."""
+"""Commands, code, files and links in the documentation exist."""
 
 import importlib
 import re
@@ -24,7 +24,7 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=str)
 
 
 @each_page
-def test_toml_and_python_in_the_documentation_can_be_read(page: Path) -> None:
+def test_toml_and_python_in_the_documentation_parse(page: Path) -> None:
     for language, code in Page(page).code:
         if language == "python":
             compile(code, str(page), "exec")
@@ -33,7 +33,7 @@ def test_toml_and_python_in_the_documentation_can_be_read(page: Path) -> None:
 
 
 def shell_commands(code: str) -> Iterator[list[str]]:
-    """Yield the simple commands of a piece of shell, as words."""
+    """Yield the simple commands of a piece of shell code as words."""
     for line in code.replace("\\\n", " ").splitlines():
         words = shlex.shlex(line.removeprefix("$ "), posix=True, punctuation_chars=True)
         words.whitespace_split = True
@@ -43,17 +43,17 @@ def shell_commands(code: str) -> Iterator[list[str]]:
                 if command:
                     yield command
                 command = []
-            elif command or not re.fullmatch(r"\w+=.*", word):  # a variable for this command
+            elif command or not re.fullmatch(r"\w+=.*", word):  # a variable of this command
                 command.append(word)
 
 
 def commands_in(page: Path) -> Iterator[list[str]]:
-    """Yield the commands in a page that one could type."""
+    """Yield the commands of a page that a reader could type."""
     parts = Page(page)
     for language, code in parts.code:
         if language in ("sh", "bash", "console"):
             yield from shell_commands(code)
-        elif not language:  # a drawing, perhaps
+        elif not language:  # possibly a drawing
             for line in re.findall(r"^(?:\$ )?(?:\S*/)?(?:udrl|make) .*", code, flags=re.MULTILINE):
                 yield from shell_commands(line)
     for code in parts.inline:
@@ -65,7 +65,7 @@ def check_udrl(words: list[str]) -> None:
     """Parse the arguments of a command ``udrl``, without running it.
 
     Raises:
-        click.UsageError, UdrlError: it could not be given so.
+        click.UsageError, UdrlError: the arguments are invalid.
     """
     name, *arguments = words
     if name.startswith("-"):
@@ -88,7 +88,7 @@ def check_udrl(words: list[str]) -> None:
     for endpoint in (given.get("listen"), given.get("connect")):
         if endpoint is not None:
             check_endpoint(endpoint, secure=given.get("keys") is not None)
-    if "side_by_side" in given:  # a study: its callback parses more
+    if "side_by_side" in given:  # a study, whose callback parses more
         StudyPlan(
             given["scale"],
             parse_seeds(given["seeds"] or "1"),
@@ -110,7 +110,7 @@ def check_udrl(words: list[str]) -> None:
 
 
 def placeholder(word: str) -> str:
-    """Return a value that a placeholder may stand for."""
+    """Return a possible value of a placeholder."""
     if word == "ENDPOINT":
         return "tcp/127.0.0.1:7447"
     if re.fullmatch(r"[A-Z]", word):
@@ -119,7 +119,7 @@ def placeholder(word: str) -> str:
 
 
 @each_page
-def test_commands_in_the_documentation_can_be_given(page: Path) -> None:
+def test_commands_in_the_documentation_are_valid(page: Path) -> None:
     for command in commands_in(page):
         program, *arguments = command
         program = program.rpartition("/")[2]
@@ -134,7 +134,7 @@ def test_commands_in_the_documentation_can_be_given(page: Path) -> None:
             assert target in make_targets() or "-C" in arguments, f"{page}: {shown}"
 
 
-def test_commands_are_found_where_they_stand() -> None:
+def test_commands_are_found_in_all_places() -> None:
     code = (
         "# a comment\n$ A=1 .venv/bin/udrl train \\\n  CartPole-v1 --set hidden=[8,8] && make x | y"
     )
@@ -159,7 +159,7 @@ def test_commands_are_found_where_they_stand() -> None:
         "status --jason",
     ],
 )
-def test_wrong_commands_would_be_found(words: str) -> None:
+def test_invalid_commands_are_found(words: str) -> None:
     with pytest.raises((click.UsageError, UdrlError, KeyError, AssertionError)):
         check_udrl(words.split())
 
@@ -168,23 +168,23 @@ def test_wrong_commands_would_be_found(words: str) -> None:
 
 
 @each_page
-def test_links_in_the_repository_lead_somewhere(page: Path) -> None:
+def test_links_in_the_repository_have_a_target(page: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", Page(page).words):
         if re.match(r"[a-z]+:", target):
-            continue  # another site's
+            continue  # an external link
         path, _, anchor = target.partition("#")
         there = (ROOT / page).parent / path if path else ROOT / page
         assert there.exists(), f"{page}: {target} does not exist"
         if anchor and there.suffix == ".md":
-            assert anchor in anchors(there), f"{page}: {target}: there is no such heading"
+            assert anchor in anchors(there), f"{page}: {target}: this heading does not exist"
 
 
 _PATH = re.compile(r"(udrl|proto|services|tests|docs|benchmarks|experiments|\.ci)(/[\w.-]+)*/?")
 _DOTTED = re.compile(r"(udrl|udrl_(?:proto|actor|learner|replay|launch))(\.\w+)+")
 
 
-def is_there(dotted: str) -> bool:
-    """Say whether a dotted name is a module, or something in one."""
+def exists(dotted: str) -> bool:
+    """Return whether a dotted name is a module, or an attribute of one."""
     module, _, rest = dotted.partition(".")
     found = importlib.import_module(module)
     for part in rest.split("."):
@@ -208,7 +208,7 @@ def test_code_named_in_the_documentation_exists(page: Path) -> None:
         if "/" in name and _PATH.fullmatch(name):
             assert (ROOT / name).exists() or (ROOT / page).parent.joinpath(name).exists(), name
         elif _DOTTED.fullmatch(name):
-            assert is_there(name), f"{page}: {name}"
+            assert exists(name), f"{page}: {name}"
         elif re.fullmatch(r"\w+\.py", name):
             assert name in modules, f"{page}: {name}"
 

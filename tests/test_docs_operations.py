@@ -1,4 +1,4 @@
-"""What the pages on running udrl say of its behaviour is what it does."""
+"""The behaviour described in the pages on operations is the actual one."""
 
 import re
 from contextlib import closing
@@ -29,8 +29,8 @@ TOY = Config(environment="Figure2-v0", max_return=2.0)
 # Resuming.
 
 
-def go_on(run_dir: Path, *, allow_inexact: bool = False, **given: Any) -> Settings:
-    """Resume a run with options of ``udrl train``; return the settings that they lead to."""
+def resume_settings(run_dir: Path, *, allow_inexact: bool = False, **given: Any) -> Settings:
+    """Resume a run with options of ``udrl train``; return the resulting settings."""
     nothing = {"preset_name": None, "file": None, "assignments": ()}
     settings = gather_settings(TOY.environment, nothing | given, run_dir, resume=True)
     open_run(
@@ -42,7 +42,7 @@ def go_on(run_dir: Path, *, allow_inexact: bool = False, **given: Any) -> Settin
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-    """The directory of a run with a budget of 5000 steps and a configuration file edited since."""
+    """The directory of a run with a budget of 5000 steps and a later edited configuration file."""
     settings = Settings(TOY, Budget(max_env_steps=5000), Fleet(actors=7))
     open_run(
         tmp_path, settings, resume=False, allow_inexact=False, listen=None,
@@ -56,7 +56,7 @@ def run_dir(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_resuming_takes_from_where_is_documented() -> None:
+def test_sources_of_settings_on_resume_are_documented() -> None:
     rows = records(section(OPERATIONS, "## Resuming and extending"), "what")
     found = {row[0].split(":")[0]: row[1] for row in rows}
     assert found == {
@@ -70,30 +70,30 @@ def test_what_resuming_takes_from_where_is_documented() -> None:
 
 
 def test_resuming_takes_settings_from_the_store(run_dir: Path) -> None:
-    assert go_on(run_dir).config.seed == TOY.seed
+    assert resume_settings(run_dir).config.seed == TOY.seed
     with pytest.raises(OtherConfiguration) as refusal:
-        go_on(run_dir, seed=9)
+        resume_settings(run_dir, seed=9)
     row = records(section(OPERATIONS, "## Resuming and extending"), "what")[0]
     assert f"refused with exit code {refusal.value.exit_code}" in row[2]
 
 
 def test_resuming_takes_the_budget_from_the_file(run_dir: Path) -> None:
-    assert go_on(run_dir).budget.max_env_steps == 6000
-    assert go_on(run_dir, max_env_steps=8000).budget.max_env_steps == 8000
-    assert budget_of(run_dir).max_env_steps == 8000  # written there
+    assert resume_settings(run_dir).budget.max_env_steps == 6000
+    assert resume_settings(run_dir, max_env_steps=8000).budget.max_env_steps == 8000
+    assert budget_of(run_dir).max_env_steps == 8000  # the edited value
     (run_dir / "config.toml").unlink()
     assert f"budget is the default, {Budget().max_env_steps:,} env steps" in plain(OPERATIONS)
-    assert go_on(run_dir).budget == Budget()
+    assert resume_settings(run_dir).budget == Budget()
 
 
-def test_resuming_takes_the_fleet_from_nowhere(run_dir: Path) -> None:
-    assert go_on(run_dir).fleet == Fleet()
+def test_resuming_uses_no_earlier_fleet_settings(run_dir: Path) -> None:
+    assert resume_settings(run_dir).fleet == Fleet()
 
 
-def test_resuming_can_allow_inexact_and_not_forbid_it(run_dir: Path) -> None:
+def test_resuming_can_allow_inexact_results_but_not_forbid_them(run_dir: Path) -> None:
     allowed = []
     for allow_inexact in (False, True, False):
-        go_on(run_dir, allow_inexact=allow_inexact)
+        resume_settings(run_dir, allow_inexact=allow_inexact)
         with closing(Store(run_dir, read_only=True)) as store:
             allowed.append(store.fact("hello", Hello).allow_inexact)
     assert allowed == [False, True, True]
@@ -102,9 +102,9 @@ def test_resuming_can_allow_inexact_and_not_forbid_it(run_dir: Path) -> None:
 # The protocol.
 
 
-def test_drawing_of_the_message_flow_has_the_rights_of_each_role() -> None:
+def test_message_flow_diagram_matches_the_rights_of_each_role() -> None:
     drawn: dict[str, set[str]] = {role: set() for role in RIGHTS}
-    says: dict[str, set[str]] = {role: set() for role in RIGHTS}
+    publishes: dict[str, set[str]] = {role: set() for role in RIGHTS}
     joins = set()
     lines = re.findall(
         r"^    (\w+) +-+ (.+?) -+> +(\w+)$",
@@ -117,17 +117,17 @@ def test_drawing_of_the_message_flow_has_the_rights_of_each_role() -> None:
         elif what.endswith(", published"):
             name = what.removesuffix(", published")
             assert name in RIGHTS[receiver].subscribes
-            if sender in says:
-                says[sender].add(name)
+            if sender in publishes:
+                publishes[sender].add(name)
         else:
             assert receiver == "replay"
             drawn[sender] |= set(what.split(", "))
     assert drawn == {role: set(verbs.asked_by(role)) for role in RIGHTS}
-    assert says == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
+    assert publishes == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
     assert joins == {role for role, rights in RIGHTS.items() if rights.joins}
 
 
-def test_every_verb_is_documented_to_be_repeatable() -> None:
+def test_every_verb_is_documented_as_repeatable() -> None:
     rows = records(section("docs/protocol.md", "## Why queries"), "request")
     assert sorted(verb for row in rows for verb in codes(row[0])) == sorted(verbs.BY_NAME)
 
@@ -168,11 +168,11 @@ def plain(page: str) -> str:
         ("proto/README.md", f"{dealing.MOST_ACTORS:,} actors have joined"),
     ],
 )
-def test_pages_have_the_numbers_of_the_code(page: str, phrase: str) -> None:
+def test_numbers_in_pages_match_the_code(page: str, phrase: str) -> None:
     assert phrase in plain(page)
 
 
-def test_constants_are_where_the_documentation_says() -> None:
+def test_constants_are_in_the_documented_places() -> None:
     named = [
         (page, name, place)
         for page in PAGES

@@ -1,4 +1,4 @@
-"""The figures and tables of the results pages are made from the CSV files beside them."""
+"""Figures and tables of the results pages are generated from the CSV files beside them."""
 
 import re
 from pathlib import Path
@@ -26,7 +26,7 @@ def anchor(heading: str) -> str:
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)
-def test_tables_are_made_of_the_evaluations(folder: Path) -> None:
+def test_tables_match_the_evaluations(folder: Path) -> None:
     rows = read(folder / "evaluations.csv", EvaluationRecord)
     points = read(folder / "curves.csv", CurvePoint)
     assert points == curves(rows, EVERY)
@@ -42,7 +42,7 @@ def test_kept_runs_are_recognised() -> None:
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)
-def test_pictures_show_every_line(folder: Path) -> None:
+def test_figures_show_every_line(folder: Path) -> None:
     points = read(folder / "curves.csv", CurvePoint)
     picture = (folder / "learning-curves.svg").read_text(encoding="utf-8")
     for algorithm, variant, seeds in {(p.algorithm, p.variant, p.seeds) for p in points}:
@@ -50,7 +50,7 @@ def test_pictures_show_every_line(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("table", sorted(RESULTS.glob("sensitivity*/*.csv")), ids=lambda p: p.stem)
-def test_sensitivity_has_100_episodes_a_point(table: Path) -> None:
+def test_sensitivity_has_100_episodes_per_point(table: Path) -> None:
     rows = read(table, Obtained)
     assert {row.episodes for row in rows} == {100}
     seeds = {row.seed for row in rows}
@@ -59,7 +59,7 @@ def test_sensitivity_has_100_episodes_a_point(table: Path) -> None:
     assert all(f"seed {seed}" in picture for seed in seeds)
 
 
-def test_every_picture_is_shown_and_every_shown_file_exists() -> None:
+def test_every_figure_is_shown_and_every_shown_file_exists() -> None:
     text = text_of("docs/results.md") + text_of("docs/experiments.md")
     shown = set(re.findall(r"\(results/([^)#]+)\)", text))
     present = {str(path.relative_to(RESULTS)) for path in RESULTS.rglob("*.*") if path.is_file()}
@@ -78,7 +78,7 @@ def test_every_result_answers_its_question() -> None:
         assert result.index("**Question.**") < result.index("**Answer.**")
 
 
-def test_every_experiment_asks_a_question_that_the_contents_list() -> None:
+def test_every_experiment_is_listed_with_its_question() -> None:
     page = text_of("docs/experiments.md")
     contents, _, entries = page.partition("\n## ")
     headings = re.findall(r"^### (.+)$", entries, flags=re.MULTILINE)

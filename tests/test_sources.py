@@ -1,4 +1,4 @@
-"""What no source file may do: turn data into code, or hand text to a shell."""
+"""Forbidden in source files: turning data into code, and passing text to a shell."""
 
 import ast
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ SOURCES = sorted(
 
 #: Modules that read or write objects as code.
 MODULES = {"cloudpickle", "code", "copyreg", "dill", "jsonpickle", "marshal", "pickle", "shelve"}
-#: Calls by the last part of their name, whatever they are attributes of.
+#: Calls by the last part of their name, as attributes of any object.
 CALLS = {
     "compile", "create_subprocess_shell", "eval", "exec", "getoutput", "getstatusoutput", "popen",
     "system",
@@ -25,7 +25,7 @@ LOADERS = {"torch.load", "torch.jit.load", "np.load", "numpy.load", "joblib.load
 
 
 def offences(source: str) -> Iterator[str]:
-    """Yield what a source file does that it may not."""
+    """Yield the forbidden parts of a source file."""
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Import(names=names):
@@ -62,12 +62,12 @@ def test_no_unpickling_no_eval_no_shell(path: Path) -> None:
         "subprocess.getoutput(x)", "from cloudpickle.x import y",
     ],
 )  # fmt: skip
-def test_the_search_finds_them(source: str) -> None:
+def test_forbidden_code_is_found(source: str) -> None:
     assert list(offences(source))
 
 
 @pytest.mark.parametrize(
     "source", ["re.compile(x)", "subprocess.run(x, shell=False)", "np.frombuffer(x)", "evaluate(x)"]
 )
-def test_the_search_finds_nothing_else(source: str) -> None:
+def test_allowed_code_is_not_found(source: str) -> None:
     assert not list(offences(source))

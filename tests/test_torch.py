@@ -1,11 +1,11 @@
-"""Only a learner needs torch: everything else is imported where there is none."""
+"""Only a learner needs torch: everything else can be imported without it."""
 
 import subprocess
 import sys
 
 import pytest
 
-#: What actors, the replay service, lookers-on and users of a trained agent import.
+#: Modules that actors, the replay service, commands that read runs, and users of agents import.
 MODULES = (
     "udrl.folder", "udrl.inference", "udrl.obedience_statistics", "udrl.policy", "udrl.rollout",
     "udrl_actor.actor_service", "udrl_replay.replay_service", "udrl_board.app",

@@ -1,4 +1,4 @@
-"""The courier against a scripted replay service."""
+"""The courier with a scripted replay service."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -63,7 +63,7 @@ def command(number: int, version: int = 0) -> Command:
 
 
 class Deals:
-    """Answers to one question for commands after another; then there is nothing to do."""
+    """Deals commands in reply to one request after another; then there are none."""
 
     def __init__(self, *answers: Message) -> None:
         self._answers = list(answers)
@@ -103,7 +103,7 @@ def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
 
 
 def take(courier: Courier, n: int) -> list[Assignment]:
-    """Take until ``n`` assignments have come."""
+    """Take until ``n`` assignments have arrived."""
     assignments: list[Assignment] = []
 
     def more() -> bool:
@@ -114,7 +114,7 @@ def take(courier: Courier, n: int) -> list[Assignment]:
     return assignments
 
 
-def test_commands_come_with_the_weights_that_they_name(
+def test_commands_are_assigned_with_their_weights(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start(CommandsReply(commands=(command(1), command(2, version=3))))
@@ -126,12 +126,12 @@ def test_commands_come_with_the_weights_that_they_name(
     assert [request.version for request in replay.requests(verbs.WEIGHTS)] == [3]
 
 
-def test_weights_that_were_announced_are_not_asked_for(
+def test_published_weights_are_not_requested(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start()
     courier.take(1, 0, wait_s=0.0)
-    wait_for(lambda: replay.requests(verbs.COMMANDS), "a question", DEADLINE_S)
+    wait_for(lambda: replay.requests(verbs.COMMANDS), "a request", DEADLINE_S)
     replay.publish(key_expressions.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
     replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
     (assignment,) = take(courier, 1)
@@ -139,7 +139,7 @@ def test_weights_that_were_announced_are_not_asked_for(
     assert replay.requests(verbs.WEIGHTS) == []
 
 
-def test_service_that_was_started_again_is_joined_again(
+def test_actor_joins_a_restarted_service_again(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     unknown = Problem(code="join_first", message="who is that?")
@@ -148,29 +148,33 @@ def test_service_that_was_started_again_is_joined_again(
     assert replay.requests(verbs.JOIN) == [JOIN]
 
 
-def test_command_whose_weights_are_gone_is_dropped(
+def test_command_with_deleted_weights_is_dropped(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     gone = Problem(code="unknown_version", message="weights version 3 is not kept")
     replay.answers(verbs.WEIGHTS, lambda _: gone)
     courier = start(CommandsReply(commands=(command(1, version=3), command(2))))
     assert [assignment.command.id for assignment in take(courier, 1)] == [2]
-    # It is no longer among those that the actor says it holds.
+    # The next request no longer lists it as running.
     courier.take(1, 0, wait_s=0.0)
-    wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
+    wait_for(
+        lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next request", DEADLINE_S
+    )
 
 
-def test_command_whose_outcome_is_acknowledged_is_no_longer_held(
+def test_acknowledged_command_is_no_longer_running(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start(CommandsReply(commands=(command(1), command(2))))
     take(courier, 2)
     courier.take(1, 1, wait_s=0.0)
     courier.note_acknowledged(1)
-    wait_for(lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next", DEADLINE_S)
+    wait_for(
+        lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next request", DEADLINE_S
+    )
 
 
-def test_refusals_reach_the_loop_that_steps_environments(
+def test_refusal_is_raised_in_the_acting_loop(
     replay: Scripted, start: Callable[..., Courier]
 ) -> None:
     courier = start(Problem(code="quarantined", message="it lied"))
@@ -180,14 +184,14 @@ def test_refusals_reach_the_loop_that_steps_environments(
     assert courier.error.code == "quarantined"
 
 
-def test_what_the_outbox_raises_ends_it(start: Callable[..., Courier]) -> None:
+def test_error_of_the_outbox_ends_the_courier(start: Callable[..., Courier]) -> None:
     courier, error = start(), Refused("quarantined", "it lied")
     courier.fail(error)
     courier.join(DEADLINE_S)
     assert courier.error is error
 
 
-def test_end_of_the_run_ends_it(start: Callable[..., Courier]) -> None:
+def test_end_of_the_run_ends_the_courier(start: Callable[..., Courier]) -> None:
     courier = start(CommandsReply(ended=True))
     courier.take(1, 0, wait_s=DEADLINE_S)
     courier.join(DEADLINE_S)

@@ -1,4 +1,4 @@
-"""Deliveries: several at once, large ones alone, and what ends them."""
+"""The outbox: concurrent deliveries, large ones alone, and errors."""
 
 import logging
 import queue
@@ -44,7 +44,7 @@ def episode(command_id: int, n_bytes: int = 100) -> Episode:
 
 
 class ReplayService:
-    """Acknowledges when it is told to."""
+    """Acknowledges on demand."""
 
     def __init__(self) -> None:
         self.came: queue.Queue[int] = queue.Queue()
@@ -80,7 +80,9 @@ def emptied(outbox: Outbox) -> Callable[[], bool]:
     return lambda: len(outbox) == 0
 
 
-def test_small_ones_go_together_and_all_arrive_once(replay: ReplayService, outbox: Outbox) -> None:
+def test_small_episodes_are_delivered_concurrently_and_exactly_once(
+    replay: ReplayService, outbox: Outbox
+) -> None:
     outbox.put(episode(i) for i in range(20))
     at_once = replay.next(outboxes._THREADS)
     assert at_once == set(range(outboxes._THREADS))
@@ -92,7 +94,7 @@ def test_small_ones_go_together_and_all_arrive_once(replay: ReplayService, outbo
     assert replay.came.empty()
 
 
-def test_large_ones_go_one_after_another(replay: ReplayService, outbox: Outbox) -> None:
+def test_large_episodes_are_delivered_one_by_one(replay: ReplayService, outbox: Outbox) -> None:
     large = outboxes._BYTES_IN_TRANSIT + 1
     outbox.put([episode(0, large), episode(1, large), episode(2)])
     for expected in range(3):
@@ -102,7 +104,9 @@ def test_large_ones_go_one_after_another(replay: ReplayService, outbox: Outbox) 
     wait_for(emptied(outbox), "the last acknowledgement")
 
 
-def test_small_one_goes_beside_one_that_leaves_room(replay: ReplayService, outbox: Outbox) -> None:
+def test_small_episode_is_delivered_beside_one_that_leaves_room(
+    replay: ReplayService, outbox: Outbox
+) -> None:
     outbox.put([episode(0, outboxes._BYTES_IN_TRANSIT - 100), episode(1), episode(2)])
     assert replay.next(2) == {0, 1}
     assert replay.came.empty()
@@ -110,25 +114,25 @@ def test_small_one_goes_beside_one_that_leaves_room(replay: ReplayService, outbo
     assert replay.next(1) == {2}
 
 
-def test_what_a_delivery_raises_is_told(replay: ReplayService, outbox: Outbox) -> None:
+def test_error_of_a_delivery_is_reported(replay: ReplayService, outbox: Outbox) -> None:
     replay.problem = ValueError("no")
     outbox.put([episode(0)])
     replay.may_answer.release()
     assert replay.errors.get(timeout=DEADLINE_S) is replay.problem
-    # It was not acknowledged.
+    # There was no acknowledgement.
     assert len(outbox) == 1
 
 
-def test_closed_one_begins_nothing(replay: ReplayService, outbox: Outbox) -> None:
+def test_closed_outbox_begins_no_delivery(replay: ReplayService, outbox: Outbox) -> None:
     outbox.put([episode(0, outboxes._BYTES_IN_TRANSIT), episode(1)])
     assert replay.next(1) == {0}
     outbox.close()
     replay.may_answer.release()
-    wait_for(lambda: len(outbox) == 1, "the end of the first")
+    wait_for(lambda: len(outbox) == 1, "the end of the first delivery")
     assert replay.came.empty()
 
 
-# One delivery.
+# A single delivery.
 
 
 @pytest.fixture
@@ -148,9 +152,7 @@ def test_episode_is_delivered(scripted: Scripted, asker: Asker) -> None:
     assert (message.actor, message.command_id) == ("a", 7)
 
 
-def test_episode_is_delivered_again_to_a_service_that_was_started_again(
-    scripted: Scripted, asker: Asker
-) -> None:
+def test_episode_is_redelivered_to_a_restarted_service(scripted: Scripted, asker: Asker) -> None:
     known = False
 
     def join(_: JoinRequest) -> Message:
@@ -165,10 +167,10 @@ def test_episode_is_delivered_again_to_a_service_that_was_started_again(
     scripted.answers(verbs.JOIN, join)
     scripted.answers(verbs.EPISODE, accept)
     assert deliver(asker, JOIN, episode(7)) == 7
-    assert [name for name, _ in scripted.asked] == ["episode", "join", "episode"]
+    assert [name for name, _ in scripted.received] == ["episode", "join", "episode"]
 
 
-def test_service_that_knows_nobody_is_not_asked_for_ever(scripted: Scripted, asker: Asker) -> None:
+def test_delivery_gives_up_after_repeated_join_first(scripted: Scripted, asker: Asker) -> None:
     scripted.answers(verbs.JOIN, lambda _: JoinReply())
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="join_first", message="who is that?"))
     with pytest.raises(Refused, match="who is that"):
@@ -176,18 +178,18 @@ def test_service_that_knows_nobody_is_not_asked_for_ever(scripted: Scripted, ask
     assert len(scripted.requests(verbs.JOIN)) == 5
 
 
-def test_failure_is_told(scripted: Scripted, asker: Asker) -> None:
+def test_failure_is_delivered(scripted: Scripted, asker: Asker) -> None:
     scripted.answers(verbs.FAILURE, lambda _: Acknowledged())
-    told = Command(
+    command = Command(
         id=8, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=1,
         stream_key=bytes(16), weights_version=0, max_steps=1,
     )  # fmt: skip
-    assert deliver(asker, JOIN, Failure(told, EnvironmentFault("it broke"))) == 8
+    assert deliver(asker, JOIN, Failure(command, EnvironmentFault("it broke"))) == 8
     (message,) = scripted.requests(verbs.FAILURE)
     assert (message.actor, message.command_id, message.error) == ("a", 8, "it broke")
 
 
-def test_rejected_episode_is_let_go(
+def test_rejected_episode_is_discarded(
     scripted: Scripted, asker: Asker, caplog: pytest.LogCaptureFixture
 ) -> None:
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))

@@ -43,8 +43,8 @@ def settings(environment: str = "Scripted-v0", **values: Any) -> Config:
     return build(Config, small | values)
 
 
-def order(number: int, **values: Any) -> Command:
-    """A command of a run that acts with weights version 1; it stands for any."""
+def make_command(number: int, **values: Any) -> Command:
+    """A command for weights version 1."""
     usual: dict[str, Any] = {
         "id": number,
         "kind": "explore",
@@ -68,7 +68,7 @@ def algorithm2(
     behavior: ActingFunction | None,
     make: Make = make_environment,
 ) -> Episode:
-    """Algorithm 2 as the paper prints it: one environment, one episode, one action at a time."""
+    """Algorithm 2 as in the paper: one environment, one episode, one action at a time."""
     env = make(config)
     spec = specify(env, config)
     limit_steps(env, command.max_steps)
@@ -121,9 +121,9 @@ def algorithm2(
     )
 
 
-def carry_out(generator: EpisodeGenerator, orders: Sequence[Order]) -> list[Episode | Failure]:
-    """What an actor does: keep all environments busy; return the outcomes as they come."""
-    waiting = list(orders)[::-1]
+def run_commands(generator: EpisodeGenerator, commands: Sequence[Order]) -> list[Episode | Failure]:
+    """Run commands as an actor does, with all environments busy; return outcomes as they arrive."""
+    waiting = list(commands)[::-1]
     outcomes: list[Episode | Failure] = []
     while waiting or generator.running:
         while waiting and generator.free:
@@ -138,11 +138,11 @@ def digests(outcomes: Sequence[Episode | Failure]) -> dict[int, bytes]:
     return {e.command_id: episode_digest(e) for e in outcomes if isinstance(e, Episode)}
 
 
-# --- Equal to the paper's loop, whatever the company ----------------------------------------------
+# --- Equality with the paper's loop, independent of concurrency --------------------------------
 
 
 @cache
-def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[bytes]]:
+def mixed_commands(environment: str) -> tuple[Config, list[Order], list[bytes]]:
     """Commands of all kinds, for two weights versions, and their episodes' digests."""
     config = settings(
         environment,
@@ -159,39 +159,41 @@ def a_bit_of_everything(environment: str) -> tuple[Config, list[Order], list[byt
     buffer = ReplayBuffer(config.buffer, [Entry(10.0, 0, 4), Entry(30.0, 1, 20)])
     sample = CommandSampler(config, spec)
     evaluation = sample.evaluate(2, buffer)
-    orders: list[Order] = []
-    orders += [(command, None) for command in sample.warm_up()]
-    orders += [(command, one) for command in sample.explore(1, buffer)]
-    orders += [(command, other) for command in sample.explore(2, buffer) + evaluation]
-    orders += [
+    commands: list[Order] = []
+    commands += [(command, None) for command in sample.warm_up()]
+    commands += [(command, one) for command in sample.explore(1, buffer)]
+    commands += [(command, other) for command in sample.explore(2, buffer) + evaluation]
+    commands += [
         (msgspec.structs.replace(command, id=command.id + 100, temperature=0.0), other)
         for command in evaluation
     ]
-    return config, orders, [episode_digest(algorithm2(config, *each)) for each in orders]
+    return config, commands, [episode_digest(algorithm2(config, *each)) for each in commands]
 
 
 @pytest.mark.parametrize("n_environments", [1, 3, 16, 20])
 @pytest.mark.parametrize("environment", ["CartPole-v1", "Figure2-v0", "LunarLander-v3"])
-def test_episodes_are_those_of_algorithm_2_whatever_the_company(
+def test_episodes_equal_algorithm_2_for_any_number_of_environments(
     environment: str, n_environments: int
 ) -> None:
-    config, orders, expected = a_bit_of_everything(environment)
+    config, commands, expected = mixed_commands(environment)
     generator = EpisodeGenerator(config, n_environments)
-    # Taking every fifth mixes long and short ones, versions and kinds.
-    mixed = [orders[5 * i % len(orders)] for i in range(len(orders))]
-    outcomes = carry_out(generator, mixed)
+    # Every fifth command mixes long and short episodes, versions and kinds.
+    mixed = [commands[5 * i % len(commands)] for i in range(len(commands))]
+    outcomes = run_commands(generator, mixed)
     assert digests(outcomes) == {
-        command.id: digest for (command, _), digest in zip(orders, expected, strict=True)
+        command.id: digest for (command, _), digest in zip(commands, expected, strict=True)
     }
 
 
-def test_an_episode_is_the_same_again_after_others() -> None:
-    config, orders, _ = a_bit_of_everything("LunarLander-v3")
+def test_episode_repeats_after_other_episodes() -> None:
+    config, commands, _ = mixed_commands("LunarLander-v3")
     generator = EpisodeGenerator(config, n_environments=2)
-    assert digests(carry_out(generator, orders)) == digests(carry_out(generator, orders[::-1]))
+    assert digests(run_commands(generator, commands)) == digests(
+        run_commands(generator, commands[::-1])
+    )
 
 
-# --- Environments that follow a script, or fail to ------------------------------------------------
+# --- Scripted and failing environments -----------------------------------------------------------
 
 
 def four_steps(seed: int) -> list[float]:
@@ -200,7 +202,7 @@ def four_steps(seed: int) -> list[float]:
 
 @dataclass
 class World:
-    """What scripted environments do, and what was done to them.
+    """The script of scripted environments, and a record of the calls they received.
 
     Attributes:
         script: the rewards of an episode, by seed.
@@ -223,7 +225,7 @@ class World:
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Observes (seed, steps taken, last action); refuses to be stepped beyond an episode's end."""
+    """Observes (seed, steps taken, last action); raises if it is stepped after an episode's end."""
 
     def __init__(self, world: World) -> None:
         self.metadata = {"render_modes": []}
@@ -274,7 +276,7 @@ class Scripted(gym.Env[Any, Any]):
 
 
 class Spy:
-    """Gives the same logits for whatever it is asked, and remembers what it was asked."""
+    """Returns the same logits for every input, and records its inputs."""
 
     def __init__(self, generator: EpisodeGenerator, logits: list[float]) -> None:
         self.shape = generator.spec.observation_space.shape
@@ -283,10 +285,10 @@ class Spy:
         self.rows: list[int] = []
 
     def call(self, n: int) -> Call:
-        return _SpiedOn(self, n)
+        return _SpyCall(self, n)
 
 
-class _SpiedOn:
+class _SpyCall:
     def __init__(self, spy: Spy, n: int) -> None:
         self.seen: Seen = (np.zeros((n, *spy.shape), np.float32),)
         self.state = self.next_state = np.zeros((n, 0), np.float32)
@@ -300,9 +302,9 @@ class _SpiedOn:
 
 
 def act(world: World, commands: list[Command], n_environments: int = 1) -> list[Episode | Failure]:
-    """Carry out commands with random actions."""
+    """Run commands with random actions."""
     generator = EpisodeGenerator(settings(), n_environments, world.make)
-    return carry_out(generator, [(command, None) for command in commands])
+    return run_commands(generator, [(command, None) for command in commands])
 
 
 @pytest.mark.parametrize(
@@ -312,21 +314,19 @@ def act(world: World, commands: list[Command], n_environments: int = 1) -> list[
         (2.5, [[2.5, 2], [1.5, 1], [2.5, 0], [-1.5, -1]]),
     ],
 )
-def test_the_graph_is_given_what_is_left_of_the_command(
-    cap: float | None, seen: list[list[float]]
-) -> None:
+def test_graph_input_is_the_remaining_command(cap: float | None, seen: list[list[float]]) -> None:
     config = settings()
     generator = EpisodeGenerator(config, 1, World().make)
     spy = Spy(generator, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(1, cap=cap, desired_horizon=2)], spy)
+    generate_episodes(generator, [make_command(1, cap=cap, desired_horizon=2)], spy)
     assert spy.commands == seen
 
 
 @pytest.mark.parametrize("n_environments", [1, 7, 40])
-def test_a_call_has_a_row_for_each_running_episode(n_environments: int) -> None:
+def test_call_has_one_row_per_running_episode(n_environments: int) -> None:
     generator = EpisodeGenerator(settings(), n_environments, World().make)
     spy = Spy(generator, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(i) for i in range(n_environments)], spy)
+    generate_episodes(generator, [make_command(i) for i in range(n_environments)], spy)
     assert spy.rows == [n_environments] * 4
 
 
@@ -334,21 +334,21 @@ def test_a_call_has_a_row_for_each_running_episode(n_environments: int) -> None:
     ("logits", "probabilities"),
     [(None, [1 / 3, 1 / 3, 1 / 3]), ([5 + math.log(p) for p in (0.5, 0.3, 0.2)], [0.5, 0.3, 0.2])],
 )
-def test_actions_have_the_networks_probabilities_and_are_uniform_in_the_warm_up(
+def test_actions_follow_the_networks_distribution_and_are_uniform_in_the_warm_up(
     logits: list[float] | None, probabilities: list[float]
 ) -> None:
     n, config = 4000, settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * n).make)
     behavior = None if logits is None else Spy(generator, logits)
-    (episode,) = generate_episodes(generator, [order(1)], behavior)
+    (episode,) = generate_episodes(generator, [make_command(1)], behavior)
     expected = n * np.array(probabilities)
     counts = np.bincount(episode.actions, minlength=3)
-    # Chi-square with 2 degrees of freedom is above 13.8 once in a thousand.
+    # Chi-square with 2 degrees of freedom exceeds 13.8 once in a thousand samples.
     assert ((counts - expected) ** 2 / expected).sum() < 13.8
 
 
 class Edges:
-    """A stream that has the least and the greatest number, and one between."""
+    """A stream of the smallest number, the largest, and one between them."""
 
     def __init__(self, key: bytes) -> None:
         pass
@@ -366,45 +366,47 @@ class Edges:
         ([-math.inf, 0.0, -math.inf], [1, 1, 1]),
     ],
 )
-def test_an_action_of_probability_zero_is_never_taken(
+def test_action_of_probability_zero_is_never_taken(
     logits: list[float], actions: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commands, "Stream", Edges)
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 3).make)
-    (episode,) = generate_episodes(generator, [order(1)], Spy(generator, logits))
+    (episode,) = generate_episodes(generator, [make_command(1)], Spy(generator, logits))
     assert episode.actions.tolist() == actions
 
 
-def test_at_temperature_0_actions_are_the_mode() -> None:
+def test_temperature_0_selects_the_mode() -> None:
     config = settings()
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.0] * 100).make)
     spy = Spy(generator, [0.1, 0.3, 0.2])
-    mode, sampled = generate_episodes(generator, [order(1, temperature=0.0), order(2)], spy)
+    mode, sampled = generate_episodes(
+        generator, [make_command(1, temperature=0.0), make_command(2)], spy
+    )
     assert set(mode.actions.tolist()) == {1}
     assert set(sampled.actions.tolist()) == {0, 1, 2}
 
 
-def test_temperatures_sharpen_and_flatten_each_episodes_own_actions() -> None:
+def test_each_episode_has_its_own_temperature() -> None:
     n, logits = 3000, [0.0, 1.0, -0.5]
     config = settings(max_episode_steps=n)
     generator = EpisodeGenerator(config, 2, World(script=lambda _: [0.0] * n).make)
     spy = Spy(generator, logits)
     temperatures = (0.25, 1.0, 4.0)
-    orders = [order(i, temperature=t, max_steps=n) for i, t in enumerate(temperatures)]
+    commands = [make_command(i, temperature=t, max_steps=n) for i, t in enumerate(temperatures)]
     for temperature, episode in zip(
-        temperatures, generate_episodes(generator, orders, spy), strict=True
+        temperatures, generate_episodes(generator, commands, spy), strict=True
     ):
         weights = np.exp(np.array(logits) / temperature)
         expected = weights / weights.sum()
         found = np.bincount(episode.actions, minlength=3) / n
-        # Four standard deviations of a frequency, and what the rest of the text rounds away.
+        # Four standard deviations of a frequency, plus the rounding of the expected values.
         assert np.abs(found - expected).max() < 4 * 0.5 / np.sqrt(n)
 
 
 @pytest.mark.parametrize("ends", [(True, False), (False, True), (True, True)])
-def test_an_episode_is_whole_and_says_how_it_ended(ends: tuple[bool, bool]) -> None:
-    (episode,) = act(World(ends=ends), [order(7)])
+def test_episode_has_all_steps_and_its_end_flags(ends: tuple[bool, bool]) -> None:
+    (episode,) = act(World(ends=ends), [make_command(7)])
     assert isinstance(episode, Episode)
     assert (episode.command_id, episode.length) == (7, 4)
     assert (episode.terminated, episode.truncated) == ends
@@ -412,8 +414,8 @@ def test_an_episode_is_whole_and_says_how_it_ended(ends: tuple[bool, bool]) -> N
     assert episode.episode_return == 3.5
 
 
-def test_observations_are_those_that_the_actions_were_chosen_in() -> None:
-    for episode in act(World(), [order(i) for i in range(1, 6)], n_environments=2):
+def test_observations_are_those_before_each_action() -> None:
+    for episode in act(World(), [make_command(i) for i in range(1, 6)], n_environments=2):
         assert isinstance(episode, Episode)
         before = [0, *episode.actions.tolist()[:-1]]
         assert episode.observations.tolist() == [
@@ -421,16 +423,16 @@ def test_observations_are_those_that_the_actions_were_chosen_in() -> None:
         ]
 
 
-def test_an_environment_is_reset_once_for_every_episode_with_the_commands_seed() -> None:
+def test_environment_is_reset_once_per_episode_with_the_commands_seed() -> None:
     world = World()
-    act(world, [order(i, environment_seed=i + 50) for i in range(6)], n_environments=2)
+    act(world, [make_command(i, environment_seed=i + 50) for i in range(6)], n_environments=2)
     first, second = (instance.seeds for instance in world.instances)
     assert (first, second) == ([50, 52, 54], [51, 53, 55])
 
 
-def test_a_command_truncates_its_episode_and_no_other() -> None:
+def test_max_steps_truncates_only_the_commands_own_episode() -> None:
     steps = {1: 2, 2: 4, 3: 3, 4: 5000}
-    episodes = act(World(), [order(i, max_steps=n) for i, n in steps.items()])
+    episodes = act(World(), [make_command(i, max_steps=n) for i, n in steps.items()])
     ends = {
         e.command_id: (e.length, e.terminated, e.truncated)
         for e in episodes
@@ -444,29 +446,33 @@ def test_a_command_truncates_its_episode_and_no_other() -> None:
     }
 
 
-def test_rewards_are_rounded_to_float32_before_they_are_counted() -> None:
+def test_rewards_are_rounded_to_float32_before_they_are_subtracted() -> None:
     config = settings(return_scale=1, horizon_scale=1)
     generator = EpisodeGenerator(config, 1, World(script=lambda _: [0.1, 0.0]).make)
     spy = Spy(generator, [0.0, 0.0, 0.0])
-    generate_episodes(generator, [order(1, desired_return=0.1)], spy)
+    generate_episodes(generator, [make_command(1, desired_return=0.1)], spy)
     assert spy.commands[1][0] == np.float32(0.1 - float(np.float32(0.1)))
 
 
-def long_ones(seed: int) -> list[float]:
+def long_script(seed: int) -> list[float]:
     return [float((seed * t) % 7 - 3) for t in range(1100 * seed)]
 
 
 @pytest.mark.parametrize("n_environments", [1, 2, 4])
-def test_episodes_longer_than_the_first_storage_are_whole(n_environments: int) -> None:
-    # 1024 steps are provided for at first; these have 1100, 2200 and 3300.
-    config, world = settings(), World(script=long_ones)
+def test_episodes_longer_than_the_initial_storage_are_complete(n_environments: int) -> None:
+    # The initial storage has 1024 steps; these episodes have 1100, 2200 and 3300.
+    config, world = settings(), World(script=long_script)
     generator = EpisodeGenerator(config, n_environments, world.make)
     behavior = behavior_of(config, generator.spec)
-    orders: list[Order] = [(order(1), behavior), (order(3), None), (order(2), behavior)]
-    outcomes = carry_out(generator, orders)
+    commands: list[Order] = [
+        (make_command(1), behavior),
+        (make_command(3), None),
+        (make_command(2), behavior),
+    ]
+    outcomes = run_commands(generator, commands)
     assert digests(outcomes) == {
-        command.id: episode_digest(algorithm2(config, command, behavior, World(long_ones).make))
-        for command, behavior in orders
+        command.id: episode_digest(algorithm2(config, command, behavior, World(long_script).make))
+        for command, behavior in commands
     }
 
 
@@ -488,14 +494,12 @@ FAULTS = {
 
 @pytest.mark.parametrize("random", [True, False])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_costs_one_episode_and_its_environment_and_nothing_else(
-    fault: str, random: bool
-) -> None:
+def test_fault_costs_one_episode_and_its_environment_only(fault: str, random: bool) -> None:
     config, world = settings(), World(faults={4: fault})
     generator = EpisodeGenerator(config, 3, world.make)
     behavior = None if random else behavior_of(config, generator.spec)
-    commands = [order(i) for i in range(9)]
-    outcomes = carry_out(generator, [(command, behavior) for command in commands])
+    commands = [make_command(i) for i in range(9)]
+    outcomes = run_commands(generator, [(command, behavior) for command in commands])
 
     (failure,) = (outcome for outcome in outcomes if isinstance(outcome, Failure))
     assert failure.command == commands[4]
@@ -513,16 +517,16 @@ def test_a_fault_costs_one_episode_and_its_environment_and_nothing_else(
     assert len(world.instances) == 3 + 1
 
 
-def test_faults_one_after_the_other_leave_the_generator_usable() -> None:
+def test_generator_survives_consecutive_faults() -> None:
     world = World(faults=dict(zip(range(1, 10), FAULTS, strict=True)))
-    outcomes = act(world, [order(i) for i in range(11)], n_environments=2)
+    outcomes = act(world, [make_command(i) for i in range(11)], n_environments=2)
     assert sum(isinstance(outcome, Failure) for outcome in outcomes) == 9
     assert set(digests(outcomes)) == {0, 10}
 
 
-def test_a_rebuilt_environment_is_given_the_next_commands_limit() -> None:
+def test_rebuilt_environment_gets_the_next_commands_limit() -> None:
     world = World(faults={1: "raises in reset"})
-    _, episode = act(world, [order(1, max_steps=2), order(2, max_steps=2)])
+    _, episode = act(world, [make_command(1, max_steps=2), make_command(2, max_steps=2)])
     assert isinstance(episode, Episode)
     assert (episode.length, episode.truncated) == (2, True)
 
@@ -530,26 +534,26 @@ def test_a_rebuilt_environment_is_given_the_next_commands_limit() -> None:
 def test_free_and_running_count_environments() -> None:
     generator = EpisodeGenerator(settings(), 2, World(faults={3: "raises in reset"}).make)
     assert (generator.free, generator.running) == (2, [])
-    assert isinstance(generator.start(order(3), None), Failure)
+    assert isinstance(generator.start(make_command(3), None), Failure)
     assert (generator.free, generator.running) == (2, [])
-    assert generator.start(order(1), None) is None
-    assert (generator.free, generator.running) == (1, [order(1)])
+    assert generator.start(make_command(1), None) is None
+    assert (generator.free, generator.running) == (1, [make_command(1)])
     for _ in range(3):
         assert generator.step() == []
     assert len(generator.step()) == 1
     assert (generator.free, generator.running) == (2, [])
 
 
-def test_episodes_are_returned_by_command_id() -> None:
+def test_episodes_are_returned_in_order_of_command_id() -> None:
     lengths = {1: 9, 2: 3, 3: 6}
     world = World(script=lambda seed: [0.0] * lengths[seed])
     generator = EpisodeGenerator(settings(), 2, world.make)
-    episodes = generate_episodes(generator, [order(i) for i in (3, 1, 2)], None)
+    episodes = generate_episodes(generator, [make_command(i) for i in (3, 1, 2)], None)
     assert [(e.command_id, e.length) for e in episodes] == list(lengths.items())
 
 
-def fails(times: int) -> Callable[[int], list[float]]:
-    """A script that cannot be had for seed 2 at first."""
+def fails_at_first(times: int) -> Callable[[int], list[float]]:
+    """A script that fails for seed 2 the first ``times`` times."""
     failures = iter([True] * times)
 
     def script(seed: int) -> list[float]:
@@ -560,23 +564,23 @@ def fails(times: int) -> Callable[[int], list[float]]:
     return script
 
 
-def test_generating_episodes_tries_again_after_a_fault_which_changes_nothing() -> None:
-    commands = [order(i) for i in range(5)]
+def test_generate_retries_after_a_fault_with_the_same_result() -> None:
+    commands = [make_command(i) for i in range(5)]
     smooth, rough = (
         generate_episodes(EpisodeGenerator(settings(), 2, world.make), commands, None)
-        for world in (World(), World(script=fails(times=2)))
+        for world in (World(), World(script=fails_at_first(times=2)))
     )
     assert digests(rough) == digests(smooth)
     assert [episode.command_id for episode in rough] == [0, 1, 2, 3, 4]
 
 
-def test_generating_episodes_raises_the_fault_of_a_command_that_keeps_failing() -> None:
-    generator = EpisodeGenerator(settings(), 2, World(script=fails(times=3)).make)
+def test_generate_raises_the_fault_of_a_command_that_keeps_failing() -> None:
+    generator = EpisodeGenerator(settings(), 2, World(script=fails_at_first(times=3)).make)
     with pytest.raises(EnvironmentFault, match=r"under command 2 .*reset\(\) .* not yet"):
-        generate_episodes(generator, [order(i) for i in range(5)], None)
+        generate_episodes(generator, [make_command(i) for i in range(5)], None)
 
 
-def test_closing_closes_all_environments() -> None:
+def test_close_closes_all_environments() -> None:
     world = World()
     EpisodeGenerator(settings(), 3, world.make).close()
     assert [instance.closed for instance in world.instances] == [True] * 3

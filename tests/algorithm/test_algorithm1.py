@@ -44,7 +44,7 @@ def obedience(**values: Any) -> Config:
 def history(
     config: Config, budget: Budget = BUDGET, n_environments: int = 4
 ) -> list[tuple[Any, ...]]:
-    """What a run looks like after every iteration."""
+    """The state of a run after every iteration."""
     rows: list[tuple[Any, ...]] = []
 
     def report(run: Run) -> None:
@@ -63,37 +63,37 @@ def history(
 
 
 @cache
-def usual_history() -> list[tuple[Any, ...]]:
+def default_history() -> list[tuple[Any, ...]]:
     return history(settings())
 
 
 @pytest.mark.parametrize("n_environments", [1, 3, 20])
-def test_a_run_does_not_depend_on_the_number_of_environments(n_environments: int) -> None:
-    assert history(settings(), n_environments=n_environments) == usual_history()
+def test_run_is_independent_of_the_number_of_environments(n_environments: int) -> None:
+    assert history(settings(), n_environments=n_environments) == default_history()
 
 
-def test_a_run_is_the_same_again() -> None:
-    assert history(settings()) == usual_history()
+def test_run_is_repeatable() -> None:
+    assert history(settings()) == default_history()
 
 
-def test_another_seed_is_another_run_from_the_start() -> None:
+def test_another_seed_changes_the_first_iteration() -> None:
     other = history(settings(seed=2))
-    assert other[0][2] != usual_history()[0][2]
-    assert other[0][3] != usual_history()[0][3]
+    assert other[0][2] != default_history()[0][2]
+    assert other[0][3] != default_history()[0][3]
 
 
-def test_a_larger_budget_goes_on_where_a_smaller_one_stopped() -> None:
+def test_larger_budget_extends_a_smaller_run() -> None:
     longer = history(settings(), Budget(max_env_steps=600))
-    assert len(longer) > len(usual_history())
-    assert longer[: len(usual_history())] == usual_history()
+    assert len(longer) > len(default_history())
+    assert longer[: len(default_history())] == default_history()
 
 
 @pytest.mark.parametrize("recent_size", [0, 8])
-def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
+def test_run_equals_the_papers_pseudo_code(recent_size: int) -> None:
     config = settings(recent_size=recent_size)
 
     def held(seen: list[Episode]) -> list[Episode]:
-        """The best of all episodes ever seen, of which equals rank by age, and the newest."""
+        """The best of all episodes seen so far, ties ranked by age, and the newest."""
         best = sorted(seen, key=lambda e: (e.episode_return, e.command_id))[
             -config.buffer.replay_size :
         ]
@@ -138,21 +138,21 @@ def test_the_run_is_the_papers_pseudo_code(recent_size: int) -> None:
     assert all(bool((ours[name] == theirs[name]).all()) for name in ours)
 
 
-def test_the_warm_up_of_obedience_is_pinned() -> None:
-    # No network, no platform's arithmetic: the streams, the commands, the sampling of actions.
+def test_warm_up_of_obedience_is_pinned() -> None:
+    # Without a network, the result does not depend on the platform's arithmetic.
     run = algorithm1(obedience(), Budget(max_env_steps=1))
     assert run.iteration == 0
     assert run.replay_sha256 == ("ef04b52c5d6cd5d99de144baef6aaf10bc138ea77acadd81cf6330adb7e44ed6")
 
 
-def test_a_run_ends_with_the_iteration_that_reaches_the_budget() -> None:
+def test_run_ends_with_the_iteration_that_reaches_the_budget() -> None:
     steps = [row[:2] for row in history(obedience(), Budget(max_env_steps=32 + 24 * 2))]
     assert steps == [(0, 32), (1, 56), (2, 80)]
     steps = [row[:2] for row in history(obedience(), Budget(max_env_steps=32 + 24 * 2 + 1))]
     assert steps == [(0, 32), (1, 56), (2, 80), (3, 104)]
 
 
-def test_a_budget_spent_in_the_warm_up_leaves_the_weights_untrained() -> None:
+def test_budget_spent_in_the_warm_up_leaves_weights_untrained() -> None:
     run = algorithm1(obedience(), Budget(max_env_steps=32))
     assert (run.iteration, run.state.version, run.env_steps) == (0, 0, 32)
 
@@ -168,15 +168,15 @@ def test_every_iteration_trains_one_version() -> None:
     assert versions == [(0, 0), (1, 1), (2, 2), (3, 3)]
 
 
-def test_evaluations_follow_the_multiples_that_env_steps_pass_and_are_not_counted() -> None:
-    # After iterations 0, 1, 2 ... there are 32, 56, 80, 104, 128, 152 steps.
+def test_evaluations_run_at_multiples_of_env_steps_and_do_not_count_as_steps() -> None:
+    # After iterations 0, 1, 2, ... the run has 32, 56, 80, 104, 128, 152 steps.
     run = algorithm1(obedience(eval_every=50, eval_episodes=5), Budget(max_env_steps=152))
     assert run.env_steps == 152
     assert sorted(run.evaluations) == [2, 4]
     assert {evaluation.episodes for evaluation in run.evaluations.values()} == {5}
 
 
-def test_evaluations_change_nothing_else() -> None:
+def test_evaluations_do_not_change_training() -> None:
     often = history(settings(eval_every=1, eval_episodes=5))
     never = history(settings(eval_every=10**9))
     assert [row[:4] for row in often] == [row[:4] for row in never]
@@ -184,24 +184,24 @@ def test_evaluations_change_nothing_else() -> None:
     assert all(row[4] is None for row in never)
 
 
-def test_a_run_stops_when_an_evaluation_reaches_the_stop_return() -> None:
-    means = {i: e.mean for i, _, _, _, e in usual_history() if e is not None}
+def test_run_stops_when_an_evaluation_reaches_the_stop_return() -> None:
+    means = {i: e.mean for i, _, _, _, e in default_history() if e is not None}
     first, mean = next(iter(means.items()))
-    assert len(usual_history()) > first + 1
+    assert len(default_history()) > first + 1
     stopped = history(settings(), Budget(max_env_steps=400, stop_return=mean))
-    assert stopped == usual_history()[: first + 1]
+    assert stopped == default_history()[: first + 1]
 
 
-def test_a_stop_return_that_is_never_reached_stops_nothing() -> None:
-    assert history(settings(), Budget(max_env_steps=400, stop_return=1e9)) == usual_history()
+def test_unreached_stop_return_has_no_effect() -> None:
+    assert history(settings(), Budget(max_env_steps=400, stop_return=1e9)) == default_history()
 
 
-def test_the_buffer_keeps_the_best_and_nothing_of_the_others() -> None:
+def test_buffer_discards_all_but_the_best_episodes() -> None:
     run = algorithm1(settings(), BUDGET)
     assert len(run.buffer) == 6
     assert run.experience.ids() == set(run.digests) == {entry.id for entry in run.buffer}
 
 
-def test_a_lead_is_refused_with_the_remedy() -> None:
+def test_lead_is_rejected_with_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"lead = 2: .*set lead=0"):
         algorithm1(settings(lead=2), BUDGET)

@@ -50,7 +50,7 @@ def section_3_2(
     command: npt.NDArray[np.float64],
     activation: str,
 ) -> npt.NDArray[np.float64]:
-    """One row at a time, one unit at a time, in float64."""
+    """One row and one unit at a time, in float64."""
     f: Callable[[float], float] = np.tanh if activation == "tanh" else lambda x: max(x, 0.0)
     tensors = {n: t.numpy().astype(np.float64) for n, t in behavior.state_dict().items()}
 
@@ -73,7 +73,7 @@ def section_3_2(
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("hidden", ARCHITECTURES, ids=str)
-def test_logits_are_those_of_section_3_2(hidden: tuple[int, ...], activation: str) -> None:
+def test_logits_equal_the_formulas_of_section_3_2(hidden: tuple[int, ...], activation: str) -> None:
     config = settings(hidden=hidden, activation=activation, initialisation="uniform")
     behavior = initialise(config, LANDER)
     observation, command = rows(5)
@@ -91,7 +91,7 @@ def test_logits_are_those_of_section_3_2(hidden: tuple[int, ...], activation: st
 
 
 @pytest.mark.parametrize("hidden", ARCHITECTURES, ids=str)
-def test_layers_have_the_widths_asked_for(hidden: tuple[int, ...]) -> None:
+def test_layers_have_the_configured_widths(hidden: tuple[int, ...]) -> None:
     behavior = initialise(settings(hidden=hidden), LANDER)
     shapes = {n: tuple(t.shape) for n, t in behavior.state_dict().items() if "weight" in n}
     assert shapes == {
@@ -102,7 +102,7 @@ def test_layers_have_the_widths_asked_for(hidden: tuple[int, ...]) -> None:
     }
 
 
-def test_a_closed_gate_hides_the_observation() -> None:
+def test_closed_gate_hides_the_observation() -> None:
     behavior = initialise(settings(hidden=(16,)), LANDER)
     with torch.no_grad():
         behavior.command.bias.fill_(-1000.0)
@@ -111,7 +111,7 @@ def test_a_closed_gate_hides_the_observation() -> None:
 
 
 @pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
-def test_initial_weights_are_a_function_of_the_runs_seed_alone(initialisation: str) -> None:
+def test_initial_weights_depend_on_the_runs_seed_only(initialisation: str) -> None:
     def weights(seed: int) -> list[torch.Tensor]:
         config = settings(seed=seed, initialisation=initialisation)
         return list(initialise(config, LANDER).state_dict().values())

@@ -71,12 +71,12 @@ def restored(state: TrainingState, config: Config = CONFIG) -> TrainingState:
     return decode_state(state.version, weights, optimizer, config, SPEC)
 
 
-def test_weights_come_back_bit_by_bit() -> None:
+def test_weights_round_trip_bit_identically() -> None:
     state = trained(1)
     assert arrays_digest(decode_weights(encode_weights(state.weights), SHAPES)) == digest(state)
 
 
-def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped() -> None:
+def test_training_resumes_from_a_checkpoint_with_identical_results() -> None:
     straight, resumed = trained(3), restored(trained(1))
     assert resumed.version == 1
     for _ in range(2):
@@ -87,7 +87,7 @@ def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped() -> None:
     assert encode_optimizer(resumed) == encode_optimizer(straight)
 
 
-def test_the_optimizers_state_matters_to_what_follows() -> None:
+def test_optimizer_state_affects_later_training() -> None:
     straight, forgetful = trained(2), untrained(CONFIG, SPEC)
     forgetful.behavior.load_state_dict(trained(1).behavior.state_dict())
     forgetful.version = 1
@@ -95,7 +95,7 @@ def test_the_optimizers_state_matters_to_what_follows() -> None:
     assert digest(forgetful) != digest(straight)
 
 
-def test_a_checkpoint_is_a_copy() -> None:
+def test_checkpoint_is_a_copy() -> None:
     state = trained(1)
     copy = restored(state)
     before = digest(copy)
@@ -150,7 +150,7 @@ CHANGES: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_weights_that_do_not_fit_are_refused(what: str) -> None:
+def test_mismatched_weights_are_rejected(what: str) -> None:
     change, complaint = CHANGES[what]
     tensors = {n: t.clone() for n, t in untrained(CONFIG, SPEC).behavior.state_dict().items()}
     change(tensors)
@@ -159,7 +159,7 @@ def test_weights_that_do_not_fit_are_refused(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_optimizer_state_that_does_not_fit_is_refused(what: str) -> None:
+def test_mismatched_optimizer_state_is_rejected(what: str) -> None:
     state = trained(1)
     tensors = safetensors.torch.load(encode_optimizer(state))
     moments = {n[8:]: t for n, t in tensors.items() if n.startswith("exp_avg.")}
@@ -171,14 +171,14 @@ def test_optimizer_state_that_does_not_fit_is_refused(what: str) -> None:
         decode_state(1, encode_weights(state.weights), optimizer, CONFIG, SPEC)
 
 
-def test_weights_of_another_architecture_are_refused() -> None:
+def test_weights_of_another_architecture_are_rejected() -> None:
     other = untrained(build(Config, {"environment": "CartPole-v1", "hidden": [8]}), SPEC)
     with pytest.raises(InvalidWeights, match="they belong to another architecture"):
         decode_weights(encode_weights(other.weights), SHAPES)
 
 
 @given(st.binary(max_size=200))
-def test_garbage_is_refused(garbage: bytes) -> None:
+def test_garbage_is_rejected(garbage: bytes) -> None:
     with pytest.raises(InvalidWeights, match=r"not safetensors|missing or surplus"):
         decode_weights(garbage, SHAPES)
 
@@ -187,15 +187,13 @@ GOOD = encode_weights(untrained(CONFIG, SPEC).weights)
 
 
 @given(st.integers(0, len(GOOD) - 1))
-def test_a_cut_is_refused(length: int) -> None:
+def test_truncated_checkpoint_is_rejected(length: int) -> None:
     with pytest.raises(InvalidWeights):
         decode_weights(GOOD[:length], SHAPES)
 
 
 @given(st.integers(0, len(GOOD) - 1), st.integers(0, 255))
-def test_a_changed_byte_is_refused_or_decoded_and_never_anything_else(
-    place: int, value: int
-) -> None:
+def test_changed_byte_is_rejected_or_decoded(place: int, value: int) -> None:
     damaged = bytearray(GOOD)
     damaged[place] = value
     try:

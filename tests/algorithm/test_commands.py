@@ -65,11 +65,11 @@ def test_exploratory_commands_follow_section_2_3_4(
     buffer = buffer_of(*zip(*episodes, strict=True))
     commands = CommandSampler(config, SPEC).explore(3, buffer)
 
-    # 1: a number of episodes from the end of the replay buffer are selected
+    # 1: select a number of episodes from the end of the replay buffer
     selected = episodes[-last_few:]
     # 2: the horizon is the mean of their lengths, rounded to the nearest integer
     steps, n = sum(length for _, length in selected), len(selected)
-    # 3: the returns are drawn from U[M, M + S]
+    # 3: draw the returns from U[M, M + S]
     m = np.mean([episode_return for episode_return, _ in selected])
     s = sqrt(np.mean([(episode_return - m) ** 2 for episode_return, _ in selected]))
     u = Stream(stream_key(seed, Purpose.COMMANDS, 3, -1)).uniforms(5)
@@ -79,7 +79,7 @@ def test_exploratory_commands_follow_section_2_3_4(
     assert {command.kind for command in commands} == {"explore"}
 
 
-def test_only_the_last_few_count_and_all_when_there_are_fewer() -> None:
+def test_only_the_last_few_episodes_count_or_all_if_there_are_fewer() -> None:
     best_two = sampler(last_few=2).evaluate(1, buffer_of([-100.0, 10.0, 20.0], [9, 1, 3]))
     assert set(desired_returns(best_two)) == {15.0}
     assert desired_horizons(best_two) == {2}
@@ -91,14 +91,12 @@ def test_only_the_last_few_count_and_all_when_there_are_fewer() -> None:
 @pytest.mark.parametrize(
     ("lengths", "horizon"), [([1, 1, 2], 1), ([1, 2], 2), ([2, 3], 3), ([2, 3, 3], 3), ([7], 7)]
 )
-def test_the_mean_length_is_rounded_to_the_nearest_integer(
-    lengths: list[int], horizon: int
-) -> None:
+def test_mean_length_is_rounded_to_the_nearest_integer(lengths: list[int], horizon: int) -> None:
     commands = sampler().explore(1, buffer_of([0.0] * len(lengths), lengths))
     assert desired_horizons(commands) == {horizon}
 
 
-def test_the_deviation_is_the_populations() -> None:
+def test_deviation_is_the_population_standard_deviation() -> None:
     commands = sampler(n_episodes_per_iter=10_000).explore(1, buffer_of([0.0, 4.0]))
     assert 2.0 <= min(desired_returns(commands)) < 2.01
     assert 3.99 < max(desired_returns(commands)) < 4.0
@@ -107,16 +105,16 @@ def test_the_deviation_is_the_populations() -> None:
 def test_exploratory_returns_are_uniform() -> None:
     commands = sampler(n_episodes_per_iter=10_000).explore(1, buffer_of([0.0, 2.0]))
     empirical = np.sort(desired_returns(commands)) - 1.0
-    # Kolmogorov's distance: 1.95 / sqrt(n) is exceeded by one sample in a thousand.
+    # The Kolmogorov-Smirnov distance exceeds 1.95 / sqrt(n) once in a thousand samples.
     assert np.abs(empirical - np.linspace(0, 1, 10_000)).max() < 1.95 / sqrt(10_000)
 
 
-def test_without_spread_every_exploratory_return_is_the_mean() -> None:
+def test_exploratory_returns_are_the_mean_without_spread() -> None:
     commands = sampler().explore(1, buffer_of([500.0] * 10))
     assert set(desired_returns(commands)) == {500.0}
 
 
-def test_evaluation_commands_take_the_lower_bound_and_the_same_horizon() -> None:
+def test_evaluation_commands_use_the_lower_bound_and_the_same_horizon() -> None:
     buffer = buffer_of([1.0, 2.0, 6.0], [10, 20, 31])
     sample = sampler(eval_episodes=7)
     evaluation = sample.evaluate(2, buffer)
@@ -125,7 +123,7 @@ def test_evaluation_commands_take_the_lower_bound_and_the_same_horizon() -> None
     assert {command.kind for command in evaluation} == {"evaluate"}
 
 
-def test_warm_up_commands_name_no_weights() -> None:
+def test_warm_up_commands_have_weights_version_0() -> None:
     commands = sampler(n_warm_up_episodes=3, lead=2).warm_up()
     assert [(c.id, c.kind, c.weights_version) for c in commands] == [
         (0, "warm_up", 0),
@@ -135,14 +133,14 @@ def test_warm_up_commands_name_no_weights() -> None:
 
 
 @pytest.mark.parametrize(("lead", "version"), [(0, 5), (1, 4), (3, 2), (7, 1)])
-def test_commands_name_the_weights_of_the_schedule(lead: int, version: int) -> None:
+def test_weights_version_follows_the_schedule(lead: int, version: int) -> None:
     sample, buffer = sampler(lead=lead), buffer_of([1.0])
     commands = sample.explore(5, buffer) + sample.evaluate(5, buffer)
     assert {command.weights_version for command in commands} == {version}
 
 
-def played(lengths: Sequence[Sequence[int]]) -> ReplayBuffer:
-    """A buffer of iterations of episodes of these lengths; all returns are different."""
+def buffer_with_lengths(lengths: Sequence[Sequence[int]]) -> ReplayBuffer:
+    """A buffer of iterations with episodes of these lengths; all returns differ."""
     entries = [
         Entry(float(10 * i + k), i * COMMANDS_PER_ITERATION + k, length)
         for i, iteration in enumerate(lengths)
@@ -155,26 +153,24 @@ def played(lengths: Sequence[Sequence[int]]) -> ReplayBuffer:
     ("newest", "expected"),
     [([200, 200], 5), ([100], 10), ([13] * 5, 77), ([1] * 5, 1000), ([20, 60], 25)],
 )
-def test_an_iteration_has_as_many_episodes_as_its_steps_take(
-    newest: list[int], expected: int
-) -> None:
+def test_number_of_episodes_follows_n_steps_per_iter(newest: list[int], expected: int) -> None:
     sample = sampler(n_episodes_per_iter=5, n_steps_per_iter=1000, last_few=2)
-    buffer = played([[7, 7, 7], newest])
+    buffer = buffer_with_lengths([[7, 7, 7], newest])
     commands = sample.explore(2, buffer)
     assert len(commands) == expected
     assert sample.evaluate(2, buffer)[0].index == expected
 
 
-def test_a_training_command_is_drawn_again_without_its_buffer() -> None:
+def test_training_command_is_reproduced_without_its_buffer() -> None:
     sample = sampler(n_episodes_per_iter=5, n_steps_per_iter=1000)
-    for command in sample.explore(3, played([[20] * 9])):
+    for command in sample.explore(3, buffer_with_lengths([[20] * 9])):
         again = sample.training_command(command.id)
         assert again == msgspec.structs.replace(
             command, desired_return=0.0, desired_horizon=again.desired_horizon
         )
 
 
-def test_a_final_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
+def test_final_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
     sample, buffer = sampler(lead=3, eval_episodes=50), buffer_of([1.0, 3.0])
     final, usual = sample.evaluate_final(9, buffer), sample.evaluate(9, buffer)
     assert {command.weights_version for command in final} == {9}
@@ -183,7 +179,7 @@ def test_a_final_evaluation_has_the_final_weights_and_fresh_seeds() -> None:
     assert {c.stream_key for c in final}.isdisjoint(c.stream_key for c in usual)
 
 
-def test_only_training_episodes_may_be_shortened() -> None:
+def test_training_limit_applies_to_training_episodes_only() -> None:
     sample, buffer = sampler(max_train_steps=100), buffer_of([1.0])
     training = sample.warm_up() + sample.explore(1, buffer)
     evaluation = sample.evaluate(1, buffer) + sample.evaluate_final(1, buffer)
@@ -191,11 +187,11 @@ def test_only_training_episodes_may_be_shortened() -> None:
     assert {command.max_steps for command in evaluation} == {500}
 
 
-def test_a_training_limit_above_the_environments_changes_nothing() -> None:
+def test_training_limit_above_the_environments_has_no_effect() -> None:
     assert {command.max_steps for command in sampler(max_train_steps=900).warm_up()} == {500}
 
 
-def test_only_evaluations_have_another_temperature_and_only_on_request() -> None:
+def test_evaluation_temperature_applies_to_evaluations_only() -> None:
     buffer = buffer_of([1.0])
     for request in (1.0, 0.5, 0.0):
         sample = sampler(eval_temperature=request)
@@ -205,7 +201,7 @@ def test_only_evaluations_have_another_temperature_and_only_on_request() -> None
         assert {command.temperature for command in evaluation} == {request}
 
 
-def test_seed_ranges_are_the_papers_and_do_not_meet() -> None:
+def test_seed_ranges_are_the_papers_and_disjoint() -> None:
     assert TRAINING_SEEDS == (1_000_000, 10_000_000)
     assert SEARCH_SEEDS == (500_000, 1_000_000)
     assert EVALUATION_SEEDS == (1, 500_000)
@@ -217,7 +213,7 @@ def test_seed_ranges_are_the_papers_and_do_not_meet() -> None:
     n=st.integers(1, 8),
     iterations=st.integers(1, 5),
 )
-def test_commands_of_a_run_are_distinct_and_keep_to_their_seeds(
+def test_commands_of_a_run_are_distinct_and_within_their_seed_range(
     seed: int, lead: int, n: int, iterations: int
 ) -> None:
     sample = sampler(
@@ -238,11 +234,11 @@ def test_commands_of_a_run_are_distinct_and_keep_to_their_seeds(
         assert command.stream_key == stream_key(
             seed, Purpose.EPISODE, command.iteration, command.index
         )
-        # What one process may send, another accepts.
+        # Another process accepts every command that one may send.
         assert msgspec.convert(msgspec.to_builtins(command), Command) == command
 
 
-def test_an_iterations_commands_depend_on_nothing_but_seed_iteration_and_buffer() -> None:
+def test_commands_depend_on_seed_iteration_and_buffer_only() -> None:
     buffer = buffer_of([1.0, 2.0])
     fresh, used = sampler(), sampler()
     used.warm_up()
@@ -251,13 +247,13 @@ def test_an_iterations_commands_depend_on_nothing_but_seed_iteration_and_buffer(
     assert sampler(seed=2).explore(2, buffer) != fresh.explore(2, buffer)
 
 
-def test_iteration_and_index_are_read_from_the_id() -> None:
+def test_id_encodes_iteration_and_index() -> None:
     command = sampler(n_episodes_per_iter=3).evaluate(12, buffer_of([1.0]))[0]
     assert (command.id, command.iteration, command.index) == (12_000_003, 12, 3)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
+def test_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
     config = {
         "held_actions": share, "hold_steps": 7, "command_strategy": "ranked", "max_train_steps": 60,
         "n_episodes_per_iter": 1000,
@@ -279,7 +275,7 @@ def test_a_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
 
 
 @pytest.mark.parametrize("hold", [1, 3])
-def test_warm_up_acts_at_random_from_the_first_step_to_the_last(hold: int) -> None:
+def test_warm_up_is_random_at_every_step(hold: int) -> None:
     for command in sampler(warm_up_hold=hold, max_train_steps=60).warm_up():
         numbers, random = command.decisions(60, ())
         assert random.all()
@@ -287,7 +283,7 @@ def test_warm_up_acts_at_random_from_the_first_step_to_the_last(hold: int) -> No
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])
-def test_held_action_is_decided_by_the_numbers_of_its_first_step(shape: tuple[int, ...]) -> None:
+def test_held_action_uses_the_numbers_of_its_first_step(shape: tuple[int, ...]) -> None:
     (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
     usual = Stream(command.stream_key).uniforms(9 * prod(shape)).reshape(9, *shape)
     numbers, random = command.decisions(9, shape)
@@ -300,7 +296,7 @@ def test_held_action_is_decided_by_the_numbers_of_its_first_step(shape: tuple[in
 
 
 @given(st.binary(min_size=16, max_size=16), st.floats(0.01, 1), st.integers(1, 4))
-def test_with_a_rate_actions_of_any_length_are_held(key: bytes, rate: float, hold: int) -> None:
+def test_random_rate_holds_actions_of_all_lengths(key: bytes, rate: float, hold: int) -> None:
     (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
     command = msgspec.structs.replace(command, stream_key=key, random_rate=rate, random_hold=hold)
     usual = Stream(key).uniforms(300)
@@ -321,7 +317,7 @@ def test_with_a_rate_actions_of_any_length_are_held(key: bytes, rate: float, hol
     assert fewer.random.tolist() == random[:70].tolist()
 
 
-def test_lengths_are_at_least_n_times_as_often_as_one_in_n() -> None:
+def test_multiples_of_the_hold_are_at_least_n_with_probability_1_in_n() -> None:
     (command,) = sampler(n_episodes_per_iter=1).explore(1, buffer_of([1.0]))
     command = msgspec.structs.replace(command, random_rate=0.2)
     numbers, random = command.decisions(200_000, ())
@@ -331,14 +327,14 @@ def test_lengths_are_at_least_n_times_as_often_as_one_in_n() -> None:
         assert (lengths >= n).mean() == pytest.approx(1 / n, rel=0.1)
 
 
-def test_a_rate_takes_the_place_of_one_held_action() -> None:
+def test_random_rate_replaces_the_single_held_action() -> None:
     config = {"held_actions": 1.0, "held_rate": 0.25, "hold_steps": 5}
     for command in sampler(**config).explore(1, buffer_of([1.0])):
         assert (command.random_rate, command.random_hold, command.random_steps) == (0.25, 5, 0)
 
 
 @pytest.mark.parametrize("max_return", [None, 12.0])
-def test_evaluation_is_capped_at_the_greatest_return(max_return: float | None) -> None:
+def test_evaluation_return_is_capped_at_max_return(max_return: float | None) -> None:
     spec = msgspec.structs.replace(SPEC, max_return=max_return)
     sample, buffer = CommandSampler(settings(), spec), buffer_of([1.0])
     assert {c.cap for c in sample.evaluate(1, buffer)} == {max_return}

@@ -38,30 +38,30 @@ TABLE_2 = {
 }
 
 
-def test_hyperparameters_keep_the_names_of_table_2() -> None:
+def test_hyperparameters_are_named_as_in_table_2() -> None:
     assert set(setting_names(Config)) >= TABLE_2
 
 
 @given(configs())
-def test_settings_are_grouped_inside_and_flat_outside(config: Config) -> None:
+def test_settings_are_grouped_in_python_and_flat_in_files(config: Config) -> None:
     values = flat(config)
     assert tuple(values) == setting_names(Config)
     assert build(Config, values) == config
     assert build(Config, msgspec.json.decode(msgspec.json.encode(values))) == config
 
 
-def test_no_two_settings_have_one_name() -> None:
+def test_setting_names_are_unique() -> None:
     kinds = (Config, Budget)
     names = [name for kind in kinds for name in setting_names(kind)]
     assert len(names) == len(set(names))
 
 
-def test_groups_have_no_names_outside() -> None:
+def test_group_names_are_not_accepted_from_outside() -> None:
     with pytest.raises(ConfigError, match="unknown setting 'training'"):
         build(Config, {"environment": "CartPole-v1", "training": {"batch_size": 512}})
 
 
-def test_settings_are_changed_by_name_in_whatever_group_they_are() -> None:
+def test_settings_of_any_group_are_changed_by_name() -> None:
     config = build(Config, {"environment": "CartPole-v1", "hidden": [8], "batch_size": 2})
     changed = change(config, batch_size=3, hidden=(4, 4), seed=5)
     assert flat(changed) == flat(config) | {"batch_size": 3, "hidden": [4, 4], "seed": 5}
@@ -77,33 +77,33 @@ def test_settings_are_changed_by_name_in_whatever_group_they_are() -> None:
         ({"segments": "all", "baseline": "value"}, r"^segments = 'all' with baseline = 'value'"),
     ],
 )
-def test_an_impossible_change_is_refused(values: dict[str, Any], complaint: str) -> None:
+def test_invalid_change_is_rejected(values: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         change(Config(environment="CartPole-v1"), **values)
 
 
-def test_rules_across_groups_hold_however_a_config_is_made() -> None:
+def test_rules_across_groups_are_checked_on_every_construction() -> None:
     with pytest.raises(ConfigError, match="last_few = 75: must be at most replay_size = 10"):
         Config(environment="CartPole-v1", buffer=BufferSettings(replay_size=10))
 
 
-def test_values_are_taken_as_given() -> None:
+def test_values_are_converted_to_the_types_of_the_fields() -> None:
     config = build(Config, {"environment": "CartPole-v1", "hidden": [8, 16], "learning_rate": 1})
     assert config.network.hidden == (8, 16)
     assert config.training.learning_rate == 1.0
 
 
-def test_the_environment_must_be_named() -> None:
+def test_environment_is_required() -> None:
     with pytest.raises(ConfigError, match="environment"):
         build(Config, {"seed": 1})
 
 
-def test_an_unknown_name_is_refused_with_the_nearest_known_one() -> None:
+def test_unknown_name_is_rejected_with_the_closest_match() -> None:
     with pytest.raises(ConfigError, match=r"'bach_size': did you mean 'batch_size'\?"):
         build(Config, {"environment": "CartPole-v1", "bach_size": 512})
 
 
-def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
+def test_unknown_name_without_a_close_match_is_rejected_with_all_names() -> None:
     with pytest.raises(ConfigError, match=r"'xyzzy': expected one of one, two"):
         refuse_unknown({"xyzzy": 1}, ("one", "two"))
 
@@ -142,17 +142,17 @@ def test_a_name_like_no_other_is_refused_with_all_that_there_are() -> None:
         ("segments", "some"),
     ],
 )
-def test_an_impossible_value_is_refused_by_name_and_value(name: str, value: object) -> None:
+def test_invalid_value_is_rejected_with_name_and_value(name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"^{name} = {re.escape(repr(value))}: "):
         build(Config, {"environment": "CartPole-v1", name: value})
 
 
-def test_last_few_above_replay_size_is_refused_with_both_values_and_the_remedy() -> None:
+def test_last_few_above_replay_size_is_rejected_with_both_values_and_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"last_few = 11.*replay_size = 10.*lower last_few"):
         build(Config, {"environment": "CartPole-v1", "last_few": 11, "replay_size": 10})
 
 
-def test_last_few_may_be_the_whole_buffer() -> None:
+def test_last_few_may_equal_replay_size() -> None:
     config = build(Config, {"environment": "CartPole-v1", "last_few": 10, "replay_size": 10})
     assert config.commands.last_few == config.buffer.replay_size
 
@@ -161,17 +161,17 @@ def test_last_few_may_be_the_whole_buffer() -> None:
     ("name", "value"),
     [("max_env_steps", 0), ("stop_return", math.nan), ("stop_return", math.inf)],
 )
-def test_an_impossible_budget_is_refused(name: str, value: float) -> None:
+def test_invalid_budget_is_rejected(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"^{name} = {value}: "):
         build(Budget, {name: value})
 
 
-def test_presets_of_the_three_environments_ship() -> None:
+def test_presets_of_the_three_environments_are_included() -> None:
     assert {"CartPole-v1", "LunarLander-v3", "LunarLanderSparse-v3"} <= set(preset_names())
 
 
 @pytest.mark.parametrize("name", [n for n in preset_names() if n != "any"])
-def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str) -> None:
+def test_preset_is_valid_and_named_after_its_environment(name: str) -> None:
     values = preset(name)
     budget = {key: values.pop(key) for key in Budget.__struct_fields__ if key in values}
     build(Budget, budget)
@@ -179,14 +179,14 @@ def test_a_preset_builds_and_is_for_the_environment_it_is_named_after(name: str)
     assert build(Config, values).environment == named
 
 
-def test_the_preset_for_any_environment_leaves_settings_open() -> None:
+def test_generic_preset_has_automatic_settings() -> None:
     values = preset("any")
     automatic = {name for name, value in values.items() if value == "auto"}
     assert automatic == AUTOMATIC.keys()
     build(Config, {n: v for n, v in values.items() if n not in AUTOMATIC} | {"environment": "X-v0"})
 
 
-def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
+def test_unknown_preset_is_rejected_with_the_available_ones() -> None:
     with pytest.raises(ConfigError, match=r"'Pong': expected one of CartPole-v1, LunarLander-v3"):
         preset("Pong")
 
@@ -207,31 +207,29 @@ def test_an_unknown_preset_is_refused_with_those_that_there_are() -> None:
         ("return_scale=inf", "return_scale", math.inf),
     ],
 )
-def test_an_assignment_is_a_name_and_a_toml_value_or_a_bare_word(
-    text: str, name: str, value: Any
-) -> None:
+def test_assignment_value_is_toml_or_a_bare_word(text: str, name: str, value: Any) -> None:
     assert parse_assignment(text) == (name, value)
 
 
 @pytest.mark.parametrize("text", ["batch_size", "=512", " =512", ""])
-def test_an_assignment_without_name_or_equals_sign_is_refused(text: str) -> None:
+def test_assignment_without_name_or_equals_sign_is_rejected(text: str) -> None:
     with pytest.raises(ConfigError, match="expected NAME=VALUE"):
         parse_assignment(text)
 
 
-def test_a_toml_file_is_read(tmp_path: Path) -> None:
+def test_toml_file_is_read(tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text('environment = "CartPole-v1"\nhidden = [8]\n')
     assert read_toml(file) == {"environment": "CartPole-v1", "hidden": [8]}
 
 
-def test_a_file_that_is_missing_is_refused_by_name(tmp_path: Path) -> None:
+def test_missing_file_is_rejected_by_name(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.toml.*name a readable TOML file"):
         read_toml(tmp_path / "absent.toml")
 
 
 @pytest.mark.parametrize("content", [b"batch_size 512", b"\xff\xfe"])
-def test_a_file_that_is_not_toml_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+def test_invalid_toml_file_is_rejected_by_name(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "broken.toml"
     file.write_bytes(content)
     with pytest.raises(ConfigError, match=r"broken\.toml"):

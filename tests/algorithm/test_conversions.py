@@ -1,4 +1,4 @@
-"""Between an environment's spaces and the algorithm's: nothing is lost, and faults are named."""
+"""Conversions between an environment's spaces and the algorithm's."""
 
 from collections.abc import Callable
 from typing import Any
@@ -50,24 +50,24 @@ def nested(leaves: st.SearchStrategy[Any]) -> st.SearchStrategy[AnySpace]:
     )
 
 
-# float64 is rounded to float32, so it does not come back.
+# float64 is rounded to float32, so it does not round-trip.
 numbers = boxes(np.float32, np.int16, np.int64)
 observed = nested(st.one_of(discretes, multi_discretes, numbers, images, bits))
 numbers_64 = boxes(np.float32, np.float64, np.int16, np.int64)
 done = nested(st.one_of(discretes, multi_discretes, numbers_64, bits))
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two elements are equal, with the types that an environment may rely on."""
+def elements_equal(one: Any, other: Any) -> bool:
+    """Whether two elements are equal, including the types that an environment may rely on."""
     if isinstance(one, dict):
-        return list(one) == list(other) and all(same(one[k], other[k]) for k in one)
+        return list(one) == list(other) and all(elements_equal(one[k], other[k]) for k in one)
     if isinstance(one, tuple):
-        return len(one) == len(other) and all(map(same, one, other))
+        return len(one) == len(other) and all(map(elements_equal, one, other))
     return np.asarray(one).dtype == np.asarray(other).dtype and np.array_equal(one, other)
 
 
 def stacked(samples: list[Any]) -> Any:
-    """Many elements as datasets have them: arrays where the leaves are."""
+    """Stack elements as datasets do: one array per leaf."""
     first = samples[0]
     if isinstance(first, dict):
         return {k: stacked([s[k] for s in samples]) for k in first}
@@ -77,34 +77,34 @@ def stacked(samples: list[Any]) -> Any:
 
 
 @given(observed, st.integers(0, 100))
-def test_observations_go_there_and_back(space: AnySpace, seed: int) -> None:
+def test_observations_round_trip(space: AnySpace, seed: int) -> None:
     space.seed(seed)
     samples = [space.sample() for _ in range(3)]
     conversion = observation_conversion(space)
     plain = conversion.convert(stacked(samples), (3,))
     assert conversion.plain.fault(plain, 3) is None
-    assert same(conversion.back(plain), stacked(samples))
+    assert elements_equal(conversion.back(plain), stacked(samples))
     for k, sample in enumerate(samples):
         one = conversion.one(sample)
         assert np.array_equal(one, plain[k])
-        assert same(conversion.back_one(one), sample)
+        assert elements_equal(conversion.back_one(one), sample)
 
 
 @given(done, st.integers(0, 100))
-def test_every_action_is_the_environments_and_comes_back(space: AnySpace, seed: int) -> None:
+def test_every_action_is_valid_and_round_trips(space: AnySpace, seed: int) -> None:
     conversion = action_conversion(space, ActionSettings())
     rng = np.random.default_rng(seed)
     plain = conversion.plain.uniform(rng.random((4, *conversion.plain.shape)))
     own = [conversion.back_one(action) for action in plain.tolist()]
     assert all(map(space.contains, own)), own
-    assert same(conversion.back(plain), stacked(own))
+    assert elements_equal(conversion.back(plain), stacked(own))
     again = conversion.convert(stacked(own), (4,))
     assert again.dtype == conversion.plain.dtype
-    # Bins of whole numbers may hold the same one twice.
-    assert same(conversion.back(again), stacked(own))
+    # Bins of whole numbers may contain the same number twice.
+    assert elements_equal(conversion.back(again), stacked(own))
 
 
-def test_kinds_of_observations() -> None:
+def test_observation_space_conversion() -> None:
     kinds = [leaf.space for leaf in leaves_of(observation_conversion(spaces.Dict(
         a=spaces.Box(-1, 1, (2, 3)),
         b=spaces.Box(-1, 1, ()),
@@ -134,11 +134,11 @@ def test_kinds_of_observations() -> None:
     ],
     ids=str,
 )
-def test_kinds_of_actions(space: AnySpace, plain: Any) -> None:
+def test_action_space_conversion(space: AnySpace, plain: Any) -> None:
     assert action_conversion(space, ActionSettings()).plain == plain
 
 
-def test_a_dimension_has_its_bounds_its_middle_and_as_many_values_as_are_wanted() -> None:
+def test_bins_include_bounds_and_centre() -> None:
     space = spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
     conversion = action_conversion(space, ActionSettings(action_bins=5))
     found = [conversion.back_one([k, k]).tolist() for k in range(5)]
@@ -147,7 +147,7 @@ def test_a_dimension_has_its_bounds_its_middle_and_as_many_values_as_are_wanted(
 
 
 @given(st.lists(st.floats(-9, 9), min_size=1, max_size=5))
-def test_an_action_of_a_dataset_becomes_the_nearest(values: list[float]) -> None:
+def test_dataset_action_is_mapped_to_the_nearest_bin(values: list[float]) -> None:
     conversion = action_conversion(spaces.Box(-2, 2, (1,), np.float64), ActionSettings())
     (known,) = conversion._values  # type: ignore[attr-defined]
     plain = conversion.convert(np.array(values)[:, None], (len(values),))
@@ -155,7 +155,7 @@ def test_an_action_of_a_dataset_becomes_the_nearest(values: list[float]) -> None
         assert abs(known[chosen] - value) == min(abs(k - value) for k in known)
 
 
-def test_bounds_that_are_not_declared_can_be_given() -> None:
+def test_undeclared_bounds_can_be_configured() -> None:
     space = spaces.Box(np.array([-np.inf, 0], np.float32), np.array([1, np.inf], np.float32))
     given_ = ActionSettings(action_low=-5, action_high=7, action_bins=3)
     conversion = action_conversion(space, given_)
@@ -168,38 +168,38 @@ DICT = spaces.Dict(
 )
 
 
-def good() -> Any:
+def valid_element() -> Any:
     return {
         "inventory": (1, np.zeros(2, np.float32), np.zeros(2, np.int8)),
         "map": np.zeros((4, 4), np.uint8),
     }
 
 
-def spoil(where: Callable[[Any], Any]) -> Any:
-    value = good()
+def corrupt(where: Callable[[Any], Any]) -> Any:
+    value = valid_element()
     return where(value)
 
 
 @pytest.mark.parametrize(
-    ("value", "says"),
+    ("value", "message"),
     [
-        (spoil(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
+        (corrupt(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
          r"observation\['map'\] an array of uint8, shape \(4, 5\), declared is Box"),
-        (spoil(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
+        (corrupt(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
          r"observation\['inventory'\]\[0\] 3 \(int.*\), declared is Discrete\(3\)"),
-        (spoil(lambda v: v | {"inventory": v["inventory"][:2]}),
+        (corrupt(lambda v: v | {"inventory": v["inventory"][:2]}),
          r"a dict of 'inventory', 'map', without observation\['inventory'\]\[2\]"),
-        (spoil(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
+        (corrupt(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
         (np.zeros(3, np.float32), r"an array of float32, shape \(3,\), without observation"),
         (None, r"None \(NoneType\), without observation\['inventory'\]\[0\]"),
     ],
 )  # fmt: skip
-def test_a_fault_names_the_leaf(value: Any, says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_invalid_observation_is_rejected_with_its_leaf(value: Any, message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         observation_conversion(DICT).one(value)
 
 
-def test_components_outside_are_faults() -> None:
+def test_action_component_out_of_range_is_rejected() -> None:
     conversion = observation_conversion(spaces.MultiDiscrete([2, 3]))
     with pytest.raises(InvalidData, match=r"observation \[1, 3\], declared is MultiDiscrete"):
         conversion.one(np.array([1, 3]))
@@ -208,7 +208,7 @@ def test_components_outside_are_faults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("space", "says"),
+    ("space", "message"),
     [
         (spaces.Text(4), "its observation is Text.*Box, Discrete.*vary.*TransformObservation"),
         (
@@ -228,15 +228,13 @@ def test_components_outside_are_faults() -> None:
     ],
     ids=str,
 )
-def test_observations_that_are_not_supported_are_refused_by_name(
-    space: AnySpace, says: str
-) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, message: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=message):
         observation_conversion(space)
 
 
 @pytest.mark.parametrize(
-    ("space", "says", "bins"),
+    ("space", "message", "bins"),
     [
         (spaces.Text(4), "its action is Text.*Discrete, MultiDiscrete.*TransformAction", None),
         (
@@ -254,14 +252,14 @@ def test_observations_that_are_not_supported_are_refused_by_name(
     ],
     ids=str,
 )
-def test_actions_that_are_not_supported_are_refused_by_name(
-    space: AnySpace, says: str, bins: int | None
+def test_unsupported_action_space_is_rejected_by_name(
+    space: AnySpace, message: str, bins: int | None
 ) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+    with pytest.raises(UnsupportedEnvironment, match=message):
         action_conversion(space, ActionSettings(action_bins=bins))
 
 
-def test_a_record_is_what_the_leaves_are() -> None:
+def test_record_has_the_converted_leaves() -> None:
     plain = observation_conversion(DICT).plain
     assert isinstance(plain, Record)
     assert [leaf.name for leaf in plain.leaves] == [

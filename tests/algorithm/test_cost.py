@@ -1,4 +1,4 @@
-"""An iteration that trains for minutes is announced."""
+"""The cost of a training iteration, and the warning when it takes minutes."""
 
 from typing import Any
 
@@ -21,13 +21,13 @@ def settings(**values: Any) -> Config:
     return build(Config, {"environment": "X-v0"} | values)
 
 
-def test_the_cost_of_a_vector_is_that_of_its_layers() -> None:
+def test_cost_of_a_vector_is_that_of_its_layers() -> None:
     config = settings(hidden=[10, 20], n_updates_per_iter=100, batch_size=50)
     found = training_s(config, spec(Vector(size=3)))
     assert found == pytest.approx(6 * 100 * 50 * (3 * 10 + 10 * 20) / 5e10)
 
 
-def test_the_cost_of_an_image_is_that_of_its_convolutions() -> None:
+def test_cost_of_an_image_is_that_of_its_convolutions() -> None:
     config = settings(
         convolutions=[8, 16], hidden=[10], n_updates_per_iter=10, batch_size=5, training_threads=2
     )
@@ -39,24 +39,24 @@ def test_the_cost_of_an_image_is_that_of_its_convolutions() -> None:
 
 
 @pytest.mark.parametrize(("baseline", "networks"), [("none", 0), ("value", 1), ("action_value", 2)])
-def test_every_network_adds_its_cost(baseline: str, networks: int) -> None:
+def test_cost_includes_every_network(baseline: str, networks: int) -> None:
     config = settings(hidden=[8], baseline=baseline, n_updates_per_iter=1, batch_size=1)
     found = training_s(config, spec(Vector(size=5))) * 5e10 / 6
     assert found == pytest.approx(5 * 8 + networks * (5 * 64 + 64 * 64))
 
 
-def test_a_memory_adds_its_cost() -> None:
+def test_cost_includes_the_memory() -> None:
     config = settings(hidden=[8], memory="gru", memory_size=16, n_updates_per_iter=1, batch_size=1)
     found = training_s(config, spec(Vector(size=5))) * 5e10 / 6
     assert found == pytest.approx(5 * 8 + 3 * 16 * (8 + 16))
 
 
-def test_large_pictures_are_announced_with_what_to_do() -> None:
+def test_large_images_are_warned_of_with_the_remedy() -> None:
     screen = spec(Image(channels=3, height=210, width=160))
-    said = slow_training_warning(settings(), screen)
-    assert "every iteration will train for about 12 minutes" in said
-    assert "100 updates of 768 examples of" in said
-    assert "ResizeObservation" in said
+    warning = slow_training_warning(settings(), screen)
+    assert "every iteration will train for about 12 minutes" in warning
+    assert "100 updates of 768 examples of" in warning
+    assert "ResizeObservation" in warning
     assert slow_training_warning(settings(n_updates_per_iter=5), screen) == ""
     assert slow_training_warning(settings(device="cuda"), screen) == ""
     assert slow_training_warning(settings(), spec(Vector(size=8))) == ""

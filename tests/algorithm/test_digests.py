@@ -29,13 +29,13 @@ def test_digests_are_pinned() -> None:
     )
 
 
-def test_arrays_count_with_name_type_shape_and_bytes() -> None:
+def test_array_digest_covers_name_type_shape_and_bytes() -> None:
     array = np.array([[1, 2, 3], [4, 5, 6]], np.int16)
     expected = hashlib.sha256(b"x|<i2|(2, 3)|" + bytes([1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0]))
     assert arrays_digest({"x": array}) == expected.digest()
 
 
-def test_the_order_of_names_and_the_layout_in_memory_do_not_count() -> None:
+def test_array_digest_ignores_order_of_names_and_memory_layout() -> None:
     a, b = np.arange(6, dtype=np.float32).reshape(2, 3), np.zeros(2)
     expected = arrays_digest({"a": a, "b": b})
     assert arrays_digest({"b": b, "a": a}) == expected
@@ -55,7 +55,7 @@ def test_the_order_of_names_and_the_layout_in_memory_do_not_count() -> None:
         {},
     ],
 )
-def test_other_arrays_have_another_digest(other: dict[str, Any]) -> None:
+def test_different_arrays_have_different_digests(other: dict[str, Any]) -> None:
     assert arrays_digest(other) != arrays_digest({"x": np.zeros(4, np.float32)})
 
 
@@ -72,11 +72,11 @@ def test_other_arrays_have_another_digest(other: dict[str, Any]) -> None:
         {"rewards": np.array([1.0, -0.5], np.float32)},
     ],
 )
-def test_another_episode_has_another_digest(change: dict[str, Any]) -> None:
+def test_different_episodes_have_different_digests(change: dict[str, Any]) -> None:
     assert episode_digest(episode(**change)) != episode_digest(episode())
 
 
-def test_a_buffers_digest_depends_on_its_episodes_order() -> None:
+def test_buffer_digest_depends_on_the_order_of_episodes() -> None:
     first, second = episode_digest(episode()), episode_digest(episode(command_id=6))
     assert replay_digest([first, second]) != replay_digest([second, first])
     assert replay_digest(iter([first, second])) == replay_digest([first, second])

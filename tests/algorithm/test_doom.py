@@ -1,4 +1,4 @@
-"""TakeCover and the other scenarios of ViZDoom: exact, well behaved, and gone with their owner."""
+"""TakeCover and the other ViZDoom scenarios."""
 
 import builtins
 import os
@@ -49,7 +49,7 @@ def doom() -> Iterator[Callable[..., Doom]]:
 
 
 def engines(owner: int) -> list[int]:
-    """Return the engines that a process started, or that lost it."""
+    """Return the engine processes of a process, including orphans."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -70,7 +70,7 @@ def wait_until(condition: Callable[[], bool], timeout: float = 20) -> None:
 
 
 def play(env: gym.Env[Any, Any], seed: int, steps: int = 80) -> tuple[list[bytes], float]:
-    """Act at random; return what was seen, and the return."""
+    """Act at random; return the observations and the return."""
     actions = np.random.default_rng(seed).integers(0, 2, steps)
     image, _ = env.reset(seed=seed)
     seen, total = [image.tobytes()], 0.0
@@ -83,7 +83,7 @@ def play(env: gym.Env[Any, Any], seed: int, steps: int = 80) -> tuple[list[bytes
     return seen, total
 
 
-def test_gymnasium_accepts_it(doom: Callable[..., Doom]) -> None:
+def test_gymnasium_checker_passes(doom: Callable[..., Doom]) -> None:
     env = doom(render_mode="rgb_array")
     check_env(env, skip_render_check=True)
     screen = env.render()
@@ -91,15 +91,15 @@ def test_gymnasium_accepts_it(doom: Callable[..., Doom]) -> None:
     assert screen.shape == (120, 160, 3)
 
 
-def test_take_cover_is_the_paper_s() -> None:
+def test_take_cover_is_the_papers() -> None:
     env = make_environment(Config(environment="TakeCover-v0"))
     spec = specify(env, Config(environment="TakeCover-v0"))
     assert spec.observation_space == Image(channels=1, height=32, width=32)
     assert spec.action_space == Categorical(n=2)
     assert (spec.max_episode_steps, spec.max_return) == (2100, 2100.0)
     seen, total = play(env, 7, 2200)
-    assert total == len(seen) - 1, "one for each step, the last included"
-    assert len(set(seen)) > 20, "the screen moves"
+    assert total == len(seen) - 1, "one reward for each step, including the last"
+    assert len(set(seen)) > 20, "frames must differ"
     env.close()
 
 
@@ -128,16 +128,16 @@ def test_episode_is_a_function_of_its_seed(doom: Callable[..., Doom]) -> None:
     assert play(other, 12) != first
 
 
-def test_size_colour_and_skipping(doom: Callable[..., Doom]) -> None:
+def test_size_colour_and_frame_skip(doom: Callable[..., Doom]) -> None:
     env = doom(height=30, width=40, colour=True, frame_skip=4)
     image, _ = env.reset(seed=1)
     assert image.shape == (30, 40, 3)
-    assert np.ptp(image.astype(int), axis=-1).max() > 10, "it has colours"
+    assert np.ptp(image.astype(int), axis=-1).max() > 10, "must not be grey"
     _, reward, *_ = env.step(np.int64(0))
     assert reward == 4.0
 
 
-def test_other_scenarios_and_files(doom: Callable[..., Doom], tmp_path: Path) -> None:
+def test_other_scenarios_and_scenario_files(doom: Callable[..., Doom], tmp_path: Path) -> None:
     assert doom(scenario="basic").action_space == gym.spaces.Discrete(3)
     assert doom(scenario="basic").metadata["render_fps"] == 35
     with pytest.raises(ValueError, match=r"scenario 'nowhere': neither a file nor one of .*basic"):
@@ -154,7 +154,7 @@ def test_close_ends_the_engine(doom: Callable[..., Doom]) -> None:
     wait_until(lambda: engine not in engines(os.getpid()))
 
 
-def test_nothing_is_written_where_one_works(
+def test_nothing_is_written_to_the_working_directory(
     doom: Callable[..., Doom], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -171,7 +171,7 @@ def commands(config: Config, n: int) -> list[Command]:
     return CommandSampler(config, spec).warm_up()[:n]
 
 
-def test_death_of_an_engine_costs_an_episode() -> None:
+def test_engine_crash_costs_one_episode() -> None:
     config = take_cover()
     undisturbed = EpisodeGenerator(config, 1)
     expected = generate_episodes(undisturbed, commands(config, 1), None)
@@ -190,7 +190,7 @@ def test_death_of_an_engine_costs_an_episode() -> None:
     assert [episode_digest(e) for e in again] == [episode_digest(e) for e in expected]
 
 
-def test_engines_end_with_a_killed_owner() -> None:
+def test_engines_end_when_their_owner_is_killed() -> None:
     shared = set(Path("/dev/shm").glob("ViZDoom*"))
     program = """
 from udrl.environments.doom import Doom
@@ -214,14 +214,14 @@ input()
     wait_until(lambda: set(Path("/dev/shm").glob("ViZDoom*")) <= shared)
 
 
-def test_without_vizdoom_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_vizdoom_is_reported_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "vizdoom", None)
     with pytest.raises(UnsupportedEnvironment, match=r'pip install "udrl\[doom\]"'):
         make_environment(take_cover())
     assert make_environment(Config(environment="CartPole-v1")) is not None
 
 
-def test_broken_vizdoom_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_vizdoom_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def broken(name: str, *rest: Any) -> Any:
@@ -239,7 +239,7 @@ def test_broken_vizdoom_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def area_average(image: npt.NDArray[np.uint8], height: int, width: int) -> list[list[int]]:
-    """Average as one would by hand, with fractions."""
+    """The area average as exact fractions."""
 
     def share(i: int, size: int, j: int, to_size: int) -> Fraction:
         low = max(Fraction(i, size), Fraction(j, to_size))

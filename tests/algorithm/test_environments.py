@@ -22,7 +22,7 @@ from udrl.spaces import Category, Vector
 
 
 class Blank(gym.Env[Any, Any]):
-    """Has the spaces it is told to have, never ends, and remembers what it was given."""
+    """Has the given spaces, never ends, and records its actions."""
 
     def __init__(self, observation: spaces.Space[Any], action: spaces.Space[Any]) -> None:
         self.metadata = {"render_modes": [], "max_return": 7.0}
@@ -52,7 +52,7 @@ Register = Callable[..., str]
 
 @pytest.fixture
 def register() -> Iterator[Register]:
-    """Registers a :class:`Blank` (or whatever makes an environment) for the time of the test."""
+    """Registers a :class:`Blank` (or another factory) for the duration of the test."""
     names = (f"Blank{i}-v0" for i in count())
     registered = []
 
@@ -78,7 +78,7 @@ def make(environment: str, **others: Any) -> Environment:
 def play(
     env: Environment, seed: int, actions: list[int]
 ) -> tuple[list[list[float]], list[float], list[bool]]:
-    """Act until the episode ends; return observations, rewards and, per step, if it ended."""
+    """Act until the episode ends; return observations, rewards and, per step, whether it ended."""
     observation, _ = env.reset(seed=seed)
     observations, rewards, ends = [observation.tolist()], [], []
     for action in actions:
@@ -102,12 +102,12 @@ def test_toys_pass_gymnasiums_checker(name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
 def test_sparse_lander_passes_gymnasiums_checker() -> None:
-    # The wrapper is what is ours, hence the warning. Rendering is Gymnasium's, and needs a screen.
+    # Only the wrapper is ours, hence the warning. Rendering is Gymnasium's, and needs a screen.
     check_env(gym.make("LunarLanderSparse-v3"), skip_render_check=True)
 
 
 @pytest.mark.parametrize("seed", [1_000_000, 1_000_001, 1_000_002])
-def test_sparse_lander_gives_the_landers_return_at_the_last_step(seed: int) -> None:
+def test_sparse_lander_pays_the_landers_return_at_the_last_step(seed: int) -> None:
     actions = random_actions(seed)
     dense = play(make("LunarLander-v3"), seed, actions)
     sparse = play(make("LunarLanderSparse-v3"), seed, actions)
@@ -117,7 +117,7 @@ def test_sparse_lander_gives_the_landers_return_at_the_last_step(seed: int) -> N
     assert dense[2][-1]
 
 
-def test_sparse_lander_gives_its_reward_also_when_the_episode_is_cut() -> None:
+def test_sparse_lander_pays_when_the_episode_is_truncated() -> None:
     dense, sparse = make("LunarLander-v3"), make("LunarLanderSparse-v3")
     limit_steps(sparse, 20)
     _, rewards, _ = play(dense, 5, [0] * 20)
@@ -127,28 +127,28 @@ def test_sparse_lander_gives_its_reward_also_when_the_episode_is_cut() -> None:
     assert last == reduce(add, rewards)
 
 
-def test_sparse_lander_forgets_what_an_abandoned_episode_earned() -> None:
+def test_sparse_lander_discards_the_reward_of_an_abandoned_episode() -> None:
     env = make("LunarLanderSparse-v3", max_episode_steps=20)
     expected = play(env, 5, [0] * 20)
     play(env, 6, [2] * 10)
     assert play(env, 5, [0] * 20) == expected
 
 
-def test_reward_at_end_records_how_it_is_made() -> None:
+def test_reward_at_end_records_its_arguments() -> None:
     spec = gym.make("LunarLanderSparse-v3").spec
     assert spec is not None
     assert spec.additional_wrappers == (RewardAtEnd.wrapper_spec(),)
 
 
 @pytest.mark.parametrize("name", ["LunarLander-v3", "LunarLanderSparse-v3"])
-def test_lander_replays_exactly_whatever_ran_before_in_the_instance(name: str) -> None:
+def test_lander_episode_is_independent_of_earlier_episodes(name: str) -> None:
     env = make(name)
     first = play(env, 1_000_000, random_actions(1))
     play(env, 1_000_001, random_actions(2))
     assert play(env, 1_000_000, random_actions(1)) == first
 
 
-def test_figure_2_has_the_arrows_of_the_figure() -> None:
+def test_figure_2_has_the_transitions_of_the_paper() -> None:
     env = Figure2()
     arrows = set()
     for seed in range(10):
@@ -161,13 +161,13 @@ def test_figure_2_has_the_arrows_of_the_figure() -> None:
     assert arrows == in_s0 | in_s1
 
 
-def test_figure_2_is_seen_as_one_of_four_states() -> None:
+def test_figure_2_observation_is_one_of_four_states() -> None:
     env = make("Figure2-v0")
     assert specify(env, settings("Figure2-v0")).observation_space == Category(n=4)
     assert {env.reset(seed=seed)[0] for seed in range(10)} == {0, 1}
 
 
-def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
+def test_obedience_pays_one_for_action_1_and_counts_down() -> None:
     env = make("Obedience-v0", environment_kwargs={"steps": 4})
     observations, rewards, ends = play(env, 1, [1, 0, 1, 1, 1])
     assert observations == [[1.0], [0.75], [0.5], [0.25], [0.0]]
@@ -175,7 +175,7 @@ def test_obedience_gives_one_for_action_1_and_counts_down() -> None:
     assert ends == [False, False, False, True]
 
 
-def test_a_spec_says_what_the_algorithm_needs_to_know() -> None:
+def test_spec_describes_spaces_limit_and_return() -> None:
     spec = specify(make("LunarLander-v3"), settings("LunarLander-v3"))
     assert spec.observation_space == Vector(size=8)
     assert spec.action_space == Categorical(n=4)
@@ -183,7 +183,7 @@ def test_a_spec_says_what_the_algorithm_needs_to_know() -> None:
     assert spec.max_return is None
 
 
-def test_the_greatest_return_is_the_settings_then_the_instances_then_the_metadatas(
+def test_max_return_is_from_setting_then_instance_then_metadata(
     register: Register,
 ) -> None:
     obedience, blank = "Obedience-v0", register(lambda: Blank(VECTOR, spaces.Discrete(2)))
@@ -192,7 +192,7 @@ def test_the_greatest_return_is_the_settings_then_the_instances_then_the_metadat
     assert specify(make(blank), settings(blank)).max_return == 7.0
 
 
-def test_a_discrete_observation_with_an_offset_is_shifted_to_zero(register: Register) -> None:
+def test_discrete_observation_with_offset_is_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(spaces.Discrete(3, start=-1), spaces.Discrete(2)))
     env = make(name)
     assert specify(env, settings(name)).observation_space == Category(n=3)
@@ -203,13 +203,13 @@ def test_a_discrete_observation_with_an_offset_is_shifted_to_zero(register: Regi
         assert observation == state + 1
 
 
-def test_more_states_than_there_can_be_vectors_are_refused(register: Register) -> None:
+def test_discrete_observation_of_too_many_states_is_rejected(register: Register) -> None:
     name = register(lambda: Blank(spaces.Discrete(2**20 + 1), spaces.Discrete(2)))
     with pytest.raises(UnsupportedEnvironment, match=r"1,048,577 states.*at most 1,048,576"):
         make(name)
 
 
-def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register) -> None:
+def test_discrete_actions_with_offset_are_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(VECTOR, spaces.Discrete(3, start=5)))
     env = make(name)
     assert specify(env, settings(name)).action_space == Categorical(n=3)
@@ -222,7 +222,7 @@ def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register)
 
 
 @pytest.mark.parametrize(
-    ("observations", "actions", "says"),
+    ("observations", "actions", "message"),
     [
         (spaces.Text(4), spaces.Discrete(2), "its observation is Text"),
         (VECTOR, spaces.Box(-np.inf, np.inf, (2,)), "has no bounds"),
@@ -230,16 +230,16 @@ def test_discrete_actions_with_an_offset_are_shifted_to_zero(register: Register)
     ],
     ids=str,
 )
-def test_other_spaces_are_refused_and_the_environment_closed(
-    register: Register, observations: spaces.Space[Any], actions: spaces.Space[Any], says: str
+def test_unsupported_space_is_rejected_and_the_environment_closed(
+    register: Register, observations: spaces.Space[Any], actions: spaces.Space[Any], message: str
 ) -> None:
     blank = Blank(observations, actions)
-    with pytest.raises(UnsupportedEnvironment, match=says):
+    with pytest.raises(UnsupportedEnvironment, match=message):
         make(register(lambda: blank))
     assert blank.closed
 
 
-def test_an_environment_without_a_step_limit_is_refused_with_the_remedy(
+def test_environment_without_step_limit_is_rejected_with_the_remedy(
     register: Register,
 ) -> None:
     name = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=None)
@@ -247,7 +247,7 @@ def test_an_environment_without_a_step_limit_is_refused_with_the_remedy(
         make(name)
 
 
-def test_max_episode_steps_gives_an_environment_a_limit_or_another_one(register: Register) -> None:
+def test_max_episode_steps_sets_or_replaces_the_limit(register: Register) -> None:
     endless = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=None)
     limited = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=10)
     for name in (endless, limited):
@@ -256,32 +256,32 @@ def test_max_episode_steps_gives_an_environment_a_limit_or_another_one(register:
         assert play(env, 1, [0] * 100)[2] == [False] * 4 + [True]
 
 
-def test_limit_steps_moves_the_limit_of_the_next_episodes(register: Register) -> None:
+def test_limit_steps_changes_the_limit_of_later_episodes(register: Register) -> None:
     env = make(register(lambda: Blank(VECTOR, spaces.Discrete(2, start=1))))
     for steps in (3, 7, 10):
         limit_steps(env, steps)
         assert len(play(env, 1, [0] * 100)[1]) == steps
 
 
-def test_limit_steps_refuses_an_environment_without_a_limit_to_move() -> None:
+def test_limit_steps_rejects_an_environment_without_a_limit() -> None:
     with pytest.raises(UnsupportedEnvironment, match="make it with make_environment"):
         limit_steps(Figure2(), 3)
 
 
 @pytest.mark.parametrize("name", ["Pong", "NoSuchEnvironment-v0", "CartPole-v99", "a b c"])
-def test_an_unknown_id_is_refused_with_the_two_forms_that_are_known(name: str) -> None:
+def test_unknown_id_is_rejected_with_the_two_accepted_forms(name: str) -> None:
     with pytest.raises(
         UnsupportedEnvironment, match=f"'{name}' cannot be made.*package.module:Env-v0"
     ):
         make(name)
 
 
-def test_a_module_that_is_not_installed_is_refused_with_the_remedy() -> None:
+def test_missing_module_is_rejected_with_the_remedy() -> None:
     with pytest.raises(UnsupportedEnvironment, match=r"no_such_module.*install the package"):
         make("no_such_module:Env-v0")
 
 
-def test_a_missing_extra_is_named_with_the_command_that_installs_it(
+def test_missing_extra_is_reported_with_the_install_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def without_box2d(name: str, **_: Any) -> None:
@@ -292,14 +292,14 @@ def test_a_missing_extra_is_named_with_the_command_that_installs_it(
         make("LunarLander-v3")
 
 
-def test_keyword_arguments_reach_the_environment_and_unknown_ones_are_refused() -> None:
+def test_keyword_arguments_reach_the_environment_and_unknown_ones_are_rejected() -> None:
     env = make("Obedience-v0", environment_kwargs={"steps": 3})
     assert specify(env, settings("Obedience-v0")).max_return == 3.0
     with pytest.raises(UnsupportedEnvironment, match=r"'Obedience-v0' cannot be made.*stpes"):
         make("Obedience-v0", environment_kwargs={"stpes": 3})
 
 
-def test_whatever_an_environment_raises_when_it_is_made_is_a_refusal() -> None:
+def test_any_error_of_the_factory_is_a_config_error() -> None:
     with pytest.raises(UnsupportedEnvironment, match=r"AssertionError: gravity \(current value: 5"):
         make("LunarLander-v3", environment_kwargs={"gravity": 5.0})
 
@@ -316,7 +316,7 @@ gymnasium.register("Patience-v0", entry_point=Patience, max_episode_steps=5)
 
 
 @pytest.fixture
-def worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def importable_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """The name of an importable module that registers ``Patience-v0``."""
     name = "worlds_of_a_user"
     (tmp_path / f"{name}.py").write_text(MODULE)
@@ -326,18 +326,20 @@ def worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     gym.registry.pop("Patience-v0", None)
 
 
-def test_an_importable_environment_is_imported(worlds: str) -> None:
-    env = make(f"{worlds}:Patience-v0")
+def test_importable_environment_is_imported(importable_module: str) -> None:
+    env = make(f"{importable_module}:Patience-v0")
     assert type(env.unwrapped).__name__ == "Patience"
-    assert specify(env, settings(f"{worlds}:Patience-v0")).max_episode_steps == 5
+    assert specify(env, settings(f"{importable_module}:Patience-v0")).max_episode_steps == 5
 
 
-def test_a_module_that_cannot_be_imported_is_refused(worlds: str, tmp_path: Path) -> None:
-    (tmp_path / f"{worlds}.py").write_text("from gymnasium import no_such_name")
+def test_module_that_fails_to_import_is_rejected(importable_module: str, tmp_path: Path) -> None:
+    (tmp_path / f"{importable_module}.py").write_text("from gymnasium import no_such_name")
     with pytest.raises(UnsupportedEnvironment, match="cannot import name 'no_such_name'"):
-        make(f"{worlds}:Patience-v0")
+        make(f"{importable_module}:Patience-v0")
 
 
-def test_an_unknown_environment_of_an_importable_module_is_refused(worlds: str) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=f"'{worlds}:Impatience-v0' cannot be made"):
-        make(f"{worlds}:Impatience-v0")
+def test_unknown_environment_of_an_importable_module_is_rejected(importable_module: str) -> None:
+    with pytest.raises(
+        UnsupportedEnvironment, match=f"'{importable_module}:Impatience-v0' cannot be made"
+    ):
+        make(f"{importable_module}:Impatience-v0")

@@ -29,7 +29,7 @@ def episode(rewards: list[float]) -> Episode:
 
 
 @given(st.lists(floats32, max_size=300))
-def test_rewards_are_summed_in_float64_one_after_the_other(rewards: list[float]) -> None:
+def test_rewards_are_summed_in_float64_in_order(rewards: list[float]) -> None:
     sums = [0.0]
     for reward in rewards:
         sums.append(sums[-1] + reward)
@@ -38,7 +38,7 @@ def test_rewards_are_summed_in_float64_one_after_the_other(rewards: list[float])
     assert result.tolist() == sums
 
 
-def test_the_order_of_summation_is_fixed_also_where_it_costs_precision() -> None:
+def test_summation_order_is_fixed_even_where_it_loses_precision() -> None:
     # Each small reward alone is lost in rounding; numpy's pairwise sum would add them up first.
     rewards = np.array([1e10] + [1e-7] * 1000, np.float32)
     assert cumulative(rewards)[-1] == rewards[0]
@@ -46,7 +46,7 @@ def test_the_order_of_summation_is_fixed_also_where_it_costs_precision() -> None
 
 
 @given(st.lists(floats32, min_size=1, max_size=300))
-def test_the_return_is_the_sum_of_all_rewards(rewards: list[float]) -> None:
+def test_return_is_the_sum_of_all_rewards(rewards: list[float]) -> None:
     assert episode(rewards).episode_return == reduce(add, rewards, 0.0)
     assert episode(rewards).length == len(rewards)
 
@@ -56,13 +56,13 @@ SPEC = EnvironmentSpec(
 )
 
 
-def test_nothing_is_wrong_with_an_episode_of_the_environment() -> None:
+def test_valid_episode_has_no_faults() -> None:
     for n in range(1, 5):
         assert fault(episode([0.5] * n), SPEC) is None
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         ({"rewards": np.zeros(0, np.float32)}, r"rewards are float32 (0,), expected float32, one"),
         ({"rewards": np.zeros(5, np.float32)}, r"one dimension of 1 to 4 steps"),
@@ -79,7 +79,7 @@ def test_nothing_is_wrong_with_an_episode_of_the_environment() -> None:
         ({"terminated": False}, "it neither terminated nor was truncated"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_an_episode_is_said(wrong: dict[str, Any], says: str) -> None:
+def test_invalid_episode_is_described(wrong: dict[str, Any], message: str) -> None:
     found = fault(dataclasses.replace(episode([0.0, 1.0]), **wrong), SPEC)
     assert found is not None
-    assert says in found
+    assert message in found

@@ -9,7 +9,7 @@ from udrl.evaluation import return_text, summarise
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=50))
-def test_mean_sample_deviation_and_interval_are_the_textbooks(returns: list[float]) -> None:
+def test_mean_deviation_and_interval_equal_the_textbook_formulas(returns: list[float]) -> None:
     mean, std = np.mean(returns), np.std(returns, ddof=1)
     half = 1.96 * std / np.sqrt(len(returns))
     evaluation = summarise(returns)
@@ -18,11 +18,11 @@ def test_mean_sample_deviation_and_interval_are_the_textbooks(returns: list[floa
     )
 
 
-def test_one_episode_has_no_spread() -> None:
+def test_one_episode_has_no_deviation() -> None:
     assert summarise([7.0]) == (7.0, 0.0, 7.0, 7.0, 1)
 
 
-def test_the_order_of_the_episodes_does_not_matter() -> None:
+def test_statistics_do_not_depend_on_the_order_of_episodes() -> None:
     returns = [0.1, 1e9, 0.2, -1e9, 0.3]
     assert summarise(returns) == summarise(returns[::-1])
 
@@ -36,11 +36,11 @@ def test_the_order_of_the_episodes_does_not_matter() -> None:
         (math.inf, "inf"),
     ],
 )  # fmt: skip
-def test_returns_have_as_many_digits_as_they_need(value: float, text: str) -> None:
+def test_return_is_formatted_with_the_necessary_digits(value: float, text: str) -> None:
     assert return_text(value) == text
 
 
 @given(st.floats(-1e6, 1e6))
-def test_a_return_as_text_is_the_return(value: float) -> None:
+def test_formatted_return_parses_to_the_same_value(value: float) -> None:
     read = float(return_text(value))
     assert abs(read - value) <= max(0.0501 if abs(value) >= 10 else 0, 0.0051 * abs(value))

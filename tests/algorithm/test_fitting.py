@@ -1,4 +1,4 @@
-"""Settings that are left open are chosen by random episodes."""
+"""Automatic settings are chosen from random episodes."""
 
 from contextlib import closing
 from typing import Any
@@ -15,7 +15,7 @@ from udrl.fitting import Sample, choose, fit, fits
 
 
 class Endless(gym.Env[Any, Any]):
-    """Nothing ends it and nothing tells actions apart."""
+    """Episodes never end, and all actions have the same effect."""
 
     id = "Endless-v0"
     observation_space = gym.spaces.Box(0, 1, (2,))
@@ -64,14 +64,14 @@ def episodes(*returns_and_lengths: tuple[float, int]) -> list[Episode]:
         ([(1e30, 1)], (1e-6, 1.0)),
     ],
 )
-def test_scales_are_one_over_what_is_usual(
+def test_scales_are_the_inverse_of_typical_values(
     found: list[tuple[float, int]], scales: tuple[float, float]
 ) -> None:
     network = choose(config(), SCALES, EpisodeGenerator(config(), 1), episodes(*found)).network
     assert (network.return_scale, network.horizon_scale) == scales
 
 
-def test_what_is_given_stays() -> None:
+def test_explicit_values_are_kept() -> None:
     generator = EpisodeGenerator(config(), 1)
     given = config(return_scale=0.5, horizon_scale=0.5)
     assert fit(given, ()) == given
@@ -80,13 +80,13 @@ def test_what_is_given_stays() -> None:
     assert half.horizon_scale != 0.5
 
 
-def test_the_choice_does_not_depend_on_how_many_environments_there_are() -> None:
+def test_choice_is_independent_of_the_number_of_environments() -> None:
     fitted = [choose(config(), AUTOMATIC, EpisodeGenerator(config(), n)) for n in (1, 7)]
     assert fitted[0] == fitted[1]
     assert 0.01 < fitted[0].network.return_scale < 0.1
 
 
-def test_algorithm_1_chooses_them() -> None:
+def test_algorithm_1_chooses_automatic_settings() -> None:
     small = {"n_warm_up_episodes": 4, "n_episodes_per_iter": 2, "n_updates_per_iter": 2,
              "batch_size": 16, "replay_size": 10, "last_few": 2}  # fmt: skip
     fitted = fit(config(**small), SCALES)
@@ -99,7 +99,7 @@ def test_algorithm_1_chooses_them() -> None:
 
 
 def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
-    """An episode of (category seen, action, reward)."""
+    """An episode of (observed category, action, reward) steps."""
     return Episode(
         command_id=0,
         observations=np.array([[s[0]] for s in steps], np.int32),
@@ -113,16 +113,16 @@ def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
 @pytest.mark.parametrize(
     ("others", "expected"),
     [
-        ([walk((0, 0, 0.0), (1, 1, 1.0))], False),  # the same again
+        ([walk((0, 0, 0.0), (1, 1, 1.0))], False),  # identical
         ([walk((0, 1, 0.0), (2, 1, 1.0))], False),  # another action
-        ([walk((0, 0, 0.0), (2, 1, 1.0))], True),  # it led elsewhere
+        ([walk((0, 0, 0.0), (2, 1, 1.0))], True),  # another next state
         ([walk((0, 0, 0.5), (1, 1, 1.0))], True),  # another reward
-        ([walk((0, 0, 0.0))], True),  # it was the end
-        ([walk((0, 0, 0.0), truncated=True)], False),  # nobody knows what would have followed
+        ([walk((0, 0, 0.0))], True),  # terminal
+        ([walk((0, 0, 0.0), truncated=True)], False),  # truncated: the next state is unknown
         ([], False),
     ],
 )
-def test_chance_shows_where_the_same_has_different_consequences(
+def test_stochasticity_is_detected_from_different_outcomes_of_equal_steps(
     others: list[Episode], expected: bool
 ) -> None:
     sample = Sample()
@@ -132,7 +132,7 @@ def test_chance_shows_where_the_same_has_different_consequences(
 
 
 @pytest.mark.parametrize(("slippery", "expected"), [(True, "action_value"), (False, "value")])
-def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expected: str) -> None:
+def test_baseline_is_action_value_in_stochastic_environments(slippery: bool, expected: str) -> None:
     settings = build(
         Config,
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
@@ -154,12 +154,12 @@ def test_where_chance_decides_actions_are_valued_on_average(slippery: bool, expe
     ("scale", "size", "good"),
     [(1.0, 0.0, True), (0.01, 500.0, True), (0.01, 5.0, False), (0.0, 5.0, True)],
 )
-def test_a_scale_fits_what_is_usual_or_not(scale: float, size: float, good: bool) -> None:
+def test_scale_is_checked_against_typical_values(scale: float, size: float, good: bool) -> None:
     assert fits(scale, size) is good
 
 
 @pytest.mark.parametrize(("environment", "expected"), [("MountainCar-v0", 32), ("CartPole-v1", 1)])
-def test_actions_are_held_where_one_step_moves_little(environment: str, expected: int) -> None:
+def test_actions_are_held_where_one_step_has_little_effect(environment: str, expected: int) -> None:
     settings = config(environment=environment)
     fitted = choose(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
     assert fitted.warm_up_hold == expected
@@ -167,14 +167,14 @@ def test_actions_are_held_where_one_step_moves_little(environment: str, expected
 
 
 @pytest.mark.parametrize(("length", "expected"), [(9, 0.95), (80, 0.95), (200, 0.98), (500, 0.992)])
-def test_lambda_follows_the_length_of_episodes(length: int, expected: float) -> None:
+def test_return_lambda_follows_the_length_of_episodes(length: int, expected: float) -> None:
     settings = config()
     generator = EpisodeGenerator(settings, 1)
     fitted = choose(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
     assert fitted.training.return_lambda == expected
 
 
-def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
+def test_long_episodes_are_sampled_in_part() -> None:
     endless = config(environment=Endless.id)
     with closing(EpisodeGenerator(endless, 1)) as generator:
         fitted = choose(endless, AUTOMATIC, generator)
@@ -183,13 +183,13 @@ def test_long_episodes_are_looked_at_in_part_and_few_of_them() -> None:
     assert fitted.commands.n_warm_up_episodes == 50
 
 
-def test_short_episodes_are_many_in_the_warm_up() -> None:
+def test_short_episodes_make_a_longer_warm_up() -> None:
     settings = config(environment="FrozenLake-v1")
     fitted = choose(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
     assert 300 < fitted.n_warm_up_episodes < 1_000  # of about 8 steps
 
 
-def test_a_dataset_decides_how_many_episodes_the_warm_up_has() -> None:
+def test_dataset_sets_the_number_of_warm_up_episodes() -> None:
     settings = config(n_warm_up_episodes=3)
     fitted = choose(settings, AUTOMATIC, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
     assert fitted.commands.n_warm_up_episodes == 3
@@ -197,7 +197,7 @@ def test_a_dataset_decides_how_many_episodes_the_warm_up_has() -> None:
 
 
 @pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])
-def test_the_time_is_shown_where_random_episodes_last_for_half_the_step_limit(
+def test_time_left_is_observed_if_random_episodes_last_half_the_step_limit(
     environment: str, shown: bool
 ) -> None:
     assert fit(config(environment=environment), ("observe_time",)).observe_time is shown
@@ -208,9 +208,9 @@ def test_the_time_is_shown_where_random_episodes_last_for_half_the_step_limit(
     [
         ((49, 51), {}, False),
         ((50, 51), {}, True),
-        ((30, 30), {"max_train_steps": 50}, True),  # none can be longer
+        ((30, 30), {"max_train_steps": 50}, True),  # the maximum
         ((999, 999), {"max_episode_steps": 100_000}, False),
-        ((1_100, 1_100), {"max_episode_steps": 100_000}, True),  # of the 2,000 that are looked at
+        ((1_100, 1_100), {"max_episode_steps": 100_000}, True),  # of the 2,000 that are sampled
     ],
 )
 def test_lengths_are_compared_with_the_limit_of_random_episodes(

@@ -28,30 +28,30 @@ def policy() -> Policy:
 
 
 @pytest.fixture
-def written(policy: Policy, tmp_path: Path) -> Path:
+def saved(policy: Policy, tmp_path: Path) -> Path:
     folder.save(tmp_path / "deep" / "agent", policy, "# A card\n")
     return tmp_path / "deep" / "agent"
 
 
-def test_a_loaded_policy_is_the_one_that_was_saved(policy: Policy, written: Path) -> None:
-    loaded = udrl.load(written)
+def test_loaded_policy_equals_the_saved_one(policy: Policy, saved: Path) -> None:
+    loaded = udrl.load(saved)
     assert loaded.config == policy.config
     assert loaded.spec == policy.spec
     assert (loaded.desired_return, loaded.desired_horizon) == (120.5, 130)
     seen = np.linspace(-1, 1, 8)
     assert loaded.logits(seen, 50.0, 60).tolist() == policy.logits(seen, 50.0, 60).tolist()
-    assert (written / "README.md").read_text() == "# A card\n"
+    assert (saved / "README.md").read_text() == "# A card\n"
 
 
-def test_weights_are_read_by_safetensors_own_loader(policy: Policy, written: Path) -> None:
-    tensors = safetensors.torch.load_file(written / "model.safetensors")
+def test_weights_are_readable_by_safetensors(policy: Policy, saved: Path) -> None:
+    tensors = safetensors.torch.load_file(saved / "model.safetensors")
     expected = policy.behavior.weights
     assert {name: t.tolist() for name, t in tensors.items()} == {
         name: t.tolist() for name, t in expected.items()
     }
 
 
-def test_a_policy_makes_the_environment_that_it_knows(policy: Policy) -> None:
+def test_policy_makes_its_environment(policy: Policy) -> None:
     env = policy.make_environment(render_mode="rgb_array")
     observation, _ = env.reset(seed=1)
     assert observation.shape == (2, 4)
@@ -61,42 +61,40 @@ def test_a_policy_makes_the_environment_that_it_knows(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("changed", "message"),
     [
         (b"{", "export the run again"),
         (b'{"format": 2}', "missing required field"),
         (b'{"format": 2, "surplus": 2}', "export the run again"),
     ],
 )
-def test_descriptions_that_are_not_what_was_written(
-    written: Path, changed: bytes, says: str
-) -> None:
-    (written / "config.json").write_bytes(changed)
-    with pytest.raises(InvalidData, match=says):
-        udrl.load(written)
+def test_invalid_description_is_rejected(saved: Path, changed: bytes, message: str) -> None:
+    (saved / "config.json").write_bytes(changed)
+    with pytest.raises(InvalidData, match=message):
+        udrl.load(saved)
 
 
-def test_a_format_of_another_version_is_named_and_may_be_written_over(
-    policy: Policy, written: Path
+def test_unknown_format_version_is_rejected_and_can_be_overwritten(
+    policy: Policy, saved: Path
 ) -> None:
-    description = json.loads((written / "config.json").read_text())
+    description = json.loads((saved / "config.json").read_text())
     of_another = description | {"format": 1, "surplus": 2}
-    (written / "config.json").write_text(json.dumps(of_another))
+    (saved / "config.json").write_text(json.dumps(of_another))
     with pytest.raises(InvalidData, match="format 1, this version of udrl reads 2"):
-        udrl.load(written)
-    folder.save(written, policy, "# A card\n")
-    assert udrl.load(written).desired_return == policy.desired_return
+        udrl.load(saved)
+    folder.save(saved, policy, "# A card\n")
+    assert udrl.load(saved).desired_return == policy.desired_return
 
 
-def test_weights_of_another_architecture(written: Path) -> None:
-    description = json.loads((written / "config.json").read_text())
+def test_weights_of_another_architecture_are_rejected(saved: Path) -> None:
+    description = json.loads((saved / "config.json").read_text())
     description["config"]["hidden"] = [16, 32]
-    (written / "config.json").write_text(json.dumps(description))
+    (saved / "config.json").write_text(json.dumps(description))
     with pytest.raises(InvalidWeights, match="another architecture"):
-        udrl.load(written)
+        udrl.load(saved)
 
 
-def test_no_folder(tmp_path: Path, policy: Policy) -> None:
+def test_missing_folder_is_rejected(tmp_path: Path, policy: Policy) -> None:
     with pytest.raises(ConfigError, match="or a folder that udrl export --folder wrote"):
         udrl.load(tmp_path / "nothing")
     (tmp_path / "file").write_text("")
@@ -104,17 +102,19 @@ def test_no_folder(tmp_path: Path, policy: Policy) -> None:
         folder.save(tmp_path / "file", policy, "")
 
 
-def test_the_package_offers_nothing_else() -> None:
+def test_package_exports_nothing_else() -> None:
     assert {"train", "load", "__version__"} <= set(dir(udrl))
     assert set(udrl.__all__) <= set(dir(udrl))
     with pytest.raises(AttributeError, match="'udrl' has no attribute 'loads'"):
         udrl.loads  # noqa: B018
 
 
-def test_a_folder_of_others_is_left_alone(policy: Policy, written: Path, tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_overwritten(
+    policy: Policy, saved: Path, tmp_path: Path
+) -> None:
     (tmp_path / "README.md").write_text("precious")
     with pytest.raises(ConfigError, match="something other than an exported agent"):
         folder.save(tmp_path, policy, "")
     assert (tmp_path / "README.md").read_text() == "precious"
-    folder.save(written, policy, "# Another card\n")
-    assert (written / "README.md").read_text() == "# Another card\n"
+    folder.save(saved, policy, "# Another card\n")
+    assert (saved / "README.md").read_text() == "# Another card\n"

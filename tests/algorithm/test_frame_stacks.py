@@ -1,4 +1,4 @@
-"""What the network sees in acting is what it is trained on: stacks of frames, bit for bit."""
+"""Stacked frames: the inputs in acting and in training are bit-identical."""
 
 import math
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ STACK = 4
 
 
 class Noise(gym.Env[npt.NDArray[np.uint8], np.int64]):
-    """Shows noise, for as many steps as the seed says."""
+    """Random observations, for a number of steps that the seed determines."""
 
     metadata = {"render_modes": []}
 
@@ -73,18 +73,18 @@ def settings(environment: str = "Noise-v0", **values: Any) -> Config:
     return build(Config, small | values)
 
 
-class Watching(ActingFunction):
-    """Notes what it is shown."""
+class RecordingGraph(ActingFunction):
+    """Records its inputs."""
 
     def __init__(self, graph: bytes) -> None:
         super().__init__(graph, probe_weights(graph))
         self.seen: list[npt.NDArray[Any]] = []
 
     def call(self, n: int) -> Call:
-        return _Noting(super().call(n), self.seen)
+        return _RecordingCall(super().call(n), self.seen)
 
 
-class _Noting:
+class _RecordingCall:
     def __init__(self, call: Call, seen: list[npt.NDArray[Any]]) -> None:
         self.seen, self.command, self.logits = call.seen, call.command, call.logits
         self.state, self.next_state = call.state, call.next_state
@@ -96,9 +96,11 @@ class _Noting:
         self._call.run()
 
 
-def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], Watching]:
+def record_inputs(
+    config: Config, n_environments: int, n: int
+) -> tuple[list[Episode], RecordingGraph]:
     generator = EpisodeGenerator(config, n_environments)
-    behavior = Watching(acting_graph(config.network, generator.spec))
+    behavior = RecordingGraph(acting_graph(config.network, generator.spec))
     commands = [
         Command(
             id=i,
@@ -115,7 +117,7 @@ def watch(config: Config, n_environments: int, n: int) -> tuple[list[Episode], W
     return generate_episodes(generator, commands, behavior), behavior
 
 
-def test_before_an_episode_its_first_observation_is_repeated() -> None:
+def test_first_observation_fills_the_stack() -> None:
     memory = FrameStack(Vector(size=2), 4)
     times = memory.times(np.array([0, 2, 9]))
     assert times.tolist() == [[0, 0, 0, 0], [0, 0, 1, 2], [6, 7, 8, 9]]
@@ -129,7 +131,7 @@ def test_before_an_episode_its_first_observation_is_repeated() -> None:
         (Category(n=7), (4,)),
     ],
 )
-def test_observations_are_joined_along_the_first_dimension(
+def test_observations_are_stacked_along_the_first_dimension(
     space: ObservationSpace, shape: tuple[int, ...]
 ) -> None:
     memory = FrameStack(space, 4)
@@ -143,12 +145,14 @@ def test_observations_are_joined_along_the_first_dimension(
 
 @pytest.mark.parametrize("environment", ["Noise-v0", "NoiseVectors-v0"])
 @pytest.mark.parametrize("capacity", [1024, 8])
-def test_acting_sees_what_training_sees(
+def test_acting_and_training_have_equal_inputs(
     environment: str, capacity: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("udrl.recording._FIRST_CAPACITY", capacity)  # 8: the ring turns and grows
+    monkeypatch.setattr(
+        "udrl.recording._FIRST_CAPACITY", capacity
+    )  # 8: the ring wraps around and grows
     config = settings(environment)
-    episodes, behavior = watch(config, 3, 12)
+    episodes, behavior = record_inputs(config, 3, 12)
     acted_on = {image.tobytes() for image in behavior.seen}
     spec = specify(make_environment(config), config)
     experience = Experience(config, spec)
@@ -171,7 +175,7 @@ def test_acting_sees_what_training_sees(
     assert len(trained_on) == sum(e.length for e in episodes)
 
 
-def test_images_come_with_the_channels_first() -> None:
+def test_image_channels_come_first() -> None:
     env = make_environment(settings())
     raw = gym.make("Noise-v0", disable_env_checker=True)
     image, _ = env.reset(seed=4)
@@ -185,7 +189,9 @@ def test_images_come_with_the_channels_first() -> None:
 @pytest.mark.parametrize(
     ("shape", "seen"), [((5, 6), (1, 5, 6)), ((3, 5, 6), (3, 5, 6)), ((5, 6, 4), (4, 5, 6))]
 )
-def test_wherever_the_channels_are(shape: tuple[int, ...], seen: tuple[int, ...]) -> None:
+def test_position_of_the_channels_is_detected(
+    shape: tuple[int, ...], seen: tuple[int, ...]
+) -> None:
     config = settings(environment_kwargs={})
     gym.register("Shaped-v0", entry_point=lambda **_: Noise(shape), max_episode_steps=9)
     try:
@@ -197,7 +203,7 @@ def test_wherever_the_channels_are(shape: tuple[int, ...], seen: tuple[int, ...]
 
 def test_stack_of_one_is_the_observation() -> None:
     config = settings(frame_stack=1)
-    episodes, behavior = watch(config, 2, 3)
+    episodes, behavior = record_inputs(config, 2, 3)
     frames = {frame.tobytes() for e in episodes for frame in e.observations}
     assert {image.tobytes() for image in behavior.seen} == frames
     assert episodes[0].observations.dtype == np.uint8

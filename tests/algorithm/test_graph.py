@@ -1,4 +1,4 @@
-"""The acting graph: the same function as in torch, row by row, and what is refused."""
+"""The acting graph: equality with torch, independence of the batch, and rejected graphs."""
 
 from typing import Any
 
@@ -100,7 +100,7 @@ def acting(config: Config, behavior: BehaviorFunction, spec: EnvironmentSpec) ->
 
 
 def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """What the network reads of a command (2.3.2, 3.1), one number at a time."""
+    """The network's inputs for a command (2.3.2, 3.1), one number at a time."""
     rows = []
     for desired_return, desired_horizon in command.tolist():
         if config.network.desired_horizon == "return":
@@ -121,14 +121,14 @@ def picked(seen: Seen, rows: Any) -> Seen:
 
 
 def fill(call: Call, seen: Seen, command: np.ndarray[Any, Any]) -> None:
-    for asked, one in zip(call.seen, seen, strict=True):
-        asked[:] = one
+    for target, one in zip(call.seen, seen, strict=True):
+        target[:] = one
     call.command[:] = command
 
 
 @pytest.mark.parametrize("weights", ["initial", "far from it"])
 @each_kind
-def test_it_is_the_function_that_is_trained(
+def test_graph_equals_the_trained_network(
     spec: EnvironmentSpec, values: dict[str, Any], weights: str
 ) -> None:
     config = settings(**values)
@@ -152,11 +152,13 @@ def test_it_is_the_function_that_is_trained(
     assert found.dtype == np.float32
     size = max(1.0, float(np.abs(expected).max()))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * size)
-    assert np.ptp(found, axis=0).min() > 0.01, "rows that are all alike prove little"
+    assert np.ptp(found, axis=0).min() > 0.01, (
+        "rows must differ for the comparison to mean anything"
+    )
 
 
 @each_kind
-def test_its_weights_are_those_of_the_network(
+def test_graph_weights_are_those_of_the_network(
     spec: EnvironmentSpec, values: dict[str, Any]
 ) -> None:
     config = settings(**values)
@@ -165,7 +167,7 @@ def test_its_weights_are_those_of_the_network(
 
 
 @each_kind
-def test_the_model_is_valid_and_says_the_same_elsewhere(
+def test_model_is_valid_onnx_and_equals_the_reference_evaluator(
     spec: EnvironmentSpec, values: dict[str, Any]
 ) -> None:
     config = settings(**values)
@@ -187,9 +189,7 @@ def test_the_model_is_valid_and_says_the_same_elsewhere(
 
 
 @each_kind
-def test_a_row_has_the_same_bits_in_any_company(
-    spec: EnvironmentSpec, values: dict[str, Any]
-) -> None:
+def test_row_is_bit_identical_in_any_batch(spec: EnvironmentSpec, values: dict[str, Any]) -> None:
     config = settings(**values)
     function = acting(config, initialise(config, spec), spec)
     seen, command, state = probe_rows(function, 40)
@@ -205,13 +205,15 @@ def test_a_row_has_the_same_bits_in_any_company(
         assert np.array_equal(call.next_state, after[rows]), n
 
 
-def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_computed_one_by_one_where_batches_change_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     config = settings()
     graph = acting_graph(config.network, VECTOR)
-    asked = []
+    sizes = []
 
     def never(graph: bytes, n: int) -> bool:
-        asked.append(n)
+        sizes.append(n)
         return False
 
     monkeypatch.setattr(module, "is_exact_in_batch", never)
@@ -223,10 +225,10 @@ def test_where_company_changes_bits_rows_go_one_by_one(monkeypatch: pytest.Monke
         fill(call, picked(seen, rows), command[rows])
         call.run()
         assert np.array_equal(call.logits, function.logits(picked(seen, rows), command[rows]))
-    assert asked == [6]
+    assert sizes == [6]
 
 
-def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batch_dependent_rounding_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings(seed=3, hidden=[48])
     graph = acting_graph(config.network, VECTOR)
     run = module._BatchCall.run
@@ -244,7 +246,7 @@ def test_that_company_changes_bits_is_noticed(monkeypatch: pytest.MonkeyPatch) -
     assert is_exact_in_batch(graph, 4)
 
 
-def test_a_graph_is_a_function_of_settings_and_spaces() -> None:
+def test_graph_is_a_function_of_settings_and_spaces() -> None:
     assert acting_graph(settings().network, VECTOR) == acting_graph(settings().network, VECTOR)
     assert acting_graph(settings().network, VECTOR) != acting_graph(
         settings(hidden=[8]).network, VECTOR
@@ -259,12 +261,12 @@ def test_probe_weights_are_bounded_by_the_inputs_of_a_unit() -> None:
 
 
 @given(st.binary(min_size=1, max_size=200))
-def test_garbage_is_no_graph(garbage: bytes) -> None:
+def test_garbage_is_rejected(garbage: bytes) -> None:
     with pytest.raises(InvalidWeights, match="acting graph"):
         ActingFunction(garbage, {})
 
 
-def test_a_graph_without_all_weights_is_refused() -> None:
+def test_graph_with_missing_weights_is_rejected() -> None:
     graph = acting_graph(settings().network, VECTOR)
     weights = dict(probe_weights(graph))
     del weights["action.bias"]

@@ -1,4 +1,4 @@
-"""The behavior function, training and checkpoints for images; what is left to the machine."""
+"""Behavior function, training and checkpoints for images; settings that depend on the machine."""
 
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,9 @@ def appendix_b_2(behavior: BehaviorFunction, image: torch.Tensor, command: torch
 
 @pytest.mark.parametrize("size", [(1, 32, 32), (3, 9, 14)])
 @pytest.mark.parametrize("initialisation", ["orthogonal", "uniform"])
-def test_logits_are_those_of_appendix_b_2(size: tuple[int, ...], initialisation: str) -> None:
+def test_logits_equal_the_formulas_of_appendix_b_2(
+    size: tuple[int, ...], initialisation: str
+) -> None:
     spec = EnvironmentSpec(
         observation_space=Image(channels=size[0], height=size[1], width=size[2]),
         action_space=Categorical(n=3),
@@ -130,7 +132,7 @@ def test_layers_have_the_sizes_of_appendix_b_2(
     assert {n: s for n, s in shapes.items() if "weight" in n} == weights
 
 
-def test_bfloat16_is_near_float32() -> None:
+def test_bfloat16_is_close_to_float32() -> None:
     given = (images(32),), commands(32)
     logits = {}
     for precision in PRECISIONS:
@@ -147,7 +149,7 @@ def some_episodes(n: int, longest: int = 70) -> list[Episode]:
         length = int(rng.integers(10, longest))
         actions = rng.integers(0, 2, length).astype(np.uint8)
         observations = rng.integers(0, 100, (length, 1, 32, 32)).astype(np.uint8)
-        observations[:, :, :8] += 100 * actions[:, None, None, None]  # what there is to learn
+        observations[:, :, :8] += 100 * actions[:, None, None, None]  # the pattern to learn
         episodes.append(
             Episode(i, observations, actions, np.ones(length, np.float32), True, False)  # noqa: FBT003
         )
@@ -155,7 +157,7 @@ def some_episodes(n: int, longest: int = 70) -> list[Episode]:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_training_learns_and_goes_on_from_a_checkpoint(precision: str) -> None:
+def test_training_learns_and_resumes_from_a_checkpoint(precision: str) -> None:
     config = settings(precision=precision, learning_rate=3e-3, n_updates_per_iter=60)
     experience = Experience(config, TAKE_COVER)
     for episode in some_episodes(5):
@@ -170,17 +172,17 @@ def test_training_learns_and_goes_on_from_a_checkpoint(precision: str) -> None:
         train(one, ranked, config)
     digests = {arrays_digest(one.weights) for one in (state, restored)}
     assert len(digests) == 1
-    assert state.loss < 0.3, "nats; chance is 0.69"
+    assert state.loss < 0.3, "nats; chance level is 0.69"
     assert all(p.dtype == torch.float32 for p in state.behavior.parameters())
 
 
-def test_classes_of_arithmetic_tell_precisions_apart() -> None:
+def test_numerics_class_depends_on_the_precision() -> None:
     classes = {p: training_class(settings(precision=p), TAKE_COVER) for p in PRECISIONS}
     assert len(set(classes.values())) == 2
 
 
-def test_buffer_keeps_single_frames() -> None:
-    """500 episodes of 800 steps take at most 0.6 GB, in pages that are taken as they fill."""
+def test_buffer_stores_single_frames() -> None:
+    """500 episodes of 800 steps take at most 0.6 GB, in pages that are allocated as they fill."""
     config = settings(replay_size=500)
     experience = Experience(config, TAKE_COVER)
     seen, done = TAKE_COVER.observation_space, TAKE_COVER.action_space
@@ -200,10 +202,10 @@ def test_buffer_keeps_single_frames() -> None:
     assert 500 * in_pages * per_step < 0.6e9
 
 
-# What is left to the machine.
+# Settings that depend on the machine.
 
 
-def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_selects_precision_and_device_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     automatic = settings(precision="auto", device="auto")
     for fast, cuda in ((True, False), (False, True)):
         monkeypatch.setattr(numerics, "_is_fast_in_bfloat16", lambda fast=fast: fast)
@@ -214,11 +216,11 @@ def test_auto_is_settled_by_what_the_machine_has(monkeypatch: pytest.MonkeyPatch
         assert resolve_arithmetic(resolved) == resolved
 
 
-def test_resumed_run_keeps_what_was_settled() -> None:
+def test_resumed_run_keeps_its_precision_and_device() -> None:
     held = settings(precision="bfloat16", device="cpu", seed=3)
     assert resolve_as(held, settings(precision="auto", device="auto", seed=3)) == held
-    asked = settings(precision="float32", device="auto", seed=3)
-    assert resolve_as(held, asked).arithmetic.precision == "float32"
+    requested = settings(precision="float32", device="auto", seed=3)
+    assert resolve_as(held, requested).arithmetic.precision == "float32"
 
 
 @pytest.mark.parametrize(
@@ -229,14 +231,16 @@ def test_resumed_run_keeps_what_was_settled() -> None:
         ("flags : fpu bf16x", False),
     ],
 )
-def test_processor_says_what_it_is_fast_in(
+def test_precision_follows_the_processors_features(
     text: str, fast: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: text)
     assert numerics._is_fast_in_bfloat16() is fast
 
 
-def test_where_nobody_tells_it_is_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precision_is_float32_where_the_features_are_unknown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def missing(*_: object, **__: object) -> str:
         raise FileNotFoundError
 
@@ -244,7 +248,7 @@ def test_where_nobody_tells_it_is_float32(monkeypatch: pytest.MonkeyPatch) -> No
     assert not numerics._is_fast_in_bfloat16()
 
 
-# Commands of TakeCover (3.1): as many steps as return, as an integer.
+# Commands of TakeCover (3.1): the horizon is the return, as an integer.
 
 
 def test_horizon_is_the_return_as_an_integer() -> None:

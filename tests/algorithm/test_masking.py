@@ -1,4 +1,4 @@
-"""Actions that are not allowed are never taken."""
+"""Masked actions are never taken."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ from udrl.rollout import Rollout
 
 
 class Doors(gym.Env[Any, Any]):
-    """Some doors are open; going through a closed one is an error, and the highest pays most."""
+    """Some doors are open. A closed one raises an error, and the last one pays most."""
 
     def __init__(self, *, shows: bool = False, two: bool = False, fault: str = "") -> None:
         self.shows, self.two, self.fault = shows, two, fault
@@ -56,7 +56,7 @@ class Doors(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> Any:
         door, second = action if self.two else (action, 1)
-        assert self.open[door], "closed"
+        assert self.open[door], "closed door"
         assert second == 1
         self.t += 1
         observation, info = self._returned()
@@ -86,7 +86,7 @@ def config(mask: str | None = "info", given: dict[str, Any] | None = None, **val
         ("doors", {"shows": True}, {"baseline": "action_value", "normalise_observations": True}),
     ],
 )
-def test_whole_runs_keep_to_what_is_allowed(
+def test_run_takes_allowed_actions_only(
     mask: str, given: dict[str, Any], values: dict[str, Any]
 ) -> None:
     settings = config(mask, given, **values)
@@ -95,7 +95,7 @@ def test_whole_runs_keep_to_what_is_allowed(
     assert np.isfinite(runs[0].state.loss)
 
 
-def test_a_random_action_is_any_of_those_allowed() -> None:
+def test_random_action_is_uniform_among_the_allowed() -> None:
     space, mask = Categorical(n=4), np.array([[0, 1, 0, 1]], np.uint8).repeat(1000, axis=0)
     found = random_actions(space, mask, np.linspace(0, 1, 1000, endpoint=False))
     assert found.tolist() == [1] * 500 + [3] * 500
@@ -107,7 +107,7 @@ def test_a_random_action_is_any_of_those_allowed() -> None:
     assert pairs.allowed(both[:1], np.array([[1, 0]])).tolist() == [[False, False]]
 
 
-def test_one_that_is_watched_keeps_to_it_too() -> None:
+def test_rollout_takes_allowed_actions_only() -> None:
     settings = config("info", {"two": True})
     run = algorithm1(settings, Budget(max_env_steps=300))
     generator = EpisodeGenerator(settings, 2)
@@ -125,7 +125,7 @@ def test_one_that_is_watched_keeps_to_it_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "message"),
     [
         ({"fault": "no mask"}, "a dict of nothing as info, without 'action_mask'"),
         (
@@ -134,15 +134,15 @@ def test_one_that_is_watched_keeps_to_it_too() -> None:
         ),
     ],
 )
-def test_masks_that_are_none_are_the_environments_fault(given: dict[str, Any], says: str) -> None:
+def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], message: str) -> None:
     generator = EpisodeGenerator(config("info", given), 1)
     commands = CommandSampler(config(), generator.spec).warm_up()
-    with pytest.raises(EnvironmentFault, match=says):
+    with pytest.raises(EnvironmentFault, match=message):
         generate_episodes(generator, commands, None)
 
 
 @pytest.mark.parametrize(
-    ("mask", "given", "says"),
+    ("mask", "given", "message"),
     [
         (
             "walls",
@@ -152,12 +152,12 @@ def test_masks_that_are_none_are_the_environments_fault(given: dict[str, Any], s
         ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
     ],
 )
-def test_entries_that_are_no_masks_are_refused(mask: str, given: dict[str, Any], says: str) -> None:
-    with pytest.raises(UnsupportedEnvironment, match=says):
+def test_invalid_mask_entry_is_rejected(mask: str, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=message):
         EpisodeGenerator(config(mask, given), 1)
 
 
-def test_an_episode_with_a_forbidden_action_is_none() -> None:
+def test_episode_with_a_masked_action_is_rejected() -> None:
     settings = config()
     generator = EpisodeGenerator(settings, 1)
     commands = CommandSampler(settings, generator.spec).warm_up()[:1]

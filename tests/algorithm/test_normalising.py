@@ -1,4 +1,4 @@
-"""Numbers read relative to their mean in the warm-up, in units of their deviation there."""
+"""Vectors are normalised by their mean and deviation in the warm-up."""
 
 from typing import Any
 
@@ -45,7 +45,7 @@ def settings(**values: Any) -> Config:
 
 
 def episode(space: ObservationSpace, number: int, shift: float = 0.0) -> Episode:
-    """Numbers around 100 + shift, deviations of 1 to 3, the last of each constant."""
+    """Numbers around 100 + shift with deviations of 1 to 3; the last number of each is constant."""
     rng = np.random.default_rng(number)
     observations = np.empty((30, *space.shape), space.dtype)
     for part in parts_of(observations):
@@ -73,7 +73,7 @@ def ranked(config: Config, space: ObservationSpace, shift: float = 0.0) -> Ranke
 
 @pytest.mark.parametrize("space", [VECTOR, RECORD], ids=["vector", "record"])
 @pytest.mark.parametrize("frame_stack", [1, 2])
-def test_version_1_has_mean_and_deviation_of_what_it_is_trained_on_and_keeps_them(
+def test_normalisation_is_set_by_version_1_and_kept(
     space: ObservationSpace, frame_stack: int
 ) -> None:
     config = settings(frame_stack=frame_stack)
@@ -100,14 +100,14 @@ def test_version_1_has_mean_and_deviation_of_what_it_is_trained_on_and_keeps_the
 
 
 @pytest.mark.parametrize("space", [VECTOR, RECORD], ids=["vector", "record"])
-def test_the_graph_is_what_was_trained(space: ObservationSpace) -> None:
+def test_graph_normalises_as_in_training(space: ObservationSpace) -> None:
     config = settings()
     state, experience = untrained(config, spec(space)), ranked(config, space)
     train(state, experience, config)
     graph = acting_graph(config.network, spec(space))
     assert weight_shapes(graph) == {n: t.shape for n, t in state.weights.items()}
     seen, _ = next(experience.steps())
-    seen[-1][0] = 1e6  # is bounded
+    seen[-1][0] = 1e6  # bounded
     command = np.tile([[5.0, 9.0]], (len(seen[0]), 1))
     found = ActingFunction(graph, state.weights).logits(seen, command)
     scaled = torch.from_numpy(command * [config.network.return_scale, config.network.horizon_scale])
@@ -119,7 +119,7 @@ def test_the_graph_is_what_was_trained(space: ObservationSpace) -> None:
     assert np.ptp(found, axis=0).min() > 1e-3
 
 
-def test_training_goes_on_where_it_was() -> None:
+def test_training_resumes_with_identical_results() -> None:
     config = settings()
 
     def advance(state: TrainingState) -> TrainingState:
@@ -134,7 +134,7 @@ def test_training_goes_on_where_it_was() -> None:
     assert encode_optimizer(resumed) == encode_optimizer(straight)
 
 
-def test_units_make_no_difference_to_what_is_learned() -> None:
+def test_training_is_invariant_to_units() -> None:
     """An environment in other units gives the same agent, up to rounding."""
     config = settings(baseline="none", n_updates_per_iter=20)
     losses = []

@@ -39,7 +39,7 @@ def test_environments_of_the_paper_and_the_toys_replay(name: str) -> None:
 
 
 class Drifting(Obedience):
-    """Remembers, in its observation, how often it was reset."""
+    """Its observation depends on the number of resets."""
 
     resets = 0
 
@@ -54,7 +54,7 @@ class Drifting(Obedience):
 
 
 class Failing(Obedience):
-    """Cannot be stepped."""
+    """Raises at every step."""
 
     def step(self, action: Any) -> Any:
         raise RuntimeError("out of order")
@@ -69,12 +69,12 @@ def generator_of(env: Callable[..., Environment]) -> EpisodeGenerator:
     return EpisodeGenerator(settings(), 2, make)
 
 
-def test_an_environment_that_remembers_other_episodes_does_not_replay() -> None:
+def test_environment_with_memory_of_earlier_episodes_does_not_replay() -> None:
     assert repeated_digest(generator_of(Obedience))
     assert not repeated_digest(generator_of(Drifting))
 
 
-def test_an_environment_that_fails_the_probe_is_at_fault() -> None:
+def test_environment_that_fails_the_probe_is_reported() -> None:
     with pytest.raises(EnvironmentFault, match="out of order"):
         repeated_digest(generator_of(Failing))
 
@@ -83,34 +83,34 @@ def class_of(config: Config) -> str:
     return acting_class(acting_graph(config.network, LANDER), LANDER.action_space)
 
 
-def test_the_environment_digest_does_not_depend_on_the_number_of_environments() -> None:
+def test_environment_digest_is_independent_of_the_number_of_environments() -> None:
     config = settings()
     digests = {environment_digest(EpisodeGenerator(config, n)) for n in (1, 3, 20)}
     assert len(digests) == 1
     assert digests != {environment_digest(generator_of(Obedience))}
 
 
-def test_a_generator_is_as_good_as_new_after_the_probes() -> None:
+def test_probes_leave_the_generator_unchanged() -> None:
     generator = EpisodeGenerator(settings(), 2)
     first = environment_digest(generator)
     assert repeated_digest(generator) == environment_digest(generator) == first
     assert generator.free == 2
 
 
-def test_the_acting_class_sees_a_change_of_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_acting_class_depends_on_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings()
     expected = class_of(config)
     advance = ActingFunction.advance
 
-    def rounds_otherwise(self: ActingFunction, *rows: Any) -> Any:
+    def round_differently(self: ActingFunction, *rows: Any) -> Any:
         logits, state = advance(self, *rows)
         return np.nextafter(logits, np.float32(np.inf)), state
 
-    monkeypatch.setattr(ActingFunction, "advance", rounds_otherwise)
+    monkeypatch.setattr(ActingFunction, "advance", round_differently)
     assert class_of(config) != expected
 
 
-def test_the_training_class_sees_a_change_of_the_last_bit(
+def test_training_class_depends_on_the_last_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = settings()
@@ -118,15 +118,15 @@ def test_the_training_class_sees_a_change_of_the_last_bit(
     assert training_class(config, LANDER) == expected
     forward_relative = BehaviorFunction.forward_relative
 
-    def rounds_otherwise(self: BehaviorFunction, *inputs: Any) -> Tensor:
+    def round_differently(self: BehaviorFunction, *inputs: Any) -> Tensor:
         return forward_relative(self, *inputs) * (1 + 2**-23)
 
-    monkeypatch.setattr(BehaviorFunction, "forward_relative", rounds_otherwise)
+    monkeypatch.setattr(BehaviorFunction, "forward_relative", round_differently)
     assert training_class(config, LANDER) != expected
 
 
 @pytest.mark.parametrize("segments", ["trailing", "all"])
-def test_the_training_class_does_not_depend_on_the_size_of_the_run(segments: str) -> None:
+def test_training_class_is_independent_of_the_size_of_the_run(segments: str) -> None:
     small = settings(segments=segments, n_updates_per_iter=1, replay_size=1, last_few=1)
     large = settings(segments=segments, n_updates_per_iter=500, replay_size=700, last_few=75)
     assert training_class(small, LANDER) == training_class(large, LANDER)

@@ -1,4 +1,4 @@
-"""Where an agent obeys: the maths against loops that read like the definitions."""
+"""Statistics of obedience against loops that read like their definitions."""
 
 import math
 import statistics
@@ -20,7 +20,7 @@ from udrl.obedience_statistics import (
 )
 
 WHOLE = st.integers(-1000, 1000)
-#: Commands, what was obtained, and half the width of its interval: whole, so that all is exact.
+#: Commands, obtained returns, and half-widths of their intervals: integers, for exact sums.
 MEASURED = st.lists(
     st.tuples(st.integers(-20, 20), st.integers(-20, 20), st.integers(0, 5)),
     min_size=1, max_size=12, unique_by=lambda row: row[0],
@@ -32,7 +32,7 @@ def means(rows: list[tuple[int, int, int]]) -> Means:
     return Means(commanded, mean, mean - half, mean + half)
 
 
-def obeyed_slowly(rows: list[tuple[int, int, int]], tolerance: float) -> slice | None:
+def slow_obeyed_range(rows: list[tuple[int, int, int]], tolerance: float) -> slice | None:
     best = None
     for first in range(len(rows)):
         for last in range(first + 1, len(rows)):
@@ -54,27 +54,27 @@ def width(rows: list[tuple[int, int, int]], part: slice) -> int:
 
 
 def slope_is_enough(x: list[int], y: list[int]) -> bool:
-    """Whether the least squares line rises by at least 1 for 2, in whole numbers."""
+    """Whether the least squares line has a slope of at least 1/2, in integers."""
     n = len(x)
     together = n * sum(a * b for a, b in zip(x, y, strict=True)) - sum(x) * sum(y)
     return 2 * together >= n * sum(a * a for a in x) - sum(x) ** 2
 
 
 @given(rows=MEASURED, tolerance=st.integers(0, 12))
-def test_the_obeyed_range_is_the_widest_that_meets_its_definition(
+def test_obeyed_range_is_the_widest_that_meets_its_definition(
     rows: list[tuple[int, int, int]], tolerance: int
 ) -> None:
-    assert obeyed(means(rows), tolerance) == obeyed_slowly(rows, tolerance)
+    assert obeyed(means(rows), tolerance) == slow_obeyed_range(rows, tolerance)
 
 
-def test_an_agent_that_obeys_up_to_its_best() -> None:
+def test_obeyed_range_ends_at_the_agents_best() -> None:
     rows = [(c, min(c, 60) + 1, 2) for c in range(0, 101, 10)]
-    assert obeyed(means(rows), tolerance=10) == slice(0, 8)  # 70 gives 61, 80 does too
+    assert obeyed(means(rows), tolerance=10) == slice(0, 8)  # 70 gives 61, and so does 80
 
 
 @pytest.mark.parametrize("half", [0, 9])
-def test_an_agent_that_always_does_the_same_obeys_nowhere(half: int) -> None:
-    """Some commands are within the tolerance of what it always obtains."""
+def test_agent_of_constant_behaviour_obeys_nowhere(half: int) -> None:
+    """Some commands are within the tolerance of its constant return."""
     rows = [(c, 50 + (c % 20 == 0), half) for c in range(0, 101, 10)]
     assert obeyed(means(rows), tolerance=10) is None
 
@@ -86,16 +86,14 @@ def test_noise_is_not_obedience() -> None:
 
 
 @given(values=st.lists(WHOLE, min_size=1, max_size=60))
-def test_reachable_leaves_out_the_lowest_twentieth(values: list[int]) -> None:
+def test_reachable_range_excludes_the_lowest_twentieth(values: list[int]) -> None:
     ranked = sorted(values)
     left_out = math.floor(round((len(values) - 1) / 20, 9))
     assert reachable(values) == (ranked[left_out], ranked[-1])
 
 
 @given(values=st.lists(st.tuples(WHOLE, WHOLE), min_size=1, max_size=150), at=WHOLE)
-def test_the_nearest_episodes_and_those_that_are_as_near(
-    values: list[tuple[int, int]], at: int
-) -> None:
+def test_nearest_episodes_include_ties(values: list[tuple[int, int]], at: int) -> None:
     ranked = sorted(values, key=lambda pair: abs(pair[0] - at))
     last = ranked[: max(5, -(-len(values) // 20))][-1]
     nearest = [value for where, value in values if abs(where - at) <= abs(last[0] - at)]
@@ -104,7 +102,7 @@ def test_the_nearest_episodes_and_those_that_are_as_near(
 
 
 @given(low=WHOLE, width=st.floats(0.001, 1e6), n=st.integers(2, 50))
-def test_commands_are_spread_evenly_and_can_be_written_down(low: int, width: float, n: int) -> None:
+def test_commands_are_evenly_spread_and_round(low: int, width: float, n: int) -> None:
     spacing = width / (n - 1)
     found = evenly(low, low + width, n)
     assert len(found) == n
@@ -115,7 +113,7 @@ def test_commands_are_spread_evenly_and_can_be_written_down(low: int, width: flo
 
 
 @given(values=st.lists(st.integers(0, 20), min_size=1, max_size=60), n=st.integers(2, 12))
-def test_a_few_values_are_commanded_as_they_are(values: list[int], n: int) -> None:
+def test_few_distinct_values_are_commanded_exactly(values: list[int], n: int) -> None:
     distinct = sorted(set(values))
     if len(distinct) <= n:
         assert spread(values, n) == distinct
@@ -123,7 +121,7 @@ def test_a_few_values_are_commanded_as_they_are(values: list[int], n: int) -> No
         assert spread(values, n) == evenly(*reachable(values), n)
 
 
-def test_commands_are_round_where_they_can_be() -> None:
+def test_commands_are_rounded_if_possible() -> None:
     assert evenly(0, 100, 11) == list(range(0, 101, 10))
     assert evenly(-119.31, 287.64, 11)[:3] == [-119, -79, -38]
     assert evenly(-0.04, 0.04, 2) == [-0.04, 0.04]

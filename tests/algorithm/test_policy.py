@@ -28,26 +28,26 @@ def policy(environment: str = "CartPole-v1", seed: int = 1, **values: Any) -> Po
 SEEN = [0.1, -0.2, 0.03, 0.4]
 
 
-def test_logits_are_those_of_the_behavior_function() -> None:
+def test_logits_equal_those_of_the_behavior_function() -> None:
     agent = policy(return_scale=0.02, horizon_scale=0.01)
     expected = agent.behavior.logits((np.array([SEEN], np.float32),), np.array([[100.0, 50.0]]))
     assert agent.logits(SEEN, 100.0, 50).tolist() == expected[0].tolist()
 
 
-def test_a_horizon_counts_as_one_step_at_least() -> None:
+def test_horizon_is_at_least_one_step() -> None:
     agent = policy()
     assert agent.logits(SEEN, 10.0, -7).tolist() == agent.logits(SEEN, 10.0, 1).tolist()
 
 
-def test_where_horizons_follow_from_returns_a_given_one_is_not_read() -> None:
+def test_given_horizon_is_ignored_where_horizons_follow_from_returns() -> None:
     agent = policy(desired_horizon="return")
-    told = agent.logits(SEEN, 100.5, 3).tolist()
-    assert told == agent.logits(SEEN, 100.5, 77).tolist()
-    assert told != policy().logits(SEEN, 100.5, 3).tolist()
+    found = agent.logits(SEEN, 100.5, 3).tolist()
+    assert found == agent.logits(SEEN, 100.5, 77).tolist()
+    assert found != policy().logits(SEEN, 100.5, 3).tolist()
 
 
 @pytest.mark.parametrize("temperature", [0.3, 1.0, 4.0])
-def test_actions_have_the_frequencies_that_the_probabilities_say(temperature: float) -> None:
+def test_action_frequencies_match_the_probabilities(temperature: float) -> None:
     agent = policy()
     expected = agent.probabilities(SEEN, 60.0, 60, temperature)
     n = 4000
@@ -57,7 +57,7 @@ def test_actions_have_the_frequencies_that_the_probabilities_say(temperature: fl
     assert abs(share - expected).max() < 5 * math.sqrt(0.25 / n)
 
 
-def test_a_deterministic_action_is_the_mode() -> None:
+def test_deterministic_action_is_the_mode() -> None:
     agent = policy()
     mode = int(agent.probabilities(SEEN, 60.0, 60).argmax())
     assert {agent.predict(SEEN, 60.0, 60, deterministic=True) for _ in range(50)} == {mode}
@@ -66,7 +66,7 @@ def test_a_deterministic_action_is_the_mode() -> None:
     ]
 
 
-def test_a_policy_repeats_itself_under_a_seed() -> None:
+def test_actions_repeat_under_the_same_seed() -> None:
     one, other = policy(seed=5), policy(seed=5)
     assert [one.predict(SEEN, 20.0, 20) for _ in range(60)] == [
         other.predict(SEEN, 20.0, 20) for _ in range(60)
@@ -74,7 +74,7 @@ def test_a_policy_repeats_itself_under_a_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "desired", "says"),
+    ("seen", "desired", "message"),
     [
         (SEEN[:3], (1.0, 1.0), r"an observation of shape \(3,\): expected \(4,\).*CartPole-v1"),
         (SEEN, (math.nan, 1.0), "desired return nan.*finite"),
@@ -82,20 +82,20 @@ def test_a_policy_repeats_itself_under_a_seed() -> None:
         ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation.*expected finite numbers"),
     ],
 )
-def test_what_it_cannot_be_asked(seen: Any, desired: tuple[float, float], says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_invalid_input_is_rejected(seen: Any, desired: tuple[float, float], message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         policy().predict(seen, *desired)
 
 
 @pytest.mark.parametrize("temperature", [-1.0, math.nan, math.inf])
-def test_a_temperature_is_a_finite_number_from_0_on(temperature: float) -> None:
+def test_temperature_is_a_finite_nonnegative_number(temperature: float) -> None:
     with pytest.raises(InvalidData, match="temperature"):
         policy().predict(SEEN, 1.0, 1, temperature=temperature)
     with pytest.raises(InvalidData, match="temperature"):
         policy().probabilities(SEEN, 1.0, 1, temperature)
 
 
-def test_stacked_observations_may_have_a_dimension_of_their_own() -> None:
+def test_stacked_observations_may_have_their_own_dimension() -> None:
     agent = policy(frame_stack=3)
     stack = np.arange(12, dtype=np.float32).reshape(3, 4) / 10
     assert agent.logits(stack, 9.0, 9).tolist() == agent.logits(stack.ravel(), 9.0, 9).tolist()
@@ -104,7 +104,7 @@ def test_stacked_observations_may_have_a_dimension_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("uniform", [0.0, 0.25, 0.5, 0.999999])
-def test_choosing_is_by_inverse_cdf(uniform: float) -> None:
+def test_actions_are_sampled_by_inverse_cdf(uniform: float) -> None:
     logits, space = np.log([0.2, 0.3, 0.5]), Categorical(n=3)
     expected = next(a for a, edge in enumerate([0.2, 0.5, 1.0]) if uniform < edge)
     assert space.choose(logits, 1.0, uniform) == expected
@@ -124,7 +124,7 @@ BATCHED: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("settings", BATCHED)
 @pytest.mark.parametrize("temperature", [1.0, 0.0])
-def test_a_batch_gets_the_actions_that_single_calls_get(
+def test_batch_gets_the_actions_of_single_calls(
     settings: dict[str, Any], temperature: float
 ) -> None:
     agent, other = policy(**settings), policy(**settings)
@@ -154,7 +154,7 @@ def test_a_batch_gets_the_actions_that_single_calls_get(
         assert actions.tolist() == one_by_one
 
 
-def test_a_number_is_used_for_all_rows_of_a_batch() -> None:
+def test_scalar_applies_to_all_rows_of_a_batch() -> None:
     agent = policy()
     batch = np.array([SEEN, SEEN[::-1]])
     expected = agent.logits(batch, np.array([20.0, 20.0]), np.array([30, 30])).tolist()
@@ -162,7 +162,7 @@ def test_a_number_is_used_for_all_rows_of_a_batch() -> None:
     assert agent.logits(batch, 20.0, np.array([30, 30])).tolist() == expected
 
 
-def test_rows_of_a_batch_forget_their_episodes_one_by_one() -> None:
+def test_rows_of_a_batch_are_reset_independently() -> None:
     agent = policy(memory="gru")
     batch, returns = np.array([SEEN, SEEN]), np.array([20.0, 20.0])
     first = agent.logits(batch, returns, 30).tolist()
@@ -180,7 +180,7 @@ def test_rows_of_a_batch_forget_their_episodes_one_by_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "desired", "says"),
+    ("seen", "desired", "message"),
     [
         (SEEN, ([1.0, 2.0], 1), r"an observation of shape \(4,\): expected \(2, 4\)"),
         ([SEEN, SEEN], (1.0, 1), r"an observation of shape \(2, 4\): expected \(4,\)"),
@@ -189,6 +189,6 @@ def test_rows_of_a_batch_forget_their_episodes_one_by_one() -> None:
         ([SEEN, SEEN], ([1.0, math.nan], 1), "expected finite numbers"),
     ],
 )
-def test_batches_that_do_not_fit_are_refused(seen: Any, desired: Any, says: str) -> None:
-    with pytest.raises(InvalidData, match=says):
+def test_mismatched_batch_is_rejected(seen: Any, desired: Any, message: str) -> None:
+    with pytest.raises(InvalidData, match=message):
         policy().predict(seen, *desired)

@@ -1,4 +1,4 @@
-"""The previous action and reward as a part of what is observed."""
+"""The previous action and reward as a part of the observation."""
 
 import re
 from pathlib import Path
@@ -43,7 +43,7 @@ def warm_up(settings: Config) -> list[Episode]:
 
 
 @pytest.mark.parametrize("environment", ["CartPole-v1", NESTED])
-def test_it_is_what_was_done_and_earned(environment: str) -> None:
+def test_previous_action_and_reward_are_observed(environment: str) -> None:
     env = ObservePrevious(gym.make(environment))
     space = env.env.action_space
     space.seed(1)
@@ -80,7 +80,7 @@ def test_first_previous_action_is_null(space: Any, expected: Any) -> None:
         assert np.array_equal(found, expected)
 
 
-def test_episodes_hold_it() -> None:
+def test_episodes_store_previous_action_and_reward() -> None:
     for episode in warm_up(config()):
         seen = episode.observations
         assert seen["['has_previous']"].ravel().tolist() == [0] + [1] * (episode.length - 1)
@@ -88,7 +88,7 @@ def test_episodes_hold_it() -> None:
         assert seen["['previous_reward']"].ravel().tolist() == [0, *episode.rewards[:-1].tolist()]
 
 
-def test_training_hides_it_from_a_share_of_the_examples() -> None:
+def test_training_masks_them_in_a_share_of_the_examples() -> None:
     always, never, half = (config(drop_previous=share) for share in (1.0, 0.0, 0.5))
     spec = specify(make_environment(always), always)
     episodes = warm_up(always)
@@ -109,26 +109,26 @@ def test_training_hides_it_from_a_share_of_the_examples() -> None:
 
 
 @pytest.mark.parametrize("baseline", ["none", "value", "action_value"])
-def test_a_run_does_not_depend_on_the_number_of_environments(baseline: str) -> None:
+def test_run_is_independent_of_the_number_of_environments(baseline: str) -> None:
     settings = config(baseline=baseline, frame_stack=2)
     budget = Budget(max_env_steps=400)
     runs = [algorithm1(settings, budget, n) for n in (1, 5)]
     assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
 
 
-def side_by_side(elements: list[Any]) -> Any:
-    """Return elements as Minari has them: lists where the leaves are."""
+def stacked(elements: list[Any]) -> Any:
+    """Stack elements as Minari does: one list per leaf."""
     if isinstance(elements[0], dict):
-        return {k: side_by_side([e[k] for e in elements]) for k in elements[0]}
+        return {k: stacked([e[k] for e in elements]) for k in elements[0]}
     if isinstance(elements[0], tuple):
-        return tuple(side_by_side([e[k] for e in elements]) for k in range(len(elements[0])))
+        return tuple(stacked([e[k] for e in elements]) for k in range(len(elements[0])))
     return elements
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning:minari")
 @pytest.mark.parametrize("time", [False, True])
 @pytest.mark.parametrize("environment", ["CartPole-v1", NESTED])
-def test_a_dataset_without_it_is_completed(
+def test_dataset_without_them_is_completed(
     environment: str, time: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
@@ -156,8 +156,8 @@ def test_a_dataset_without_it_is_completed(
         buffers.append(
             EpisodeBuffer(
                 id=seed,
-                observations=side_by_side(seen),
-                actions=side_by_side(done),
+                observations=stacked(seen),
+                actions=stacked(done),
                 rewards=earned,
                 terminations=[*ends, terminated],
                 truncations=[*ends, truncated],
@@ -167,7 +167,7 @@ def test_a_dataset_without_it_is_completed(
     episodes = read_dataset("some/raw-v0", settings, specify(own, settings))
     found = np.concatenate([e.observations for e in episodes])
     for name in found.dtype.names or ():
-        # A value of a Box is the nearest of its bins to this environment, and not to the other.
+        # The nearest bin of a Box differs between this environment and the dataset.
         if not name.startswith("['previous_action']['legs']") and "reward" not in name:
             assert np.array_equal(found[name], np.array(expected)[name]), name
 
@@ -187,7 +187,7 @@ def test_wrappers_are_applied_in_order() -> None:
     assert all(e.length <= 5 for e in warm_up(limited))
 
 
-def test_wrappers_take_literals_as_arguments() -> None:
+def test_wrappers_take_literal_arguments() -> None:
     settings = config(
         observe_previous=False,
         wrappers=["gymnasium.wrappers:FrameStackObservation(stack_size=3, padding_type='zero')"],
@@ -197,7 +197,7 @@ def test_wrappers_take_literals_as_arguments() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrapper", "says"),
+    ("wrapper", "message"),
     [
         ("FlattenObservation", "there is no colon"),
         ("gymnasium.wrappers:FrameStackObservation(3)", "arguments need names"),
@@ -209,13 +209,13 @@ def test_wrappers_take_literals_as_arguments() -> None:
         ("gymnasium.wrappers:TransformObservation", "TypeError"),
     ],
 )
-def test_wrappers_that_cannot_be_applied_are_refused(wrapper: str, says: str) -> None:
+def test_inapplicable_wrapper_is_rejected(wrapper: str, message: str) -> None:
     with pytest.raises(
-        UnsupportedEnvironment, match=f"{re.escape(wrapper)}.*{says}.*package.module:Wrapper"
+        UnsupportedEnvironment, match=f"{re.escape(wrapper)}.*{message}.*package.module:Wrapper"
     ):
         make_environment(config(wrappers=[wrapper]))
 
 
-def test_to_drop_what_is_not_observed_has_no_effect() -> None:
+def test_drop_previous_without_observe_previous_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"drop_previous = 0.25 .* needs observe_p"):
         refuse_ineffective(config(observe_previous=False), ["drop_previous"])

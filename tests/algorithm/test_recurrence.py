@@ -1,4 +1,4 @@
-"""Memory: acting and training remember the same, and agents use it."""
+"""Memory: acting and training have equal states, and agents learn to use them."""
 
 from typing import Any
 
@@ -71,13 +71,13 @@ def played(config: Config) -> list[Episode]:
 
 
 @pytest.mark.parametrize("baseline", ["none", "value", "action_value"])
-def test_a_run_does_not_depend_on_the_number_of_environments(baseline: str) -> None:
+def test_run_is_independent_of_the_number_of_environments(baseline: str) -> None:
     config = settings(baseline=baseline)
     runs = [algorithm1(config, Budget(max_env_steps=500), n) for n in (1, 7)]
     assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
 
 
-def test_what_has_to_be_remembered_is_learned_with_a_memory_only() -> None:
+def test_recall_is_learned_with_a_memory_only() -> None:
     found = {}
     for memory in ("gru", "none"):
         run = algorithm1(settings(memory=memory, baseline="value"), Budget(max_env_steps=4000))
@@ -86,7 +86,7 @@ def test_what_has_to_be_remembered_is_learned_with_a_memory_only() -> None:
     assert found["none"] < 0.75
 
 
-def test_training_remembers_what_acting_remembers() -> None:
+def test_acting_and_training_have_equal_states() -> None:
     config = settings(environment="CartPole-v1", baseline="value", max_episode_steps=50)
     episodes = played(config)[:6]
     generator = EpisodeGenerator(config, 1)
@@ -128,7 +128,7 @@ def test_windows_cover_every_step_once() -> None:
     assert found == [(rank, t) for rank, n in enumerate(lengths) for t in range(n)]
 
 
-def test_a_batch_is_windows_of_consecutive_steps() -> None:
+def test_batch_consists_of_windows_of_consecutive_steps() -> None:
     config = settings(observe_previous=True, drop_previous=0.5)
     episodes = played(config)
     generator = EpisodeGenerator(config, 1)
@@ -152,7 +152,7 @@ def test_a_batch_is_windows_of_consecutive_steps() -> None:
         assert batch.counted(batch.command).shape == (int(batch.valid.sum()), 2)
 
 
-def test_training_goes_on_where_it_was() -> None:
+def test_training_resumes_with_identical_results() -> None:
     config = settings(baseline="action_value", normalise_observations=True)
     episodes = played(config)
     spec = EpisodeGenerator(config, 1).spec
@@ -172,7 +172,7 @@ def test_training_goes_on_where_it_was() -> None:
     assert encode_optimizer(resumed) == encode_optimizer(straight)
 
 
-def test_a_policy_remembers_until_it_is_reset_and_a_rollout_by_itself() -> None:
+def test_policy_keeps_its_state_until_reset_and_rollout_has_its_own() -> None:
     config = settings()
     generator = EpisodeGenerator(config, 1)
     graph = acting_graph(config.network, generator.spec)
@@ -192,12 +192,12 @@ def test_a_policy_remembers_until_it_is_reset_and_a_rollout_by_itself() -> None:
     assert actions == episode.actions.tolist()
 
     first, _ = env.reset(seed=1)
-    told = policy.logits(first, 1.0, 5).tolist()
-    assert policy.logits(first, 1.0, 5).tolist() == told
+    logits = policy.logits(first, 1.0, 5).tolist()
+    assert policy.logits(first, 1.0, 5).tolist() == logits
     policy.predict(first, 1.0, 5)
-    assert policy.logits(first, 1.0, 5).tolist() != told
+    assert policy.logits(first, 1.0, 5).tolist() != logits
     policy.reset()
-    assert policy.logits(first, 1.0, 5).tolist() == told
+    assert policy.logits(first, 1.0, 5).tolist() == logits
 
 
 def test_all_segments_have_no_windows() -> None:

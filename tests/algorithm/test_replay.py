@@ -8,7 +8,7 @@ from udrl.config import COMMANDS_PER_ITERATION, build
 from udrl.replay import Entry, ReplayBuffer
 from udrl.setting_groups import BufferSettings
 
-# Few different returns, so that there are many ties; batches of episodes, as iterations bring them.
+# Few different returns cause many ties. Episodes arrive in batches, one for each iteration.
 batches = st.lists(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), max_size=6), max_size=8)
 capacities = st.integers(1, 10)
 recents = st.integers(0, 10)
@@ -29,7 +29,7 @@ def numbered(batches: list[list[float]]) -> list[list[Entry]]:
 
 
 def top_k(seen: list[Entry], k: int) -> list[Entry]:
-    """Throw away the oldest of the worst until k are left; then sort, the newer after the older."""
+    """Remove the oldest of the worst until k remain; then sort, ties by age."""
     left = list(seen)
     while len(left) > k:
         worst = min(entry.episode_return for entry in left)
@@ -40,7 +40,7 @@ def top_k(seen: list[Entry], k: int) -> list[Entry]:
 
 
 @given(batches, capacities, recents)
-def test_the_buffer_is_the_top_k_of_all_episodes_seen_and_the_newest(
+def test_buffer_holds_the_top_k_of_all_episodes_and_the_newest(
     batches: list[list[float]], capacity: int, recent: int
 ) -> None:
     buffer = ReplayBuffer(settings(capacity, recent))
@@ -57,14 +57,14 @@ def test_the_buffer_is_the_top_k_of_all_episodes_seen_and_the_newest(
 
 
 @given(batches, capacities, recents, st.integers(1, 4))
-def test_with_an_age_limit_the_best_of_the_last_iterations_are_kept(
+def test_age_limit_keeps_the_best_of_the_last_iterations(
     batches: list[list[float]], capacity: int, recent: int, max_age: int
 ) -> None:
     buffer = ReplayBuffer(settings(capacity, recent, max_age))
     held: list[Entry] = []
     for n, entries in enumerate(numbered(batches)):
         held += entries
-        if entries:  # an iteration without episodes says nothing of the time
+        if entries:  # an iteration without episodes does not advance the age
             held = [e for e in held if n - e.id // COMMANDS_PER_ITERATION < max_age]
         newest = held[len(held) - min(recent, len(held)) :]
         held = [e for e in held if e in newest or e in top_k(held, capacity)]
@@ -73,7 +73,7 @@ def test_with_an_age_limit_the_best_of_the_last_iterations_are_kept(
 
 
 @given(batches, capacities, st.randoms(use_true_random=False))
-def test_the_order_in_which_episodes_arrive_does_not_matter_to_the_best(
+def test_best_episodes_do_not_depend_on_the_order_of_arrival(
     batches: list[list[float]], capacity: int, random: Random
 ) -> None:
     straight, shuffled = ReplayBuffer(settings(capacity)), ReplayBuffer(settings(capacity))
@@ -86,7 +86,7 @@ def test_the_order_in_which_episodes_arrive_does_not_matter_to_the_best(
 
 
 @given(batches, capacities, st.integers(1, 12))
-def test_the_best_are_the_last_and_all_when_there_are_fewer(
+def test_best_n_are_the_last_or_all_if_there_are_fewer(
     batches: list[list[float]], capacity: int, n: int
 ) -> None:
     buffer = ReplayBuffer(settings(capacity))
@@ -98,7 +98,7 @@ def test_the_best_are_the_last_and_all_when_there_are_fewer(
     assert everything[len(everything) - len(best) :] == best
 
 
-def test_of_equal_returns_the_newer_ranks_higher_and_the_oldest_leaves_first() -> None:
+def test_ties_rank_newer_episodes_higher_and_evict_the_oldest_first() -> None:
     buffer = ReplayBuffer(settings(3))
     assert buffer.admit([Entry(500.0, i, 500) for i in (3, 1, 2)]) == []
     assert [entry.id for entry in buffer] == [1, 2, 3]
@@ -106,7 +106,7 @@ def test_of_equal_returns_the_newer_ranks_higher_and_the_oldest_leaves_first() -
     assert [entry.id for entry in buffer] == [2, 3, 4]
 
 
-def test_a_new_episode_that_is_not_good_enough_leaves_at_once() -> None:
+def test_new_episode_below_the_buffers_minimum_is_discarded() -> None:
     buffer = ReplayBuffer(settings(2))
     buffer.admit([Entry(1.0, 1, 1), Entry(2.0, 2, 1)])
     assert buffer.admit([Entry(0.0, 3, 1)]) == [Entry(0.0, 3, 1)]
@@ -114,7 +114,7 @@ def test_a_new_episode_that_is_not_good_enough_leaves_at_once() -> None:
 
 
 @given(batches, capacities, recents, ages, st.randoms(use_true_random=False))
-def test_a_restored_buffer_goes_on_like_one_that_never_stopped(
+def test_restored_buffer_behaves_like_the_original(
     batches: list[list[float]], capacity: int, recent: int, max_age: int | None, random: Random
 ) -> None:
     config = settings(capacity, recent, max_age)
@@ -128,6 +128,6 @@ def test_a_restored_buffer_goes_on_like_one_that_never_stopped(
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1), (2, 3, 1)])
-def test_a_buffer_is_restored_from_its_entries_in_any_order(order: tuple[int, ...]) -> None:
+def test_buffer_is_restored_from_entries_in_any_order(order: tuple[int, ...]) -> None:
     buffer = ReplayBuffer(settings(3), [Entry(float(i), i, 1) for i in order])
     assert [entry.id for entry in buffer] == [1, 2, 3]

@@ -45,7 +45,7 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
 
 
 @pytest.mark.parametrize(
-    ("told", "settings"),
+    ("given", "settings"),
     [
         ({}, {}),
         ({"temperature": 0.0}, {}),
@@ -58,11 +58,11 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
         ({"desired_return": 500.0}, {"max_return": 20.0}),
     ],
 )
-def test_left_alone_it_makes_the_episode_of_its_command(
-    told: dict[str, Any], settings: dict[str, Any]
+def test_rollout_makes_the_episode_of_its_command(
+    given: dict[str, Any], settings: dict[str, Any]
 ) -> None:
     policy, env = agent(**settings)
-    order = command(**told)
+    order = command(**given)
     (expected,) = generate_episodes(EpisodeGenerator(policy.config, 3), [order], policy.behavior)
     rollout = Rollout(policy, env, order)
     actions, rewards = [], []
@@ -76,7 +76,7 @@ def test_left_alone_it_makes_the_episode_of_its_command(
     assert rollout.steps == expected.length
 
 
-def test_the_command_counts_down() -> None:
+def test_command_counts_down() -> None:
     policy, env = agent()
     rollout = Rollout(policy, env, command())
     for _ in range(3):
@@ -84,7 +84,7 @@ def test_the_command_counts_down() -> None:
     assert (rollout.desired_return, rollout.desired_horizon) == (77.0, 57)
 
 
-def test_a_command_given_on_the_way_is_what_the_next_action_follows() -> None:
+def test_changed_command_applies_to_the_next_action() -> None:
     policy, env = agent()
     rollout = Rollout(policy, env, command())
     rollout.step()
@@ -98,7 +98,7 @@ def test_a_command_given_on_the_way_is_what_the_next_action_follows() -> None:
     assert (rollout.desired_return, rollout.desired_horizon) == (499.0, 8)
 
 
-def test_what_is_told_is_bounded_as_in_evaluations() -> None:
+def test_command_is_bounded_as_in_evaluations() -> None:
     policy, env = agent()
     rollout = Rollout(policy, env, command(desired_return=300.0, cap=100.0))
     assert rollout.desired_return == 100.0
@@ -107,7 +107,7 @@ def test_what_is_told_is_bounded_as_in_evaluations() -> None:
     assert rollout.desired_horizon == math.floor(33.9)
 
 
-def test_a_picture_is_what_the_environment_renders() -> None:
+def test_frame_is_the_environments_rendering() -> None:
     policy, _ = agent()
     kwargs = {"render_mode": "rgb_array"}
     env = make_environment(msgspec.structs.replace(policy.config, environment_kwargs=kwargs))
@@ -121,7 +121,7 @@ def test_a_picture_is_what_the_environment_renders() -> None:
     env.close()
 
 
-def test_an_environment_that_renders_nothing_is_told_so() -> None:
+def test_environment_without_rendering_is_reported() -> None:
     policy, env = agent()
     with (
         pytest.warns(UserWarning, match="render"),
@@ -135,7 +135,7 @@ class Broken(gym.Wrapper[Any, Any, Any, Any]):
         raise RuntimeError("the wheels came off")
 
 
-def test_an_environment_that_breaks_is_named() -> None:
+def test_failing_environment_is_reported() -> None:
     policy, env = agent()
     rollout = Rollout(policy, Broken(env), command())
     with pytest.raises(EnvironmentFault, match=r"0 steps.*seed 11: step\(\) .*wheels came off"):

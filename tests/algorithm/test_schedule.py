@@ -6,7 +6,7 @@ from udrl.schedule import evaluation_due, opened_by, weights_version
 leads = st.integers(0, 64)
 
 
-def test_without_lead_every_iteration_acts_with_the_weights_just_trained() -> None:
+def test_without_lead_each_iteration_acts_with_the_weights_just_trained() -> None:
     assert [weights_version(i, lead=0) for i in range(5)] == [0, 1, 2, 3, 4]
     assert [list(opened_by(i, lead=0)) for i in range(4)] == [[1], [2], [3], [4]]
 
@@ -17,7 +17,7 @@ def test_with_lead_acting_runs_ahead_of_training() -> None:
 
 
 @given(leads, st.integers(0, 200))
-def test_commands_come_from_the_buffer_that_their_weights_were_trained_on(
+def test_commands_use_the_buffer_that_their_weights_were_trained_on(
     lead: int, completed: int
 ) -> None:
     for iteration in range(1, 300):
@@ -32,7 +32,7 @@ def test_every_iteration_is_opened_once_and_in_order(lead: int, n: int) -> None:
 
 
 @given(st.integers(0, 500), st.integers(1, 500), st.integers(1, 100), st.integers(0, 3))
-def test_an_evaluation_is_due_when_a_multiple_was_passed(
+def test_evaluation_is_due_when_a_multiple_is_passed(
     before: int, steps: int, every: int, completed: int
 ) -> None:
     after = before + steps
@@ -41,13 +41,13 @@ def test_an_evaluation_is_due_when_a_multiple_was_passed(
     assert evaluation_due(completed, before, after, every) == bool(passed)
 
 
-def test_a_multiple_counts_when_it_is_reached_and_only_once() -> None:
+def test_multiple_counts_once_when_it_is_reached() -> None:
     assert not evaluation_due(1, 80, 99, every=100)
     assert evaluation_due(2, 99, 100, every=100)
     assert not evaluation_due(3, 100, 199, every=100)
     assert evaluation_due(4, 199, 450, every=100)
 
 
-def test_the_warm_up_counts_from_zero() -> None:
+def test_warm_up_counts_from_zero() -> None:
     assert evaluation_due(0, 120, 120, every=100)
     assert not evaluation_due(0, 80, 80, every=100)

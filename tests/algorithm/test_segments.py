@@ -38,7 +38,7 @@ def experience(replay_size: int, max_steps: int) -> Experience:
 
 
 def random_episode(episode_id: int, length: int) -> Episode:
-    """An episode with rewards that are multiples of 1/8, so that every sum of them is exact."""
+    """An episode whose rewards are multiples of 1/8, so that all sums are exact."""
     rng = np.random.default_rng(episode_id)
     return Episode(
         command_id=episode_id,
@@ -76,7 +76,7 @@ def gathered(held: Experience, ids: list[int], wanted: list[tuple[int, int, int]
 
 
 @pytest.mark.parametrize("length", [1, 2, 9])
-def test_every_segment_of_an_episode_makes_the_papers_example(length: int) -> None:
+def test_every_segment_makes_the_papers_example(length: int) -> None:
     episode = random_episode(5, length)
     held = experience(replay_size=1, max_steps=length)
     held.add(episode)
@@ -85,7 +85,7 @@ def test_every_segment_of_an_episode_makes_the_papers_example(length: int) -> No
 
 
 @given(st.lists(st.floats(-1e4, 1e4, width=32), min_size=1, max_size=40))
-def test_the_desired_return_is_the_exact_sum_up_to_rounding(rewards: list[float]) -> None:
+def test_desired_return_is_the_exact_sum_up_to_rounding(rewards: list[float]) -> None:
     n = len(rewards)
     held = experience(replay_size=1, max_steps=n)
     held.add(
@@ -105,7 +105,7 @@ def test_the_desired_return_is_the_exact_sum_up_to_rounding(rewards: list[float]
         assert abs(Fraction(desired_return) - exact) < 1e-9
 
 
-def test_an_example_has_the_types_that_training_reads() -> None:
+def test_example_has_the_dtypes_that_training_reads() -> None:
     held = experience(replay_size=1, max_steps=4)
     held.add(random_episode(0, 4))
     examples = held.by_rank([0]).examples(Segments(*np.array([[0], [1], [4]])))
@@ -115,7 +115,7 @@ def test_an_example_has_the_types_that_training_reads() -> None:
 
 
 def draw_one(u: tuple[float, float, float], lengths: list[int], kind: Kind) -> tuple[int, int, int]:
-    """An episode uniformly, then the times uniformly."""
+    """Draw an episode uniformly, then the times uniformly."""
     rank = int(u[0] * len(lengths))
     length = lengths[rank]
     if kind == "trailing":
@@ -134,7 +134,7 @@ units = st.floats(0, 1, exclude_max=True)
     lengths=st.lists(st.integers(1, 1000), min_size=1, max_size=5),
     uniforms=st.lists(st.tuples(units, units, units), min_size=1),
 )
-def test_segments_are_drawn_as_a_loop_over_examples_would(
+def test_segments_equal_those_of_a_loop_over_examples(
     kind: Kind, lengths: list[int], uniforms: list[tuple[float, float, float]]
 ) -> None:
     drawn = draw_segments(np.array(uniforms).T, np.array(lengths), kind)
@@ -153,7 +153,7 @@ def chi_square(counts: npt.NDArray[np.int64], probabilities: npt.NDArray[np.floa
 
 
 @pytest.mark.parametrize("kind", ["trailing", "all"])
-def test_episodes_are_equally_likely_and_so_are_an_episodes_segments(kind: Kind) -> None:
+def test_episodes_and_their_segments_are_equally_likely(kind: Kind) -> None:
     lengths = [1, 2, 3, 7]
     possible: list[tuple[int, int, int]] = []
     probabilities: list[float] = []
@@ -172,7 +172,7 @@ def test_episodes_are_equally_likely_and_so_are_an_episodes_segments(kind: Kind)
 
 
 @pytest.mark.parametrize("kind", ["trailing", "all"])
-def test_segments_keep_the_shape_of_the_numbers_they_are_made_of(kind: Kind) -> None:
+def test_segments_keep_the_shape_of_their_random_numbers(kind: Kind) -> None:
     numbers = uniform_numbers(6)
     flat = draw_segments(numbers, np.array([4, 5]), kind)
     shaped = draw_segments(numbers.reshape(3, 2, 3), np.array([4, 5]), kind)
@@ -182,7 +182,7 @@ def test_segments_keep_the_shape_of_the_numbers_they_are_made_of(kind: Kind) -> 
 
 @pytest.mark.parametrize("first_pages", [1, 256])
 @pytest.mark.parametrize("length", [1, 63, 64, 65, 128, 200])
-def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(
+def test_episodes_of_any_length_cross_page_boundaries(
     length: int, first_pages: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(segments, "_MIN_PAGES", first_pages)
@@ -200,25 +200,27 @@ def test_episodes_of_any_length_fit_and_are_found_at_page_boundaries(
     assert gathered(held, [0, 1, 2], wanted) == expected
 
 
-def test_memory_is_taken_by_need_whatever_the_step_limit() -> None:
+def test_memory_is_allocated_on_demand_for_any_step_limit() -> None:
     held = experience(replay_size=500, max_steps=2**31)
     for i in range(20):
         held.add(random_episode(i, 100))
     assert sum(a.nbytes for a in vars(held).values() if isinstance(a, np.ndarray)) < 1e6
 
 
-def test_too_little_memory_is_refused_with_what_to_lower(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_left(array: Any, more: int) -> Any:
+def test_insufficient_memory_is_rejected_with_the_settings_to_lower(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_memory(array: Any, more: int) -> Any:
         raise MemoryError
 
     held = experience(replay_size=3, max_steps=200)
-    monkeypatch.setattr(segments, "_longer", none_left)
+    monkeypatch.setattr(segments, "_longer", no_memory)
     with pytest.raises(ConfigError, match=r"memory for 16,384 steps.*lower replay_size"):
         held.add(random_episode(1, 100))
 
 
-class ExperienceAsADictionary(RuleBasedStateMachine):
-    """Episodes come and go at random; what is held must be what a dictionary would hold."""
+class ExperienceMachine(RuleBasedStateMachine):
+    """Random additions and removals, compared with a dictionary."""
 
     replay_size, max_steps = 4, 150
 
@@ -263,10 +265,10 @@ class ExperienceAsADictionary(RuleBasedStateMachine):
         ]
 
     @invariant()
-    def ids_are_those_of_the_dictionary(self) -> None:
+    def ids_equal_those_of_the_dictionary(self) -> None:
         assert self.held.ids() == set(self.model)
         assert all(i in self.held for i in self.model)
 
 
-TestExperienceAsADictionary = ExperienceAsADictionary.TestCase
-TestExperienceAsADictionary.settings = settings(max_examples=50, stateful_step_count=30)
+TestExperienceMachine = ExperienceMachine.TestCase
+TestExperienceMachine.settings = settings(max_examples=50, stateful_step_count=30)

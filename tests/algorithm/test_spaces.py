@@ -1,4 +1,4 @@
-"""Observations and actions: what is of a space, and what is made of numbers."""
+"""Observation and action spaces: which elements they accept, and how they are encoded."""
 
 from typing import Any
 
@@ -60,7 +60,7 @@ def elements(space: Space, n: int) -> Any:
 
 
 @pytest.mark.parametrize("space", SPACES, ids=str)
-def test_elements_have_the_shape_and_dtype_that_are_said(space: Space) -> None:
+def test_elements_have_the_declared_shape_and_dtype(space: Space) -> None:
     values = elements(space, 6)
     assert values.shape == (6, *space.shape)
     assert space.fault(values, 6) is None
@@ -68,7 +68,7 @@ def test_elements_have_the_shape_and_dtype_that_are_said(space: Space) -> None:
 
 
 @pytest.mark.parametrize("space", SPACES, ids=str)
-def test_other_shapes_and_dtypes_are_not_of_the_space(space: Space) -> None:
+def test_other_shapes_and_dtypes_are_rejected(space: Space) -> None:
     values = elements(space, 6)
     for other in (values[..., None], values.astype(np.float64)):
         found = space.fault(other, 6)
@@ -78,12 +78,12 @@ def test_other_shapes_and_dtypes_are_not_of_the_space(space: Space) -> None:
 
 
 @pytest.mark.parametrize("space", [Category(n=7), Categorical(n=7)], ids=str)
-def test_indices_outside_are_named(space: Space) -> None:
+def test_index_out_of_range_is_rejected(space: Space) -> None:
     assert space.fault(np.array([0, 7], space.dtype), 2) == "from 0 to 7, expected 0 to 6"
 
 
 @pytest.mark.parametrize("space", [Categories(ns=(9, 3)), Product(ns=(9, 3))], ids=str)
-def test_indices_outside_are_named_with_their_component(space: Space) -> None:
+def test_index_out_of_range_is_rejected_with_its_component(space: Space) -> None:
     found = space.fault(np.array([[8, 2], [0, 3]], space.dtype), 2)
     assert found == "from 2 to 3, expected 0 to 2 in component 1"
 
@@ -104,21 +104,21 @@ def test_elements_of_a_record_are_structures_without_padding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("leaf", "value", "says"),
+    ("leaf", "value", "message"),
     [
         ("['bag'][0]", np.nan, "not all finite numbers in ['bag'][0]"),
         ("['bag'][1]['deep']", 2, "not all 0 or 1 in ['bag'][1]['deep']"),
         ("['here']", 7, "from 0 to 7, expected 0 to 6 in ['here']"),
     ],
 )
-def test_what_is_impossible_in_a_record_is_named(leaf: str, value: Any, says: str) -> None:
+def test_fault_in_a_record_names_the_leaf(leaf: str, value: Any, message: str) -> None:
     values = np.zeros(3, RECORD.dtype)
     values[leaf][1] = value
-    assert RECORD.fault(values, 3) == says
+    assert RECORD.fault(values, 3) == message
     assert "expected" in str(RECORD.fault(values["['bag'][0]"], 3))
 
 
-def test_leaves_have_names_of_their_own() -> None:
+def test_leaf_names_are_unique() -> None:
     twice = [msgspec.to_builtins(Leaf(("a",), Bits(size=1)))] * 2
     with pytest.raises(msgspec.ValidationError, match="two leaves have the same name"):
         msgspec.convert({"kind": "record", "leaves": twice}, ObservationSpace)
@@ -130,21 +130,23 @@ def test_vectors_are_finite(value: float) -> None:
 
 
 @pytest.mark.parametrize("space", [*OBSERVATIONS, RECORD], ids=str)
-def test_observations_survive_the_wire_and_gymnasium(space: ObservationSpace) -> None:
+def test_observation_space_round_trips_through_message_and_gymnasium(
+    space: ObservationSpace,
+) -> None:
     encoded = msgspec.msgpack.encode(space)
     assert msgspec.msgpack.decode(encoded, type=ObservationSpace) == space
     assert observation_conversion(space.gymnasium).plain == space
 
 
 @pytest.mark.parametrize("space", ACTIONS, ids=str)
-def test_actions_survive_the_wire_and_gymnasium(space: ActionSpace) -> None:
+def test_action_space_round_trips_through_message_and_gymnasium(space: ActionSpace) -> None:
     encoded = msgspec.msgpack.encode(space)
     assert msgspec.msgpack.decode(encoded, type=ActionSpace) == space
     assert action_conversion(space.gymnasium, ActionSettings()).plain == space
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8, np.int32])
-def test_noise_is_of_every_space_of_the_dtype(dtype: Any) -> None:
+def test_noise_is_within_the_space(dtype: Any) -> None:
     made = noise(Stream(stream_key(1, Purpose.PROBE)), np.dtype(dtype), (500, 3))
     assert (made.shape, made.dtype) == ((500, 3), dtype)
     bounds = {np.float32: (-2.0, 2.0), np.uint8: (0, 255), np.int32: (0, 0)}[dtype]
@@ -172,13 +174,13 @@ def test_actions_are_sampled_by_inverse_cdf(rows: list[list[float]], data: st.Da
 
 
 @given(st.integers(1, 300), st.lists(units, min_size=1, max_size=20))
-def test_without_logits_all_actions_are_as_likely(n: int, u: list[float]) -> None:
+def test_actions_are_uniform_without_logits(n: int, u: list[float]) -> None:
     space, numbers = Categorical(n=n), np.array(u)
     flat = np.zeros((len(u), n)), np.ones((len(u), 1))
     assert space.uniform(numbers).tolist() == [int(x * n) for x in u]
     assert space.sample(*flat, numbers).tolist() == space.uniform(numbers).tolist()
 
 
-def test_a_record_prints_its_leaves_as_python_finds_them() -> None:
+def test_record_lists_its_leaves_as_python_expressions() -> None:
     leaves = (Leaf(("map", 1), Vector(size=2)), Leaf(("time",), Category(n=3)))
     assert str(Record(leaves)) == "['map'][1]: Vector(size=2), ['time']: Category(n=3)"

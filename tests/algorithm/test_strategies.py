@@ -32,7 +32,7 @@ def strategy(name: str) -> Any:
 
 
 @given(BEST, U)
-def test_uniform_asks_for_returns_in_m_to_m_plus_s_and_the_mean_length(
+def test_uniform_draws_returns_from_m_to_m_plus_s_with_the_mean_length(
     best: list[Entry], u: float
 ) -> None:
     n = len(best)
@@ -44,31 +44,31 @@ def test_uniform_asks_for_returns_in_m_to_m_plus_s_and_the_mean_length(
 
 
 @given(BEST)
-def test_ranked_asks_for_one_of_the_k_best_with_probability_sqrt_k_of_n(best: list[Entry]) -> None:
+def test_ranked_draws_one_of_the_k_best_with_probability_sqrt_k_of_n(best: list[Entry]) -> None:
     n, tries = len(best), 1_000
-    asked = [strategy("ranked")(best, (i + 0.5) / tries) for i in range(tries)]
+    drawn = [strategy("ranked")(best, (i + 0.5) / tries) for i in range(tries)]
     for k in range(1, n + 1):
         kept = [(e.episode_return, e.length) for e in best[n - k :]]
-        share = sum(one in kept for one in asked) / tries
+        share = sum(one in kept for one in drawn) / tries
         others = [(e.episode_return, e.length) for e in best[: n - k]]
         if not set(kept) & set(others):
             assert abs(share - sqrt(k / n)) < 2 / tries
 
 
 @given(BEST, U)
-def test_maximum_asks_for_the_greatest_return_in_the_mean_length(
+def test_maximum_commands_the_greatest_return_with_the_mean_length(
     best: list[Entry], u: float
 ) -> None:
     assert strategy("maximum")(best, u) == (500.0, strategy("uniform")(best, u)[1])
 
 
-def test_maximum_needs_a_greatest_return() -> None:
+def test_maximum_requires_a_greatest_return() -> None:
     with pytest.raises(ConfigError, match=r"max_return is not set; set it, e\.g\. --set"):
         make_strategy(config(command_strategy="maximum"))
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_every_strategy_is_a_function_of_its_arguments(name: str) -> None:
+def test_strategy_is_a_function_of_its_arguments(name: str) -> None:
     best = [Entry(float(n), n, n + 1) for n in range(10)]
     first = [strategy(name)(best, u / 7) for u in range(7)]
     again = strategy(name)
@@ -76,7 +76,7 @@ def test_every_strategy_is_a_function_of_its_arguments(name: str) -> None:
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def custom_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (tmp_path / "own_strategies.py").write_text(
         "class Patient:\n"
         "    def __init__(self, config):\n"
@@ -104,13 +104,13 @@ def buffer() -> ReplayBuffer:
     return ReplayBuffer(config().buffer, [Entry(1.0, 1, 10), Entry(5.0, 2, 20)])
 
 
-def test_your_own_is_named_by_module_and_class(own: str) -> None:
-    sampler = CommandSampler(config(command_strategy=f"{own}:Patient", seed=9), SPEC)
+def test_custom_strategy_is_named_by_module_and_class(custom_module: str) -> None:
+    sampler = CommandSampler(config(command_strategy=f"{custom_module}:Patient", seed=9), SPEC)
     commands = sampler.explore(1, buffer())
     assert {(c.desired_return, c.desired_horizon) for c in commands} == {(10.0, 40)}
 
 
-def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
+def test_evaluation_commands_do_not_use_the_strategy() -> None:
     sampler = CommandSampler(config(command_strategy="not.there:Missing"), SPEC)
     assert {(c.desired_return, c.desired_horizon) for c in sampler.evaluate(1, buffer())} == {
         (3.0, 15)
@@ -118,46 +118,48 @@ def test_evaluations_stay_the_papers_and_need_no_strategy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("cautious", r"expected uniform, ranked, maximum, or a class of your own"),
         ("not.there:Missing", r"ModuleNotFoundError.*PYTHONPATH"),
         ("udrl.strategies:Missing", "AttributeError"),
     ],
 )
-def test_what_cannot_be_imported_is_refused(name: str, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_strategy_that_fails_to_import_is_rejected(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         strategy(name)
 
 
-def test_what_cannot_be_made_is_refused(own: str) -> None:
+def test_strategy_that_cannot_be_constructed_is_rejected(custom_module: str) -> None:
     with pytest.raises(ConfigError, match=r"own_strategies:Needy.*TypeError"):
-        strategy(f"{own}:Needy")
+        strategy(f"{custom_module}:Needy")
 
 
-def test_a_strategy_that_fails_is_named(own: str) -> None:
+def test_exception_of_a_strategy_is_reported(custom_module: str) -> None:
     with pytest.raises(ConfigError, match="Broken failed: ZeroDivisionError"):
-        choose_command(strategy(f"{own}:Broken"), [Entry(1.0, 1, 1)], 0.5)
+        choose_command(strategy(f"{custom_module}:Broken"), [Entry(1.0, 1, 1)], 0.5)
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "desired",
     [(float("nan"), 3), (float("inf"), 3), (1e300, 3), (1.0, 2**31), None, (1.0,), ("a lot", 3)],
 )
-def test_what_no_command_can_be_is_refused(asked: Any) -> None:
+def test_invalid_desired_return_is_rejected(desired: Any) -> None:
     class Odd:
         def __init__(self, config: Config) -> None:
             pass
 
         def __call__(self, best: Sequence[Entry], u: float) -> Any:
-            return asked
+            return desired
 
     with pytest.raises(ConfigError, match="Odd"):
         choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5)
 
 
-@pytest.mark.parametrize(("horizon", "said"), [(0, 1), (-5, 1), (2.9, 2)])
-def test_a_horizon_is_a_whole_number_of_at_least_one(horizon: float, said: int) -> None:
+@pytest.mark.parametrize(("horizon", "expected"), [(0, 1), (-5, 1), (2.9, 2)])
+def test_horizon_is_truncated_to_a_whole_number_of_at_least_one(
+    horizon: float, expected: int
+) -> None:
     class Odd:
         def __init__(self, config: Config) -> None:
             pass
@@ -165,4 +167,4 @@ def test_a_horizon_is_a_whole_number_of_at_least_one(horizon: float, said: int) 
         def __call__(self, best: Sequence[Entry], u: float) -> Any:
             return 1.0, horizon
 
-    assert choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, said)
+    assert choose_command(Odd(config()), [Entry(1.0, 1, 1)], 0.5) == (1.0, expected)

@@ -38,7 +38,7 @@ def test_numbers_are_pinned() -> None:
     assert stream.integers(3, 1_000_000, 10_000_000).tolist() == [6970033, 3536741, 9531674]
 
 
-def test_numbers_are_philox_with_the_counter_from_one() -> None:
+def test_numbers_are_philox_with_a_counter_from_one() -> None:
     key = stream_key(7, Purpose.EPISODE, 11, 13)
     words = [
         word
@@ -48,7 +48,7 @@ def test_numbers_are_philox_with_the_counter_from_one() -> None:
     assert Stream(key).uniforms(100).tolist() == [(word >> 11) / 2**53 for word in words]
 
 
-def test_drawing_in_parts_gives_the_same_numbers_as_drawing_at_once() -> None:
+def test_numbers_drawn_in_parts_equal_those_drawn_at_once() -> None:
     key = stream_key(1, Purpose.EPISODE)
     parts, whole = Stream(key), Stream(key).uniforms(1024)
     cuts = [0, 1, 3, 6, 513, 1024]
@@ -82,7 +82,7 @@ def test_integers_are_uniform_in_a_half_open_range() -> None:
         (13, Purpose.EPISODE, 4, 0),
     ],
 )
-def test_every_part_of_the_address_names_another_stream(
+def test_every_part_of_the_address_changes_the_stream(
     other: tuple[int, Purpose, int, int],
 ) -> None:
     assert stream_key(1, Purpose.EPISODE, 3, 4) != stream_key(*other)

@@ -12,7 +12,7 @@ def target(**values: Any) -> ReturnInTime:
     return ReturnInTime(build(NetworkSettings, values))
 
 
-def test_counting_down_is_lines_8_9_and_11_of_algorithm_2() -> None:
+def test_countdown_equals_lines_8_9_and_11_of_algorithm_2() -> None:
     desired = np.array([[10.0, 5.0], [3.0, 1.0]])
     target().advance(desired, np.array([2.5, -1.0], np.float32))
     assert desired.tolist() == [[7.5, 4.0], [4.0, 0.0]]
@@ -24,19 +24,21 @@ def test_desired_return_never_exceeds_the_cap() -> None:
     assert desired.tolist() == [[11.0, 5.0], [12.0, 5.0]]
 
 
-@pytest.mark.parametrize(("horizon", "said"), [(7, 7), (0, 1), (-3, 1)])
-def test_horizon_is_one_step_at_least(horizon: int, said: int) -> None:
-    assert target().initial(2.5, horizon) == (2.5, said)
+@pytest.mark.parametrize(("horizon", "expected"), [(7, 7), (0, 1), (-3, 1)])
+def test_horizon_is_at_least_one_step(horizon: int, expected: int) -> None:
+    assert target().initial(2.5, horizon) == (2.5, expected)
 
 
 @pytest.mark.parametrize(
-    ("desired_return", "said"), [(300.7, 300), (0.4, 1), (-5.0, 1), (1e12, 2**31)]
+    ("desired_return", "expected"), [(300.7, 300), (0.4, 1), (-5.0, 1), (1e12, 2**31)]
 )
-def test_horizon_that_follows_is_the_return_as_an_integer(desired_return: float, said: int) -> None:
-    assert target(desired_horizon="return").initial(desired_return, 99) == (said, said)
+def test_horizon_that_follows_is_the_return_as_an_integer(
+    desired_return: float, expected: int
+) -> None:
+    assert target(desired_horizon="return").initial(desired_return, 99) == (expected, expected)
 
 
-def test_networks_read_it_bounded_and_scaled() -> None:
+def test_network_inputs_are_bounded_and_scaled() -> None:
     usual = target(return_scale=0.5, horizon_scale=0.25)
     assert (usual.least, usual.scales) == ((-np.inf, 1.0), (0.5, 0.25))
     assert target(desired_horizon="return").least == (1.0, 1.0)

@@ -1,4 +1,4 @@
-"""The time that is left as a part of what is observed."""
+"""The remaining time as a part of the observation."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def warm_up(settings: Config) -> list[Episode]:
     return generate_episodes(generator, commands, None)
 
 
-def test_it_counts_down_from_1_towards_0_at_the_limit() -> None:
+def test_time_left_decreases_from_1_towards_0_at_the_limit() -> None:
     for limit in ({}, {"max_train_steps": 5}):
         for episode in warm_up(config(**limit)):
             left = episode.observations["['time_left']"].ravel()
@@ -41,7 +41,7 @@ def test_it_counts_down_from_1_towards_0_at_the_limit() -> None:
     ("observed", "limit", "bootstraps"),
     [(True, None, False), (True, 5, True), (False, None, True), (False, 5, True)],
 )
-def test_nothing_is_expected_after_the_limit_if_it_is_seen_coming(
+def test_truncation_bootstraps_unless_the_limit_is_observed(
     observed: bool, limit: int | None, bootstraps: bool
 ) -> None:
     settings = config(observe_time=observed, max_train_steps=limit)
@@ -57,13 +57,13 @@ def test_nothing_is_expected_after_the_limit_if_it_is_seen_coming(
     assert (last == (101.0 if bootstraps else 1.0)).all()
 
 
-def test_a_run_does_not_depend_on_the_number_of_environments() -> None:
+def test_run_is_independent_of_the_number_of_environments() -> None:
     settings = config(observe_previous=True, frame_stack=2)
     runs = [algorithm1(settings, Budget(max_env_steps=200), n) for n in (1, 5)]
     assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
 
 
-def test_what_was_before_is_hidden_below_a_mask_and_time_is_not() -> None:
+def test_mask_hides_previous_steps_but_not_time_left() -> None:
     settings = config(
         environment="Taxi-v4", action_mask="info", observe_previous=True, drop_previous=1.0
     )

@@ -115,7 +115,7 @@ def test_training_equals_a_loop_over_single_examples(segments: str) -> None:
     assert fast.loss == pytest.approx(loss)
 
 
-def test_version_0_is_untrained_and_every_training_makes_the_next() -> None:
+def test_version_0_is_untrained_and_each_training_makes_the_next_version() -> None:
     config = settings()
     state = untrained(config, SPEC)
     assert state.version == 0
@@ -128,7 +128,7 @@ def test_version_0_is_untrained_and_every_training_makes_the_next() -> None:
     assert len(seen) == 4
 
 
-def test_training_depends_on_ranks_and_not_on_where_episodes_are_kept() -> None:
+def test_training_depends_on_ranks_and_not_on_storage() -> None:
     config = settings()
     digests = set()
     for order in (EPISODES, EPISODES[::-1], EPISODES[2:] + EPISODES[:2]):
@@ -138,7 +138,7 @@ def test_training_depends_on_ranks_and_not_on_where_episodes_are_kept() -> None:
     assert len(digests) == 1
 
 
-def test_every_version_draws_examples_of_its_own() -> None:
+def test_every_version_draws_different_examples() -> None:
     config = settings()
     first, later = untrained(config, SPEC), untrained(config, SPEC)
     later.version = 5
@@ -215,12 +215,12 @@ def test_table_1(seed: int) -> None:
     assert probability.max(dim=1).values.min() > 0.9
 
 
-# Sampled actions slip where the network is not quite certain: over 8 seeds and 8 sets of commands,
-# at most 2 of 180 did. Acting at random obeys about 20 of them.
+# Sampled actions miss where the network is uncertain: over 8 seeds and 8 sets of commands,
+# at most 2 of 180 did. Random actions obey about 20 of them.
 @pytest.mark.parametrize(
     ("segments", "temperature", "slips"), [("all", 1.0, 3), ("trailing", 0.0, 0)]
 )
-def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: int) -> None:
+def test_agent_obeys_its_commands(segments: str, temperature: float, slips: int) -> None:
     config = settings(
         environment="Obedience-v0",
         segments=segments,
@@ -241,7 +241,7 @@ def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: 
     state = untrained(config, generator.spec)
     train(state, experience.by_rank(sorted(experience.ids())), config)
 
-    told = [
+    issued = [
         Command(
             id=i,
             kind="explore",
@@ -256,16 +256,16 @@ def test_the_agent_does_as_it_is_told(segments: str, temperature: float, slips: 
         for i in range(180)
     ]
     act = ActingFunction(acting_graph(config.network, generator.spec), state.weights)
-    did = generate_episodes(generator, told, act)
+    outcomes = generate_episodes(generator, issued, act)
     disobeyed = [
         command
-        for command, episode in zip(told, did, strict=True)
+        for command, episode in zip(issued, outcomes, strict=True)
         if episode.episode_return != command.desired_return
     ]
     assert len(disobeyed) <= slips
 
 
-def test_training_has_the_threads_of_the_settings_and_leaves_the_others_alone(
+def test_training_sets_and_restores_the_number_of_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen = set()
@@ -285,13 +285,13 @@ def test_training_has_the_threads_of_the_settings_and_leaves_the_others_alone(
     assert digest(one) == digest(other)
 
 
-def test_a_learner_computes_in_one_thread_and_deterministically() -> None:
+def test_learner_computes_deterministically_in_one_thread() -> None:
     use_one_thread()
     assert torch.get_num_threads() == 1
     assert torch.are_deterministic_algorithms_enabled()
 
 
-def test_gathering_a_few_updates_at_a_time_changes_nothing(
+def test_chunked_gathering_gives_identical_results(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = settings(n_updates_per_iter=7)
@@ -304,7 +304,7 @@ def test_gathering_a_few_updates_at_a_time_changes_nothing(
     assert len(digests) == 1
 
 
-def test_exact_arithmetic_is_left_when_the_last_one_leaves(
+def test_exact_arithmetic_ends_with_its_last_user(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
@@ -314,7 +314,7 @@ def test_exact_arithmetic_is_left_when_the_last_one_leaves(
             with exact_arithmetic():
                 other = exact_arithmetic()
                 pool.submit(other.__enter__).result()
-            assert torch.are_deterministic_algorithms_enabled(), "the other still computes"
+            assert torch.are_deterministic_algorithms_enabled(), "the other thread still computes"
             pool.submit(other.__exit__, None, None, None).result()
         assert not torch.are_deterministic_algorithms_enabled()
         assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ

@@ -1,4 +1,4 @@
-"""The value function and desired returns relative to it (udrl.value)."""
+"""The value function, and desired returns relative to it (udrl.value)."""
 
 from typing import Any
 
@@ -75,7 +75,7 @@ def ranked(
 
 
 def lambda_return(rewards: list[float], values: list[float], end: float, lam: float) -> float:
-    """The definition: a mean of n-step returns, of which the last has all the weight left."""
+    """The definition: a mean of n-step returns, of which the last has the remaining weight."""
     n_step, earned = [], 0.0
     for n, reward in enumerate(rewards, start=1):
         earned += reward
@@ -113,7 +113,7 @@ def test_labels_are_lambda_returns(
         np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-6)
 
 
-def test_with_lambda_1_labels_are_what_was_obtained() -> None:
+def test_labels_with_lambda_1_are_observed_returns() -> None:
     experience = ranked([episode(0, [1.0, 2.0, 4.0]), episode(1, [-1.0])])
     segments = Segments(np.array([0, 0, 0, 1]), np.array([0, 1, 2, 0]), np.array([3, 3, 3, 1]))
     before = experience.examples(segments).command[:, 0]
@@ -121,7 +121,7 @@ def test_with_lambda_1_labels_are_what_was_obtained() -> None:
     assert experience.examples(segments).command[:, 0].tolist() == before.tolist()
 
 
-def test_steps_come_one_after_another_in_parts() -> None:
+def test_steps_are_iterated_in_parts() -> None:
     episodes = [episode(0, [0.0] * 70), episode(1, [0.0] * 3)]
     parts = [(seen, done) for (seen,), done in ranked(episodes).steps(at_once=50)]
     assert [(len(seen), len(done)) for seen, done in parts] == [(50, 50), (23, 23)]
@@ -130,15 +130,15 @@ def test_steps_come_one_after_another_in_parts() -> None:
         np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), expected)
 
 
-def test_a_relative_return_is_in_deviations_and_bounded() -> None:
+def test_relative_return_is_in_deviations_and_bounded() -> None:
     command = torch.tensor([[3.0, 0.1], [1.0, 0.2], [90.0, 0.3], [-90.0, 0.4]])
     got = relative(command, torch.tensor([[1.0, 2.0]] * 4), 2.0)
     torch.testing.assert_close(got, torch.tensor([[1.0, 0.1], [0.0, 0.2], [2.0, 0.3], [-2.0, 0.4]]))
 
 
-def test_the_value_function_learns_what_follows() -> None:
+def test_value_function_learns_expected_returns() -> None:
     config = settings(n_updates_per_iter=100, learning_rate=3e-3, return_lambda=0.9)
-    # What follows is written in the observation.
+    # The observation encodes the return that follows.
     episodes = [episode(i, [1.0] * 40) for i in range(8)]
     for one in episodes:
         one.observations[:, 0] = np.arange(40, 0, -1) / 40
@@ -155,11 +155,11 @@ def test_the_value_function_learns_what_follows() -> None:
     assert (deviation < 3.0).all()
 
 
-def test_the_critic_learns_what_actions_bring_on_average() -> None:
+def test_critic_learns_expected_returns_of_actions() -> None:
     config = settings(
         baseline="action_value", n_updates_per_iter=100, learning_rate=3e-3, return_lambda=1.0
     )
-    # Action a brings a with a chance of a half, and nothing else.
+    # Action a pays a with probability 1/2, otherwise nothing.
     episodes = [episode(i, [float(4 * (i % 2))]) for i in range(64)]
     for i, one in enumerate(episodes):
         one.observations[:] = 0
@@ -173,14 +173,14 @@ def test_the_critic_learns_what_actions_bring_on_average() -> None:
     observation, actions = torch.zeros(4, 3), torch.arange(4)
     expected = state.critic((observation,), actions) / config.network.return_scale
     torch.testing.assert_close(expected, torch.tensor([0.0, 0.5, 1.0, 1.5]), atol=0.3, rtol=0)
-    # The examples say the same, whatever these episodes obtained.
+    # All examples agree, independent of these episodes' returns.
     labels = experience.labels
     assert labels is not None
     np.testing.assert_allclose(labels, [0.5 * (i // 2 % 4) for i in range(64)], atol=0.3)
 
 
 @pytest.mark.parametrize("baseline", ["value", "action_value"])
-def test_a_restored_state_trains_on_as_if_nothing_had_happened(baseline: str) -> None:
+def test_restored_state_trains_on_with_identical_results(baseline: str) -> None:
     config = settings(baseline=baseline)
     experience = ranked([episode(i, [1.0, 0.0, float(i)]) for i in range(4)], config)
     state = untrained(config, SPEC)
@@ -192,7 +192,7 @@ def test_a_restored_state_trains_on_as_if_nothing_had_happened(baseline: str) ->
     assert encode_optimizer(state) == encode_optimizer(restored)
 
 
-def test_the_baseline_changes_what_is_learned() -> None:
+def test_baseline_changes_the_trained_weights() -> None:
     episodes = [episode(i, [1.0, 0.0, float(i)]) for i in range(4)]
     digests = set()
     for lam in (0.5, 1.0):
@@ -203,6 +203,6 @@ def test_the_baseline_changes_what_is_learned() -> None:
     assert len(digests) == 2
 
 
-def test_a_baseline_needs_trailing_segments() -> None:
+def test_baseline_requires_trailing_segments() -> None:
     with pytest.raises(ConfigError, match="segments = 'all' with baseline = 'value'"):
         settings(segments="all")

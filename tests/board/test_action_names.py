@@ -1,4 +1,4 @@
-"""Names of actions: of known environments, of those that declare them, of every kind of space."""
+"""Names of actions: of known environments, declared ones, and those of every kind of space."""
 
 from typing import Any
 
@@ -44,11 +44,11 @@ def test_known_environments(environment: str, first: str, n: int) -> None:
     env.close()
 
 
-def test_numbers_where_there_are_no_names() -> None:
+def test_actions_without_names_are_numbered() -> None:
     assert names(Acting(spaces.Discrete(3, start=5))) == [("", ["5", "6", "7"])]
 
 
-def test_names_that_the_environment_declares() -> None:
+def test_declared_names_are_used() -> None:
     env = Acting(spaces.Discrete(2))
     env.metadata = {"action_names": ["Stay", "Go"]}
     assert names(env) == [("", ["stay", "go"])]
@@ -68,7 +68,7 @@ def test_several_components() -> None:
     assert names(Acting(spaces.MultiBinary(2)))[1] == ("component 1", ["off", "on"])
 
 
-def test_bins_are_named_by_their_numbers() -> None:
+def test_bins_are_named_by_their_values() -> None:
     assert names(Acting(spaces.Box(-2, 2, (1,), np.float32)), action_bins=5) == [
         ("", ["-2", "-1", "0", "1", "2"])
     ]

@@ -1,4 +1,4 @@
-"""The news for the page, and how often the run is queried."""
+"""The updates of the page, and the rate of queries to the run."""
 
 from collections import Counter
 from typing import Any
@@ -42,7 +42,7 @@ def evaluation(number: int) -> EvaluationStatus:
 
 
 class CountingSource:
-    """A run after some iterations, which counts the queries."""
+    """A run with some iterations, which counts its queries."""
 
     def __init__(self, iterations: int) -> None:
         self.iterations = iterations
@@ -69,7 +69,7 @@ class CountingSource:
 
     def status(self) -> Status:
         self._query("status")
-        # Only this is read of it here; tests of the whole system have whole ones.
+        # The feed reads only these fields; tests of the whole system have complete ones.
         fields: dict[str, Any] = dict.fromkeys(Status.__struct_fields__)
         return Status(**fields | {"iteration": self.iterations - 1, "run_id": "run"})
 
@@ -92,7 +92,7 @@ class CountingSource:
         )  # fmt: skip
 
     def weights(self, version: object) -> Weights:
-        raise AssertionError("a feed needs no weights")
+        raise AssertionError("the feed must not request weights")
 
     def obedience(self) -> ObedienceReport | None:
         if isinstance(self.report, InvalidData):
@@ -126,7 +126,7 @@ def feed(run: CountingSource, clock: Clock) -> Feed:
     return Feed(run, clock)
 
 
-def test_a_new_page_gets_everything(feed: Feed) -> None:
+def test_new_page_gets_everything(feed: Feed) -> None:
     news = feed.news()
     assert news.hello == HELLO
     assert [i.iteration for i in news.iterations] == [0, 1, 2, 3, 4]
@@ -136,7 +136,7 @@ def test_a_new_page_gets_everything(feed: Feed) -> None:
     assert msgspec.json.decode(msgspec.json.encode(news))["iterations"]
 
 
-def test_a_page_gets_what_it_lacks(feed: Feed, run: CountingSource, clock: Clock) -> None:
+def test_page_gets_changes_only(feed: Feed, run: CountingSource, clock: Clock) -> None:
     feed.news()
     run.iterations = 8
     clock.now += FRESH_S
@@ -149,7 +149,7 @@ def test_a_page_gets_what_it_lacks(feed: Feed, run: CountingSource, clock: Clock
     assert (again.iterations, again.evaluations, again.contents) == ([], [], None)
 
 
-def test_the_run_is_queried_once_a_second_for_any_number_of_pages(
+def test_run_is_queried_once_a_second_for_any_number_of_pages(
     feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     for _ in range(10):
@@ -158,16 +158,16 @@ def test_the_run_is_queried_once_a_second_for_any_number_of_pages(
     clock.now += FRESH_S
     for _ in range(10):
         feed.news(4, "run")
-    # The buffer has not changed since.
+    # The buffer has not changed.
     assert run.queries == {"hello": 1, "status": 2, "history": 2, "contents": 1}
 
 
-def test_a_long_history_is_fetched_page_by_page(feed: Feed, run: CountingSource) -> None:
+def test_long_history_is_fetched_page_by_page(feed: Feed, run: CountingSource) -> None:
     run.iterations, run.page = 100, 7
     assert [i.iteration for i in feed.news().iterations] == list(range(100))
 
 
-def test_without_a_reply_the_page_keeps_what_it_has(
+def test_page_keeps_its_state_without_a_reply(
     feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     feed.news()
@@ -182,7 +182,7 @@ def test_without_a_reply_the_page_keeps_what_it_has(
     assert (news.problem, [i.iteration for i in news.iterations]) == ("", [5])
 
 
-def test_the_page_gets_the_place_and_doubts(feed: Feed, run: CountingSource, clock: Clock) -> None:
+def test_page_gets_the_place_and_doubts(feed: Feed, run: CountingSource, clock: Clock) -> None:
     assert feed.news().place == RunLocation("runs/mine", "tcp/127.0.0.1:7447")
     run.is_doubtful = True
     clock.now += FRESH_S
@@ -192,14 +192,14 @@ def test_the_page_gets_the_place_and_doubts(feed: Feed, run: CountingSource, clo
 
 
 @pytest.mark.parametrize(("after", "run_id"), [(77, "run"), (2, "another"), (2, "")])
-def test_a_page_of_another_run_gets_everything(feed: Feed, after: int, run_id: str) -> None:
+def test_page_of_another_run_gets_everything(feed: Feed, after: int, run_id: str) -> None:
     news = feed.news(after, run_id)
     assert news.hello == HELLO
     assert len(news.iterations) == 5
     assert news.contents is not None
 
 
-def test_a_run_restored_from_a_backup_is_sent_again(
+def test_run_restored_from_a_backup_is_sent_again(
     feed: Feed, run: CountingSource, clock: Clock
 ) -> None:
     feed.news()
@@ -222,7 +222,7 @@ def report(run_id: str = "run", *, obeys: bool) -> ObedienceReport:
 
 
 @pytest.mark.parametrize("obeys", [True, False])
-def test_the_report_on_obedience(run: CountingSource, clock: Clock, obeys: bool) -> None:
+def test_page_gets_the_report_on_obedience(run: CountingSource, clock: Clock, obeys: bool) -> None:
     feed = Feed(run, clock)
     assert feed.news().obeyed is None
     run.report = report(obeys=obeys)
@@ -237,7 +237,7 @@ def test_the_report_on_obedience(run: CountingSource, clock: Clock, obeys: bool)
     assert feed.news().obeyed is None
 
 
-def test_a_damaged_report_hides_nothing_else(run: CountingSource, clock: Clock) -> None:
+def test_damaged_report_does_not_hide_other_data(run: CountingSource, clock: Clock) -> None:
     run.report = InvalidData("obedience.json: damaged; delete it")
     news = Feed(run, clock).news()
     assert news.problem == "obedience.json: damaged; delete it"

@@ -1,4 +1,4 @@
-"""Runs that are finished, without the runs."""
+"""Finished runs, without training."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from udrl_inspect.csv_tables import write
 
 
 def finish(root: Path, one: Job, *, wall_s: float = 10.0, machine: Machine | None = None) -> None:
-    """Leave what a finished run leaves."""
+    """Write the files of a finished run."""
     folder = one.folder(root)
     folder.mkdir(parents=True)
     rows = [

@@ -40,7 +40,7 @@ seeds: list[int | None] = []
 
 
 class Balance(CartPoleEnv):
-    """CartPole that notes what it is reset with."""
+    """CartPole that records its reset seeds."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -51,7 +51,7 @@ class Balance(CartPoleEnv):
 
 
 class Pictures(gym.Env[npt.NDArray[np.uint8], np.int64]):
-    """Small images of noise, whose number of frames is not their smallest dimension."""
+    """Small images of noise; the number of stacked frames is not the smallest dimension."""
 
     observation_space = gym.spaces.Box(0, 255, (5, 6), np.uint8)
     action_space = gym.spaces.Discrete(3)
@@ -107,7 +107,7 @@ class Stopped(Exception):
 
 
 def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop a run after its n-th evaluation, before its table is written."""
+    """Stop a run after its n-th evaluation, before it writes its table."""
 
     def write(path: Path, kind: type[EvaluationRecord], rows: list[EvaluationRecord]) -> None:
         if len(rows) == n:
@@ -126,13 +126,13 @@ def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
         ("PPO", {"n_envs": 8, "n_steps": 32, "learning_rate": 2e-3}, 4096),
     ],
 )  # fmt: skip
-def test_it_learns(
+def test_baseline_learns(
     algorithm: str, hyperparameters: dict[str, KeywordValue], steps: int, tmp_path: Path
 ) -> None:
     plain = baseline(algorithm, hidden=[64, 64], eval_every=steps // 2, eval_episodes=20)
     rows = run(msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path)
     assert [row.env_steps for row in rows] == [steps // 2, steps]
-    assert rows[-1].mean > 60  # acting at random: 22
+    assert rows[-1].mean > 60  # random actions: 22
     assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
     first = rows[0]
     assert (first.environment, first.algorithm, first.seed) == ("Balance-v0", algorithm, 1)
@@ -140,7 +140,7 @@ def test_it_learns(
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_images(algorithm: str, tmp_path: Path) -> None:
+def test_baseline_trains_on_images(algorithm: str, tmp_path: Path) -> None:
     rows = run(pictures(algorithm), 450, tmp_path)
     assert [row.env_steps for row in rows][:2] == [200, 400]
     assert 450 <= rows[-1].env_steps < 460
@@ -149,8 +149,8 @@ def test_images(algorithm: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("make", [baseline, pictures])
-def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
-    """With a gate that is open, both are the same function of the same layers."""
+def test_networks_equal_the_behavior_functions(algorithm: str, make: Any) -> None:
+    """With an open gate, both are the same function of the same layers."""
     wanted: Baseline = make(algorithm)
     if algorithm != "DQN":
         wanted = msgspec.structs.replace(wanted, hyperparameters={"activation": "relu"})
@@ -191,7 +191,7 @@ def test_networks_are_the_behavior_functions(algorithm: str, make: Any) -> None:
     torch.testing.assert_close(logits, expected)
 
 
-def test_training_sees_the_most_recent_frames() -> None:
+def test_training_inputs_are_the_most_recent_frames() -> None:
     model = made(pictures("DQN"))
     assert model.env is not None
     first = model.env.reset()
@@ -205,7 +205,7 @@ def test_training_sees_the_most_recent_frames() -> None:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_reset_seeds(algorithm: str, tmp_path: Path) -> None:
+def test_reset_seeds_are_from_the_ranges(algorithm: str, tmp_path: Path) -> None:
     config = baseline(algorithm).config
     run(baseline(algorithm), 400, tmp_path)
     in_training = [s for s in seeds if s is not None and 1_000_000 <= s < 10_000_000]
@@ -219,13 +219,13 @@ def test_reset_seeds(algorithm: str, tmp_path: Path) -> None:
     assert in_evaluation == udrl
 
 
-def test_seeds_of_a_search(tmp_path: Path) -> None:
+def test_search_uses_its_own_reset_seeds(tmp_path: Path) -> None:
     run(baseline("A2C", eval_seeds="search"), 200, tmp_path)
     assert sum(500_000 <= (s or 0) < 1_000_000 for s in seeds) == 4
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_evaluations_act_as_udrl_does(
+def test_evaluations_act_like_udrl(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     temperatures: list[float] = []
@@ -243,7 +243,7 @@ def test_evaluations_act_as_udrl_does(
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_evaluations_leave_training_alone(algorithm: str, tmp_path: Path) -> None:
+def test_evaluations_do_not_change_training(algorithm: str, tmp_path: Path) -> None:
     often = run(baseline(algorithm), 400, tmp_path / "often")
     once = run(baseline(algorithm, eval_every=400), 400, tmp_path / "once")
     assert (len(often), len(once)) == (2, 1)
@@ -255,7 +255,7 @@ def test_evaluations_leave_training_alone(algorithm: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("make", [baseline, pictures])
-def test_stopped_and_resumed(
+def test_resumed_run_equals_an_uninterrupted_one(
     algorithm: str, make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
@@ -287,7 +287,7 @@ def test_stopped_and_resumed(
     assert (algorithm == "DQN") == ("replay.observations" in saved)
 
 
-def test_a_replay_buffer_that_is_full(tmp_path: Path) -> None:
+def test_full_replay_buffer_is_restored(tmp_path: Path) -> None:
     small = msgspec.structs.replace(
         baseline("DQN"), hyperparameters=FAST["DQN"] | {"buffer_size": 150, "n_steps": 3}
     )
@@ -300,11 +300,13 @@ def test_a_replay_buffer_that_is_full(tmp_path: Path) -> None:
     assert buffer is not None
     assert (buffer.full, buffer.pos) == (True, 50)
     np.testing.assert_array_equal(buffer.observations, saved["replay.observations"].numpy())
-    # What was in progress is cut off, so that no return of three steps reaches the next episode.
+    # The unfinished episode is truncated, so that no three-step return reaches into the next one.
     assert buffer.dones[49] or buffer.timeouts[49]
 
 
-def test_killed_while_it_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_resumes_after_a_kill_while_saving(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     original = safetensors.torch.save_file
     saved: list[Path] = []
 
@@ -322,7 +324,7 @@ def test_killed_while_it_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [row.env_steps for row in rows] == [200, 400, 600]
 
 
-def test_extended_with_the_exploration_that_it_began_with(
+def test_extended_run_keeps_its_exploration_schedule(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     explored: list[int] = []
@@ -345,7 +347,7 @@ def test_extended_with_the_exploration_that_it_began_with(
 
 
 @pytest.mark.parametrize("damage", ["shorter", "other tensors", "no state"])
-def test_damaged_state(damage: str, tmp_path: Path) -> None:
+def test_damaged_state_is_rejected(damage: str, tmp_path: Path) -> None:
     run(baseline("DQN"), 200, tmp_path)
     path = tmp_path / "state.safetensors"
     if damage == "shorter":
@@ -366,14 +368,16 @@ def test_damaged_state(damage: str, tmp_path: Path) -> None:
         ({"activation": "step"}, "activation = 'step'"),
     ],
 )
-def test_hyperparameters_that_cannot_be(
+def test_invalid_hyperparameters_are_rejected(
     hyperparameters: dict[str, KeywordValue], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         msgspec.structs.replace(baseline("DQN"), hyperparameters=hyperparameters)
 
 
-def test_without_stable_baselines3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_stable_baselines3_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(ConfigError, match=r'pip install "udrl\[studies\]"'):
         run(baseline("DQN"), 100, tmp_path / "run")
@@ -382,7 +386,7 @@ def test_without_stable_baselines3(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("environment", ["LunarLander-v3", "LunarLanderSparse-v3", "TakeCover-v0"])
 @pytest.mark.parametrize("algorithm", ["DQN", "A2C"])
-def test_what_ships_is_in_the_papers_lists(algorithm: Any, environment: str) -> None:
+def test_shipped_hyperparameters_are_in_the_papers_lists(algorithm: Any, environment: str) -> None:
     spaces = Path(baselines.__file__).parent / "spaces" / f"{environment}.toml"
     lists = read_toml(spaces)[algorithm]
     chosen = tuned(algorithm, environment)
@@ -400,10 +404,10 @@ def test_minibatches_of_ppo_divide_its_rollouts(task: Task) -> None:
     shipped = complete("PPO", tuned("PPO", task.environment))
     assert isinstance(shipped, PpoHyperparameters)
     assert (shipped.n_envs * shipped.n_steps) % shipped.batch_size == 0
-    # No two evaluations belong to the same point of a curve, and no point is left out.
+    # Every point of a curve has exactly one evaluation.
     assert shipped.n_envs * shipped.n_steps < 50_000
 
 
-def test_nothing_ships_for_other_environments() -> None:
+def test_other_environments_have_no_hyperparameters() -> None:
     with pytest.raises(ConfigError, match=r"'CartPole-v1'.*TakeCover-v0"):
         tuned("DQN", "CartPole-v1")

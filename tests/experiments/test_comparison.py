@@ -19,7 +19,7 @@ each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
 @each_task
-def test_the_papers_preset_is_a_participant_whose_runs_are_those_of_its_settings(
+def test_papers_preset_is_a_participant_with_the_papers_settings(
     task: Task,
 ) -> None:
     participant = job(task, PLAN, "UDRL-paper", 1)
@@ -32,7 +32,7 @@ def test_the_papers_preset_is_a_participant_whose_runs_are_those_of_its_settings
 
 
 @each_task
-def test_without_a_choice_the_figure_is_the_papers(task: Task) -> None:
+def test_default_figure_is_the_papers(task: Task) -> None:
     name = next(name for name, one in TASKS.items() if one is task)
     jobs = comparison(name, PLAN, DEFAULT_PARTICIPANTS).jobs
     assert [(one.algorithm, one.variant, one.config.seed) for one in jobs] == [
@@ -47,7 +47,7 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
         finish(tmp_path, one)
     place = StudyFolders(tmp_path, tmp_path / "lander")
     place.folder.mkdir()
-    said = study.report(place)
+    output = study.report(place)
 
     points = read(place.folder / "curves.csv", CurvePoint)
     assert {(point.algorithm, point.variant) for point in points} == {
@@ -58,10 +58,10 @@ def test_both_presets_are_lines_of_one_figure(tmp_path: Path) -> None:
     picture = (place.folder / "learning-curves.svg").read_text(encoding="utf-8")
     for label in ("UDRL (2 seeds)", "UDRL-paper (2 seeds)"):
         assert f">{label}</text>" in picture
-    assert "LunarLander: UDRL-paper: mean return 3.5 after 100,000 env steps, seeds: 2" in said
+    assert "LunarLander: UDRL-paper: mean return 3.5 after 100,000 env steps, seeds: 2" in output
 
 
-def test_wall_times_are_compared_on_one_kind_of_machine_alone(tmp_path: Path) -> None:
+def test_wall_times_are_compared_on_one_kind_of_machine_only(tmp_path: Path) -> None:
     study = comparison("lander", PLAN._replace(seeds=(1, 2, 3)), ("UDRL", "DQN"))
     many, few = Machine("Quick", 2, "Linux x86_64"), Machine("Slow", 2, "Linux x86_64")
     for one in study.jobs:

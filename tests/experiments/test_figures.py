@@ -63,7 +63,7 @@ ALL = [*curve("DQN"), *curve("A2C"), *curve("PPO"), *curve("UDRL", "paper"), *cu
 MANY = [point for i in range(31) for point in curve("UDRL", f"lead {i}")]
 
 
-def test_a_line_for_each_agent_with_its_seeds() -> None:
+def test_each_agent_has_a_line_with_its_seeds() -> None:
     points = [*curve(), *curve("UDRL", "lead 2", seeds=1), *curve("A2C", seeds=3)]
     figure = learning_curves(points, "LunarLander")
     lines = labelled(figure)
@@ -79,20 +79,20 @@ def test_a_line_for_each_agent_with_its_seeds() -> None:
         assert y == [0, 10, 20, 30, 40]
 
 
-def test_against_wall_time() -> None:
+def test_curve_over_wall_time() -> None:
     figure = learning_curves(curve(), "LunarLander", x="wall_s")
     assert figure.axes[0].get_xlabel() == "wall time (minutes)"
     x, _ = data(labelled(figure)["UDRL (20 seeds)"])
     assert x == [0, 1.5, 3, 4.5, 6]
 
 
-def test_the_band_is_the_interval() -> None:
+def test_band_is_the_interval() -> None:
     (band,) = learning_curves(curve(n=3), "LunarLander").axes[0].collections
     corners = {(round(x, 9), y) for x, y in np.asarray(band.get_paths()[0].vertices)}
     assert corners == {(0, -3), (0, 4), (0.05, 7), (0.05, 14), (0.1, 17), (0.1, 24)}
 
 
-def test_environments_are_told_apart_where_there_are_several() -> None:
+def test_labels_name_environments_if_there_are_several() -> None:
     sparse = [msgspec.structs.replace(p, environment="LunarLanderSparse-v3") for p in curve()]
     assert list(labelled(learning_curves([*curve(), *sparse], "both"))) == [
         "LunarLander-v3 UDRL (20 seeds)",
@@ -105,7 +105,7 @@ def test_environments_are_told_apart_where_there_are_several() -> None:
     ]
 
 
-def test_references_are_lines_with_their_names_beside_them() -> None:
+def test_references_are_labelled_lines() -> None:
     figure = learning_curves(curve(), "LunarLander", references={"lands": 100, "solved": 200})
     (axes,) = figure.axes
     names = [text for text in axes.texts if isinstance(text, Annotation)]
@@ -119,18 +119,18 @@ def test_references_are_lines_with_their_names_beside_them() -> None:
     assert list(labelled(figure)) == ["UDRL (20 seeds)"]
 
 
-def test_an_algorithm_looks_the_same_in_whatever_order() -> None:
-    def look(line: Line2D) -> tuple[str, object, object]:
+def test_algorithms_have_fixed_styles() -> None:
+    def style(line: Line2D) -> tuple[str, object, object]:
         return to_hex(line.get_color()), line.get_linestyle(), line.get_marker()
 
-    one = {label: look(line) for label, line in labelled(learning_curves(ALL, "")).items()}
+    one = {label: style(line) for label, line in labelled(learning_curves(ALL, "")).items()}
     other = labelled(learning_curves(ALL[::-1], ""))
-    assert one == {label: look(line) for label, line in other.items()}
+    assert one == {label: style(line) for label, line in other.items()}
     assert one["UDRL (20 seeds)"][0] == GREEN
     assert len({colour for colour, _, _ in one.values()}) == 5
     for algorithm, variant in (("DQN", ""), ("UDRL", "paper")):
         ((label, alone),) = labelled(learning_curves(curve(algorithm, variant), "")).items()
-        assert look(alone) == one[label]
+        assert style(alone) == one[label]
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_an_algorithm_looks_the_same_in_whatever_order() -> None:
         lambda: sensitivity([row for seed in range(1, 21) for row in obtained(seed)], ""),
     ],
 )
-def test_lines_differ_in_grey(draw: Callable[[], Figure]) -> None:
+def test_lines_differ_in_greyscale(draw: Callable[[], Figure]) -> None:
     lines = labelled(draw()).values()
     for one, other in itertools.combinations(lines, 2):
         assert (one.get_linestyle(), one.get_marker()) != (
@@ -151,7 +151,7 @@ def test_lines_differ_in_grey(draw: Callable[[], Figure]) -> None:
         )
 
 
-def test_every_line_shows_its_marker_however_long_it_is() -> None:
+def test_every_line_shows_its_marker_at_any_length() -> None:
     for n in (1, 2, 9, 10, 11, 19, 20, 201):
         points = [point for i in range(12) for point in curve("UDRL", f"lead {i}", n=n)]
         for line in labelled(learning_curves(points, "")).values():
@@ -192,7 +192,7 @@ DRAWINGS: list[Callable[[], Figure]] = [
 
 
 @pytest.mark.parametrize("draw", DRAWINGS)
-def test_the_same_rows_give_the_same_bytes(draw: Callable[[], Figure], tmp_path: Path) -> None:
+def test_equal_rows_give_equal_bytes(draw: Callable[[], Figure], tmp_path: Path) -> None:
     figure = draw()
     pictures = [
         [path.read_bytes() for path in save(figure, tmp_path / name)]
@@ -201,7 +201,7 @@ def test_the_same_rows_give_the_same_bytes(draw: Callable[[], Figure], tmp_path:
     assert pictures[0] == pictures[1] == pictures[2]
 
 
-def test_two_files_and_nothing_else_are_left(tmp_path: Path) -> None:
+def test_only_two_files_are_written(tmp_path: Path) -> None:
     written = save(learning_curves(curve(), ""), tmp_path / "LunarLander-v3.5")
     assert [path.name for path in written] == ["LunarLander-v3.5.png", "LunarLander-v3.5.svg"]
     assert sorted(tmp_path.iterdir()) == written
@@ -211,7 +211,7 @@ def test_two_files_and_nothing_else_are_left(tmp_path: Path) -> None:
     assert b"<dc:date>" not in svg
 
 
-def test_text_stays_text(tmp_path: Path) -> None:
+def test_text_is_stored_as_text(tmp_path: Path) -> None:
     points = [*curve("UDRL", "lead 2"), *curve("A2C")]
     figure = learning_curves(points, "The lander", references={"solved": 200})
     svg = save(figure, tmp_path / "curves")[1].read_text(encoding="utf-8")
@@ -221,7 +221,7 @@ def test_text_stays_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("points", [ALL, MANY, curve("UDRL", "with a name that is long" * 3)])
-def test_nothing_is_cut_off_or_covered(points: Sequence[CurvePoint], tmp_path: Path) -> None:
+def test_nothing_is_clipped_or_covered(points: Sequence[CurvePoint], tmp_path: Path) -> None:
     figure = learning_curves(points, "LunarLander", references={"close to optimal": 200})
     save(figure, tmp_path / "curves")
     width, height = figure.get_size_inches()
@@ -233,7 +233,7 @@ def test_nothing_is_cut_off_or_covered(points: Sequence[CurvePoint], tmp_path: P
     assert axes.get_position().height * height > 3
 
 
-def test_an_empty_table_is_an_error() -> None:
+def test_empty_table_is_an_error() -> None:
     with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
         learning_curves([], "lander")
     with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
@@ -241,7 +241,7 @@ def test_an_empty_table_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("draw", DRAWINGS)
-def test_without_matplotlib_the_remedy_is_named(
+def test_missing_matplotlib_is_reported_with_the_remedy(
     draw: Callable[[], Figure], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)

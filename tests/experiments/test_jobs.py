@@ -39,7 +39,7 @@ def evaluated(env_steps: int) -> EvaluationRecord:
     )  # fmt: skip
 
 
-def test_runs_of_equal_settings_are_one_run_as_far_as_anyone_asks() -> None:
+def test_runs_of_equal_settings_share_a_folder() -> None:
     planned = [job(100), job(50, "short"), job(300, "long"), job(10, seed=2)]
     assert [(one.config.seed, one.max_env_steps) for one in merge_jobs(planned)] == [
         (1, 300),
@@ -48,7 +48,7 @@ def test_runs_of_equal_settings_are_one_run_as_far_as_anyone_asks() -> None:
 
 
 @pytest.mark.parametrize("change", [{"seed": 2}, {"lead": 1}, {"environment": "Acrobot-v1"}])
-def test_other_settings_are_another_run(change: dict[str, Any]) -> None:
+def test_other_settings_give_another_folder(change: dict[str, Any]) -> None:
     assert job(**change).name != job().name
 
 
@@ -69,13 +69,13 @@ def test_a_finished_run_with_other_defaults_is_another_run(tmp_path: Path) -> No
     assert not one.done(tmp_path)
 
 
-def test_other_hyperparameters_are_another_run() -> None:
+def test_other_hyperparameters_give_another_folder() -> None:
     dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=1)
     other = msgspec.structs.replace(dqn, hyperparameters={"gamma": 0.9})
     assert len({job().name, dqn.name, other.name}) == 3
 
 
-def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
+def test_evaluations_beyond_the_budget_are_left_out(tmp_path: Path) -> None:
     one = job(300, "mine")
     one.folder(tmp_path).mkdir(parents=True)
     rows = [evaluated(n) for n in (105, 203, 310, 400, 950)]
@@ -93,24 +93,24 @@ def test_evaluations_up_to_what_is_asked_for(tmp_path: Path) -> None:
     [('{"max_env_steps": 1000}', True), ('{"max_env_steps": 999}', False), ("", False),
      ("[]", False), ('{"max_env_steps": null}', False), ('{"max_env_steps": 1e999}', False)],
 )  # fmt: skip
-def test_done_is_done_as_far_as_asked(tmp_path: Path, text: str, *, done: bool) -> None:
+def test_run_is_done_if_it_reached_its_budget(tmp_path: Path, text: str, *, done: bool) -> None:
     folder = job().folder(tmp_path)
     folder.mkdir(parents=True)
     (folder / "job.json").write_bytes(msgspec.json.encode(job()))
     (folder / "done.json").write_text(text, encoding="utf-8")
-    assert not job().done(tmp_path), "it has no evaluations"
+    assert not job().done(tmp_path), "without evaluations it is not done"
     write(folder / "evaluations.csv", EvaluationRecord, [evaluated(105)])
     assert job().done(tmp_path) is done
 
 
-def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+def test_folder_without_a_run_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InvalidData, match=r"job\.json"):
         read_job(tmp_path)
 
 
 @pytest.fixture
 def program(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Replace what a run does by a line of Python; ``folder`` and ``json`` are there."""
+    """Replace a run by a line of Python, which has the variables ``folder`` and ``json``."""
 
     def replace(line: str) -> None:
         code = f"import json, os, shutil, sys, time\nfolder = sys.argv[1]\n{line}"
@@ -124,33 +124,35 @@ open(folder + '/evaluations.csv', 'w').write({TABLE!r})
 asked = json.load(open(folder + '/job.json'))['max_env_steps']
 json.dump({{'max_env_steps': asked}}, open(folder + '/done.json', 'w'))
 """
-#: Leaves the process's id, and lasts.
+#: Writes the process's id and sleeps.
 LAST = "open(folder + '/pid', 'w').write(str(os.getpid())); time.sleep(600)"
 
 
-def quietly(text: str) -> None:
-    """Say nothing."""
+def ignore(text: str) -> None:
+    """Print nothing."""
 
 
-def test_what_is_done_is_not_done_again(tmp_path: Path, program: Callable[[str], None]) -> None:
+def test_finished_run_is_not_repeated(tmp_path: Path, program: Callable[[str], None]) -> None:
     program(FINISH)
-    said: list[str] = []
+    printed: list[str] = []
     planned = [job(seed=n) for n in (1, 2, 3)]
-    run_jobs(planned[:2], tmp_path, 2, threading.Event(), said.append)
-    assert len(said) == 2
-    run_jobs(planned, tmp_path, 2, threading.Event(), said.append)
-    assert said[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+    run_jobs(planned[:2], tmp_path, 2, threading.Event(), printed.append)
+    assert len(printed) == 2
+    run_jobs(planned, tmp_path, 2, threading.Event(), printed.append)
+    assert printed[2:] == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
     assert read_job(planned[2].folder(tmp_path)) == planned[2]
 
 
-def test_no_more_than_asked_side_by_side(tmp_path: Path, program: Callable[[str], None]) -> None:
-    # Each run leaves a file while it is there, and counts those of the others.
+def test_number_of_concurrent_runs_is_limited(
+    tmp_path: Path, program: Callable[[str], None]
+) -> None:
+    # Each run has a file while it exists, and counts the files of the others.
     program(
         "root = os.path.dirname(folder); mark = folder + '.on'; open(mark, 'w').close(); "
         "time.sleep(0.5); n = sum(f.endswith('.on') for f in os.listdir(root)); "
         "open(folder + '.count', 'w').write(str(n)); os.remove(mark)\n" + FINISH
     )
-    run_jobs([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), quietly)
+    run_jobs([job(seed=n) for n in range(4)], tmp_path, 2, threading.Event(), ignore)
     counts = [int(file.read_text()) for file in (tmp_path / "runs").glob("*.count")]
     assert len(counts) == 4
     assert max(counts) == 2
@@ -160,17 +162,17 @@ def names_in(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
 
-def test_records_of_finished_runs_are_copied_and_their_runs_not_made_again(
+def test_records_of_finished_runs_are_copied_and_not_repeated(
     tmp_path: Path, program: Callable[[str], None]
 ) -> None:
     first, second, here = (tmp_path / name for name in ("first", "second", "here"))
     program(FINISH)
-    run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), quietly)
-    run_jobs([job(2000, seed=2)], second, 1, threading.Event(), quietly)
-    said: list[str] = []
+    run_jobs([job(seed=1), job(seed=2)], first, 1, threading.Event(), ignore)
+    run_jobs([job(2000, seed=2)], second, 1, threading.Event(), ignore)
+    printed: list[str] = []
     wanted = [job(seed=1), job(2000, seed=2), job(seed=3)]
-    copy_finished(wanted, here, [first, second], said.append)
-    assert said == [
+    copy_finished(wanted, here, [first, second], printed.append)
+    assert printed == [
         f"copied from {first}: UDRL, CartPole-v1, seed 1: 1,000 env steps",
         f"copied from {second}: UDRL, CartPole-v1, seed 2: 2,000 env steps",
     ]
@@ -180,24 +182,24 @@ def test_records_of_finished_runs_are_copied_and_their_runs_not_made_again(
             kept = one.folder(here) / name
             assert kept.read_bytes() == (one.folder(source) / name).read_bytes()
 
-    del said[:]
-    copy_finished(wanted, here, [first, second], said.append)  # they are here now
-    run_jobs(wanted, here, 1, threading.Event(), said.append)
-    assert said == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
+    del printed[:]
+    copy_finished(wanted, here, [first, second], printed.append)  # they have been copied
+    run_jobs(wanted, here, 1, threading.Event(), printed.append)
+    assert printed == ["[1/1] UDRL, CartPole-v1, seed 3: 1,000 env steps"]
 
 
-def test_a_folder_without_runs_is_told(tmp_path: Path) -> None:
+def test_folder_without_runs_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "runs" / "lander").mkdir(parents=True)
     with pytest.raises(
         ConfigError, match=r"--runs-from .*runs: expected a folder of studies.*--folder"
     ):
-        copy_finished([job()], tmp_path, [tmp_path / "runs"], quietly)
+        copy_finished([job()], tmp_path, [tmp_path / "runs"], ignore)
 
 
 @pytest.mark.parametrize(
     ("state", "kept"), [("run", True), ("state.safetensors", True), ("", False)]
 )
-def test_a_run_of_which_only_records_were_kept_begins_anew(
+def test_run_with_records_only_starts_from_the_beginning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, *, kept: bool
 ) -> None:
     def fail(*arguments: Any, **others: Any) -> None:
@@ -212,8 +214,8 @@ def test_a_run_of_which_only_records_were_kept_begins_anew(
     assert (tmp_path / "done.json").exists() is kept
 
 
-class WhenItRuns(threading.Event):
-    """Set as soon as a run has left its process's id."""
+class SetWhenRunning(threading.Event):
+    """Set as soon as a run has written its process's id."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -236,16 +238,16 @@ def is_running(pid: int) -> bool:
     return True
 
 
-def test_a_stop_ends_what_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
+def test_stop_ends_active_runs(tmp_path: Path, program: Callable[[str], None]) -> None:
     program(LAST)
-    stop, said = WhenItRuns(job().folder(tmp_path)), list[str]()
+    stop, printed = SetWhenRunning(job().folder(tmp_path)), list[str]()
     with pytest.raises(Interrupted, match="--resume"):
-        run_jobs([job()], tmp_path, 1, stop, said.append)
-    assert "--resume" in said[-1]
+        run_jobs([job()], tmp_path, 1, stop, printed.append)
+    assert "--resume" in printed[-1]
     assert not is_running(stop.pid)
 
 
-def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
+def test_failure_is_reported_with_its_last_output_and_ends_the_others(
     tmp_path: Path, program: Callable[[str], None]
 ) -> None:
     lasting = job(seed=1)
@@ -256,9 +258,9 @@ def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
         "print('no such luck', file=sys.stderr); sys.exit(7)"
     )
     with pytest.raises(RunFailed, match="no such luck") as raised:
-        run_jobs([lasting, job(seed=2)], tmp_path, 2, threading.Event(), quietly)
+        run_jobs([lasting, job(seed=2)], tmp_path, 2, threading.Event(), ignore)
     assert raised.value.exit_code == 7
-    assert not is_running(WhenItRuns(lasting.folder(tmp_path)).pid)
+    assert not is_running(SetWhenRunning(lasting.folder(tmp_path)).pid)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +275,7 @@ def test_a_failure_is_told_with_its_last_words_and_ends_the_others(
         ("os.kill(os.getpid(), 9)", "was killed by signal 9; see"),
     ],
 )
-def test_a_failure_is_one_line_with_its_cause(
+def test_failure_is_one_line_with_its_cause(
     tmp_path: Path, program: Callable[[str], None], line: str, message: str
 ) -> None:
     folder = job().folder(tmp_path)
@@ -281,17 +283,19 @@ def test_a_failure_is_one_line_with_its_cause(
     (folder / "log.txt").write_text("udrl: error: of an earlier process\n", encoding="utf-8")
     program(line)
     with pytest.raises(RunFailed, match=message) as raised:
-        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+        run_jobs([job()], tmp_path, 1, threading.Event(), ignore)
     assert "\n" not in str(raised.value)
 
 
-def test_a_run_without_evaluations_is_told(tmp_path: Path, program: Callable[[str], None]) -> None:
+def test_run_without_evaluations_is_reported(
+    tmp_path: Path, program: Callable[[str], None]
+) -> None:
     program("")
     with pytest.raises(RunFailed, match=r"without an evaluation within 1,000 env steps; raise"):
-        run_jobs([job()], tmp_path, 1, threading.Event(), quietly)
+        run_jobs([job()], tmp_path, 1, threading.Event(), ignore)
 
 
-def test_nobody_else_works_on_a_run(tmp_path: Path) -> None:
+def test_run_is_locked_against_other_processes(tmp_path: Path) -> None:
     dqn = Job(algorithm="DQN", settings=flat(CONFIG), max_env_steps=10)
     with (tmp_path / "lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)

@@ -14,12 +14,12 @@ def test_seeds_are_numbers_and_ranges(text: str, seeds: tuple[int, ...]) -> None
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1-99999", "1;2", "1.5"])
-def test_other_seeds_are_refused(text: str) -> None:
+def test_invalid_seeds_are_rejected(text: str) -> None:
     with pytest.raises(ConfigError, match="--seeds"):
         parse_seeds(text)
 
 
-def test_the_papers_scale_is_the_papers() -> None:
+def test_papers_scale_has_the_papers_values() -> None:
     plan = StudyPlan("paper")
     assert plan.seeds_of_runs() == tuple(range(1, 21))
     assert {plan.steps(task, "DQN") for task in TASKS.values()} == {10_000_000}
@@ -27,7 +27,7 @@ def test_the_papers_scale_is_the_papers() -> None:
     assert {plan.config(task, 1).evaluation.eval_episodes for task in TASKS.values()} == {100}
 
 
-def test_what_is_given_wins_over_the_scale() -> None:
+def test_explicit_values_override_the_scale() -> None:
     plan = StudyPlan("paper", (4, 5), 1000, ("batch_size=64", "eval_every=77"))
     assert plan.seeds_of_runs() == (4, 5)
     assert plan.steps(TASKS["lander"]) == 1000
@@ -36,7 +36,7 @@ def test_what_is_given_wins_over_the_scale() -> None:
     assert (config.training.batch_size, config.evaluation.eval_every) == (64, 77)
 
 
-def test_a_config_is_the_preset_but_for_the_protocol() -> None:
+def test_config_is_the_preset_with_the_protocols_values() -> None:
     for task in TASKS.values():
         config = StudyPlan().config(task, 2)
         expected = preset(task.environment) | {"eval_every": 50_000, "seed": 2}
@@ -44,24 +44,24 @@ def test_a_config_is_the_preset_but_for_the_protocol() -> None:
         assert flat(config).items() >= expected.items()
 
 
-def test_an_unknown_setting_is_refused() -> None:
+def test_unknown_setting_is_rejected() -> None:
     with pytest.raises(ConfigError, match="bach_size"):
         StudyPlan(assignments=("bach_size=3",)).config(TASKS["lander"], 1)
 
 
-def test_tasks_by_name() -> None:
+def test_tasks_are_found_by_name() -> None:
     assert tasks(["sparse", "lander"]) == [TASKS["sparse"], TASKS["lander"]]
     with pytest.raises(ConfigError, match=r"task 'moon': expected one of lander"):
         tasks(["moon"])
 
 
 @pytest.mark.parametrize("name", ["lead", "seed", "environment"])
-def test_what_a_study_sets_itself_cannot_be_set(name: str) -> None:
+def test_settings_of_the_protocol_cannot_be_changed(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
         StudyPlan(assignments=(f"{name}=1",)).config(TASKS["lander"], 1, lead=2)
 
 
-def test_a_baseline_is_the_same_whatever_udrl_does() -> None:
+def test_baselines_do_not_depend_on_udrls_settings() -> None:
     usual = StudyPlan().baseline(TASKS["lander"], 3)
     other = StudyPlan(
         assignments=("last_few=7", "lead=3", "command_strategy=record", "batch_size=9")
@@ -71,7 +71,7 @@ def test_a_baseline_is_the_same_whatever_udrl_does() -> None:
     assert (shared.network.hidden, shared.seed, shared.environment) == ((8,), 3, "LunarLander-v3")
 
 
-def test_numbers_of_steps_have_suffixes_as_elsewhere() -> None:
+def test_step_counts_may_have_suffixes() -> None:
     config = StudyPlan(assignments=("eval_every=10K",)).config(TASKS["lander"], 1)
     assert config.evaluation.eval_every == 10_000
     with pytest.raises(ConfigError, match="eval_every = 'often' is not a number of steps"):

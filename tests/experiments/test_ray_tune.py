@@ -83,7 +83,7 @@ def test_each_failed_run_is_one_line_with_its_cause(
     assert os.environ["RAY_AIR_NEW_OUTPUT"] == os.environ["TUNE_PRINT_ALL_TRIAL_ERRORS"] == "0"
 
 
-def test_an_error_of_ray_is_its_first_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_ray_is_its_first_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def die(*arguments: Any) -> None:
         raise RuntimeError("The actor died unexpectedly.\n\tclass_name: ImplicitFunc")
 
@@ -110,7 +110,7 @@ def test_some_failed_runs_do_not_fail_the_search(
     ]
 
 
-def test_a_stop_interrupts_the_search(tmp_path: Path) -> None:
+def test_stop_interrupts_the_search(tmp_path: Path) -> None:
     stop = threading.Event()
     stop.set()
     lines: list[str] = []

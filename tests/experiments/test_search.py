@@ -28,7 +28,7 @@ from udrl_launch.settings import gather
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
 
 
-def test_the_papers_scale_is_the_papers() -> None:
+def test_papers_scale_has_the_papers_values() -> None:
     study = search(StudyPlan("paper"), list(TASKS.values()), ["UDRL"])
     runs = [job.config.environment for job in study.jobs]
     assert [runs.count(name) for name in ENVIRONMENTS] == [256 * 3, 256, 72]
@@ -36,7 +36,7 @@ def test_the_papers_scale_is_the_papers() -> None:
     assert {job.max_env_steps for job in study.jobs} == {10_000_000}
 
 
-def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
+def test_search_starts_from_the_papers_settings_only() -> None:
     (job,) = search(StudyPlan(), [TASKS["lander"]], ["UDRL"], 1).jobs
     buffer = job.config.buffer
     assert (buffer.max_age, buffer.recent_size, job.config.lead) == (None, 0, 0)
@@ -45,7 +45,7 @@ def test_a_search_starts_from_what_is_in_the_paper_alone() -> None:
     assert list(job.config.network.hidden) == drawn["hidden"]
 
 
-def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
+def test_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
     plan = StudyPlan(seeds=(1, 2), assignments=("eval_every=10",))
     study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN", "DQN"], 4)
     scores = dict[tuple[str, int], list[float]]()
@@ -53,7 +53,7 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
         means = [float((index * 7) % 5 + n % 3) for n in range(25)]
         number = index // 2 % 4
         if number == 3:
-            continue  # it failed
+            continue  # failed
         scores.setdefault((job.algorithm, number), []).append(fmean(means[5:]))
         job.folder(tmp_path).mkdir(parents=True)
         rows = [
@@ -69,7 +69,7 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
         (job.folder(tmp_path) / "job.json").write_bytes(msgspec.json.encode(job))
     place = StudyFolders(tmp_path, tmp_path / "search")
     place.folder.mkdir()
-    said = study.report(place)
+    text = study.report(place)
 
     found = read(place.folder / "scores.csv", Scored)
     assert len(found) == 8
@@ -78,18 +78,18 @@ def test_the_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_
     best = max((r for r in found if r.algorithm == "UDRL"), key=lambda r: r.score or -math.inf)
     kept = tomllib.loads((place.folder / "udrl-LunarLanderSparse-v3.toml").read_text())
     drawn = shipped_space("LunarLanderSparse-v3").draw("UDRL", best.configuration)
-    assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in said
+    assert (place.folder / "udrl-LunarLanderSparse-v3.toml").read_text() in text
     assert kept == preset("LunarLanderSparse-v3-paper") | drawn
     assert (place.folder / "dqn-LunarLanderSparse-v3.toml").exists()
 
 
 @pytest.mark.parametrize("name", ["batch_size", "eval_seeds", "hidden", "seed", "environment"])
-def test_what_a_search_draws_cannot_be_set(name: str) -> None:
+def test_searched_setting_cannot_be_set(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
         search(StudyPlan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
 
 
-def test_finalists_run_longer_and_the_best_of_them_becomes_a_preset(
+def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches: list[list[Job]] = []
@@ -129,15 +129,15 @@ def test_finalists_run_longer_and_the_best_of_them_becomes_a_preset(
     assert [row.final_score for row in found] == [None, 4.5, None, 6.0]
 
 
-def test_without_any_score_there_is_no_preset(tmp_path: Path) -> None:
+def test_no_preset_is_written_without_a_score(tmp_path: Path) -> None:
     study = search(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()
-    said = study.report(StudyFolders(tmp_path, tmp_path / "search"))
-    assert "every configuration has a failed run" in said
+    text = study.report(StudyFolders(tmp_path, tmp_path / "search"))
+    assert "every configuration has a failed run" in text
     assert not list((tmp_path / "search").glob("*.toml"))
 
 
-def test_an_algorithm_that_the_space_has_not_is_told() -> None:
+def test_algorithm_that_is_not_in_the_space_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"--algorithm PPO: .*LunarLander-v3 has UDRL, DQN, A2C"):
         search(StudyPlan(), [TASKS["lander"]], ["PPO"], 1)
 
@@ -159,22 +159,22 @@ gamma = [0.9, 0.99]
 
 
 @pytest.fixture
-def mine(tmp_path: Path) -> Path:
+def custom_space(tmp_path: Path) -> Path:
     file = tmp_path / "mine.toml"
     file.write_text(SPACE)
     return file
 
 
-def test_any_environment_is_searched_from_the_settings_of_a_training(mine: Path) -> None:
+def test_custom_environment_is_searched_from_the_settings_of_training(custom_space: Path) -> None:
     plan = StudyPlan(seeds=(1, 2), assignments=("n_updates_per_iter=7",))
-    study = search_environment(plan, "MountainCar-v0", mine, configurations=2)
+    study = search_environment(plan, "MountainCar-v0", custom_space, configurations=2)
     assert study.name == "search-MountainCar-v0"
     assert [(one.algorithm, one.config.seed) for one in study.jobs] == [
         (algorithm, seed) for algorithm in ("UDRL", "PPO") for _ in range(2) for seed in (1, 2)
     ]
     settings = gather("MountainCar-v0", options={"seed": 1}, assignments=plan.assignments)
     fitted = fit(settings.config, settings.automatic)
-    drawn = read_space("MountainCar-v0", mine).draw("UDRL", 1)
+    drawn = read_space("MountainCar-v0", custom_space).draw("UDRL", 1)
     assert study.jobs[3].config == change(
         fitted, seed=2, eval_seeds="search", eval_every=50_000, **drawn
     )
@@ -183,18 +183,18 @@ def test_any_environment_is_searched_from_the_settings_of_a_training(mine: Path)
     assert set(ppo.hyperparameters) == {"gamma"}
     assert list(ppo.config.network.hidden) in [[8], [16, 8]]
     assert {one.max_env_steps for one in study.jobs} == {500_000}
-    paper = search_environment(StudyPlan("paper"), "MountainCar-v0", mine)
+    paper = search_environment(StudyPlan("paper"), "MountainCar-v0", custom_space)
     assert len(paper.jobs) == 2 * 3 * 2
 
 
-def test_the_best_settings_of_any_environment_are_those_that_were_run(
-    mine: Path, tmp_path: Path
+def test_best_settings_of_a_custom_environment_are_those_of_its_run(
+    custom_space: Path, tmp_path: Path
 ) -> None:
     plan = StudyPlan(assignments=("environment_kwargs={ a = 1 }", "eval_every=10"))
     with pytest.raises(UnsupportedEnvironment):
-        search_environment(plan, "MountainCar-v0", mine)
+        search_environment(plan, "MountainCar-v0", custom_space)
     plan = StudyPlan(assignments=("wrappers=['gymnasium.wrappers:RecordEpisodeStatistics']",))
-    study = search_environment(plan, "MountainCar-v0", mine, ["UDRL"], 1)
+    study = search_environment(plan, "MountainCar-v0", custom_space, ["UDRL"], 1)
     (run,) = study.jobs
     finish(tmp_path, run)
     place = StudyFolders(tmp_path, tmp_path / study.name)
@@ -206,8 +206,8 @@ def test_the_best_settings_of_any_environment_are_those_that_were_run(
     assert change(again.config, eval_seeds="search", eval_every=50_000) == run.config
 
 
-def test_runs_of_different_configurations_have_different_descriptions(mine: Path) -> None:
-    study = search_environment(StudyPlan(), "MountainCar-v0", mine, configurations=3)
+def test_different_configurations_have_different_descriptions(custom_space: Path) -> None:
+    study = search_environment(StudyPlan(), "MountainCar-v0", custom_space, configurations=3)
     assert [one.described for one in study.jobs] == [
         f"{algorithm} configuration {number}, MountainCar-v0, seed 1: 500,000 env steps"
         for algorithm in ("UDRL", "PPO")
@@ -250,27 +250,27 @@ def test_runs_of_different_configurations_have_different_descriptions(mine: Path
         ("seeds = 2", "seeds =", r"mine\.toml is not TOML"),
     ],
 )
-def test_a_space_that_cannot_be_used_is_told(mine: Path, old: str, new: str, message: str) -> None:
-    mine.write_text(SPACE.replace(old, new))
+def test_invalid_space_is_rejected(custom_space: Path, old: str, new: str, message: str) -> None:
+    custom_space.write_text(SPACE.replace(old, new))
     with pytest.raises(ConfigError, match=message):
-        search_environment(StudyPlan(), "MountainCar-v0", mine)
+        search_environment(StudyPlan(), "MountainCar-v0", custom_space)
 
 
-def test_a_space_without_algorithms_is_told(mine: Path) -> None:
-    mine.write_text("seeds = 2")
+def test_space_without_algorithms_is_rejected(custom_space: Path) -> None:
+    custom_space.write_text("seeds = 2")
     with pytest.raises(ConfigError, match=r"no table of an algorithm; expected \[UDRL\] or"):
-        search_environment(StudyPlan(), "MountainCar-v0", mine)
+        search_environment(StudyPlan(), "MountainCar-v0", custom_space)
 
 
-def test_what_a_search_of_any_environment_draws_cannot_be_set(mine: Path) -> None:
+def test_searched_setting_of_a_custom_environment_cannot_be_set(custom_space: Path) -> None:
     with pytest.raises(ConfigError, match=r"--set batch_size=\.\.\.: this study sets batch_size"):
-        search_environment(StudyPlan(assignments=("batch_size=1",)), "MountainCar-v0", mine)
+        search_environment(StudyPlan(assignments=("batch_size=1",)), "MountainCar-v0", custom_space)
 
 
-def test_algorithms_that_cannot_act_in_the_environment_are_told(mine: Path) -> None:
+def test_algorithms_that_cannot_act_in_the_environment_are_rejected(custom_space: Path) -> None:
     with pytest.raises(ConfigError, match=r"with PPO: expected discrete actions.*--algorithm UDRL"):
-        search_environment(StudyPlan(), "Pendulum-v1", mine)
-    assert search_environment(StudyPlan(), "Pendulum-v1", mine, ["UDRL"]).jobs
+        search_environment(StudyPlan(), "Pendulum-v1", custom_space)
+    assert search_environment(StudyPlan(), "Pendulum-v1", custom_space, ["UDRL"]).jobs
 
 
 @pytest.mark.parametrize(
@@ -284,7 +284,7 @@ def test_algorithms_that_cannot_act_in_the_environment_are_told(mine: Path) -> N
         ),
     ],
 )
-def test_environment_and_space_belong_together(arguments: list[str], message: str) -> None:
+def test_environment_and_space_are_required_together(arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(study_command.study, ["search", *arguments])
     assert isinstance(result.exception, ConfigError)
     assert message in str(result.exception)

@@ -10,12 +10,12 @@ from udrl_experiments.protocol import TASKS, Algorithm
 from udrl_experiments.search_space import read_space, shipped_space
 
 ENVIRONMENTS = [task.environment for task in TASKS.values()]
-#: Those of the paper.
+#: Sizes of the paper's search spaces.
 ALGORITHMS: tuple[Algorithm, ...] = ("UDRL", "DQN", "A2C")
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
-def test_shipped_spaces_are_of_the_papers_algorithms(environment: str) -> None:
+def test_shipped_spaces_have_the_papers_algorithms(environment: str) -> None:
     space = shipped_space(environment)
     assert set(space.lists) == set(ALGORITHMS)
     logarithmic = space.lists["UDRL"]["learning_rate"]
@@ -24,7 +24,7 @@ def test_shipped_spaces_are_of_the_papers_algorithms(environment: str) -> None:
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_configurations_come_from_the_lists_and_all_values_come(
+def test_configurations_are_from_the_lists_and_cover_them(
     environment: str, algorithm: Algorithm
 ) -> None:
     space = shipped_space(environment)
@@ -39,20 +39,20 @@ def test_configurations_come_from_the_lists_and_all_values_come(
     assert all(set(one) == set(lists) for one in drawn)
 
 
-def test_a_configuration_is_a_function_of_its_number() -> None:
+def test_configuration_is_a_function_of_its_number() -> None:
     space = shipped_space("LunarLander-v3")
     assert space.draw("DQN", 5) == shipped_space("LunarLander-v3").draw("DQN", 5)
     assert space.draw("DQN", 5) != space.draw("DQN", 6)
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
-def test_every_configuration_of_udrl_is_one_that_a_run_takes(environment: str) -> None:
+def test_every_configuration_of_udrl_is_valid(environment: str) -> None:
     space = shipped_space(environment)
     for number in range(100):
         build(Config, {"environment": environment} | space.draw("UDRL", number))
 
 
-def test_a_space_is_of_one_environment(tmp_path: Path) -> None:
+def test_space_belongs_to_one_environment(tmp_path: Path) -> None:
     file = tmp_path / "space.toml"
     file.write_text('[UDRL]\nenvironment = ["CartPole-v1"]\n', encoding="utf-8")
     with pytest.raises(ConfigError, match=r"\[UDRL\] environment: .*ENV, 'Acrobot-v1'"):

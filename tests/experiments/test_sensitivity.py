@@ -8,7 +8,7 @@ from udrl_experiments.sensitivity import sensitivity
 from udrl_experiments.study import StudyFolders
 
 
-def test_an_agent_that_was_not_kept_is_told(tmp_path: Path) -> None:
+def test_missing_agent_is_reported(tmp_path: Path) -> None:
     study = sensitivity(StudyPlan(seeds=(1,)), [TASKS["sparse"]])
     (run,) = study.jobs
     expected = rf"UDRL, LunarLanderSparse-v3, seed 1.*delete {run.folder(tmp_path)} to repeat it"

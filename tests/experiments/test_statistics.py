@@ -46,7 +46,7 @@ def evaluated(
 
 
 def slow_interval(values: Sequence[float], samples: int, level: float) -> tuple[float, float]:
-    """Section 3.3 on lists: number i * samples + j chooses value i of resample j."""
+    """Section 3.3 on lists: number i * samples + j selects value i of resample j."""
     ordered, n = sorted(values), len(values)
     numbers = Stream(hashlib.sha256(b"udrl/study/bootstrap/1").digest()[:16]).uniforms(n * samples)
     means = []
@@ -67,7 +67,7 @@ def slow_interval(values: Sequence[float], samples: int, level: float) -> tuple[
 
 
 @given(RETURNS, st.integers(1, 200), st.sampled_from([0.5, 0.9, 0.95, 0.99]))
-def test_interval_is_that_of_a_slow_bootstrap(
+def test_interval_equals_that_of_a_slow_bootstrap(
     values: list[float], samples: int, level: float
 ) -> None:
     scale = max(map(abs, values))
@@ -77,7 +77,7 @@ def test_interval_is_that_of_a_slow_bootstrap(
 
 
 @given(RETURNS, st.randoms(use_true_random=False), st.floats(-1e6, 1e6))
-def test_interval_lies_within_the_values_and_moves_with_them(
+def test_interval_is_within_the_values_and_equivariant_to_shifts(
     values: list[float], random: Random, shift: float
 ) -> None:
     low, high = bootstrap_interval(values)
@@ -91,7 +91,7 @@ def test_interval_lies_within_the_values_and_moves_with_them(
 
 
 @given(st.floats(-1e300, 1e300), st.integers(1, 20))
-def test_interval_of_equal_values_is_their_value(value: float, n: int) -> None:
+def test_interval_of_equal_values_is_that_value(value: float, n: int) -> None:
     assert bootstrap_interval([value] * n) == (value, value)
 
 
@@ -103,20 +103,20 @@ def test_interval_of_many_values_is_the_normal_one() -> None:
     n = 400
     values = [NormalDist(100, 30).inv_cdf((i + 0.5) / n) for i in range(n)]
     half = 1.96 * pstdev(values) / math.sqrt(n)
-    # Five times what 20 000 resamples leave to chance: a quantile's error is 0.019 half / 1.96.
+    # Five times the random error of 20 000 resamples: a quantile's error is 0.019 half / 1.96.
     assert bootstrap_interval(values, samples=20_000) == pytest.approx(
         (100 - half, 100 + half), abs=0.05 * half
     )
 
 
-def test_interval_holds_the_true_mean_about_as_often_as_it_says() -> None:
+def test_interval_has_approximately_its_nominal_coverage() -> None:
     numbers = Stream(stream_key(1, Purpose.PROBE)).uniforms(600 * 30).reshape(600, 30)
     held = sum(low <= 0.5 <= high for low, high in map(bootstrap_interval, numbers.tolist()))
-    # Thirty values are few for a percentile bootstrap: it holds the mean in 93 to 94 of 100.
+    # Thirty values are few for a percentile bootstrap: its coverage is 93 to 94 %.
     assert 0.90 < held / 600 < 0.97
 
 
-def test_interval_of_nothing_is_an_error() -> None:
+def test_interval_of_no_values_is_an_error() -> None:
     with pytest.raises(ConfigError, match="no values for a bootstrap interval; expected"):
         bootstrap_interval([])
 
@@ -140,12 +140,12 @@ def test_score_is_the_mean_of_the_last_evaluations(
     assert score(means, last) == mean
 
 
-def test_twenty_evaluations_count_if_nothing_is_said() -> None:
+def test_score_has_twenty_evaluations_by_default() -> None:
     assert score([1e9, *[2.0] * 20]) == 2.0
 
 
 @pytest.mark.parametrize(("means", "last"), [([], 20), ([1.0], 0), ([1.0], -1)])
-def test_score_of_nothing_is_an_error(means: list[float], last: int) -> None:
+def test_score_of_no_evaluations_is_an_error(means: list[float], last: int) -> None:
     with pytest.raises(ConfigError, match=f"last {last} of {len(means)} .* expected at least one"):
         score(means, last)
 
@@ -192,11 +192,11 @@ def slow_curves(rows: Sequence[EvaluationRecord], every: int) -> Iterator[CurveP
 
 
 @given(ROWS, st.integers(1, 20))
-def test_curves_are_those_of_a_slow_search(rows: list[EvaluationRecord], every: int) -> None:
+def test_curves_equal_those_of_a_slow_search(rows: list[EvaluationRecord], every: int) -> None:
     assert curves(rows, every) == list(slow_curves(rows, every))
 
 
-def test_a_bin_that_a_seed_lacks_is_no_point() -> None:
+def test_bin_without_all_seeds_has_no_point() -> None:
     rows = [
         evaluated(1_003, 10.0, 1, wall_s=5.0), evaluated(2_000, 20.0, 1), evaluated(3_001, 30.0, 1),
         evaluated(1_999, 30.0, 2, wall_s=7.0), evaluated(3_999, 50.0, 2),
@@ -206,12 +206,12 @@ def test_a_bin_that_a_seed_lacks_is_no_point() -> None:
     assert points[0].wall_s == 6.0
 
 
-def test_the_earliest_of_two_evaluations_in_a_bin_counts() -> None:
+def test_earliest_evaluation_of_a_bin_counts() -> None:
     rows = [evaluated(1_010, 2.0), evaluated(1_005, 1.0), evaluated(1_005, 3.0)]
     assert [point.mean for point in curves(rows, 1_000)] == [1.0]
 
 
-def test_agents_and_environments_are_kept_apart_in_the_order_of_their_first_rows() -> None:
+def test_agents_and_environments_are_ordered_by_their_first_rows() -> None:
     first = evaluated(0, 1.0, variant="lead 2")
     elsewhere = msgspec.structs.replace(first, environment="TakeCover-v0")
     rows = [first, evaluated(0, 2.0, algorithm="A2C"), elsewhere, evaluated(50, 3.0, 9)]
@@ -231,7 +231,7 @@ def test_points_are_rows_of_a_tidy_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("every", [0, -1])
-def test_an_interval_that_is_not_positive_is_an_error(every: int) -> None:
+def test_nonpositive_bin_width_is_an_error(every: int) -> None:
     with pytest.raises(ConfigError, match=f"interval of {every} env steps; expected at least 1"):
         curves([], every)
 
@@ -262,13 +262,13 @@ def slow_reached(
 
 
 @given(ROWS, st.lists(st.floats(-1e3, 1e3), max_size=3))
-def test_reached_is_what_a_slow_search_finds(
+def test_reached_equals_the_result_of_a_slow_search(
     rows: list[EvaluationRecord], thresholds: list[float]
 ) -> None:
     assert reached(rows, thresholds) == list(slow_reached(rows, thresholds))
 
 
-def test_a_run_reaches_what_it_equals_and_need_not_keep_it() -> None:
+def test_threshold_is_reached_by_equality_and_need_not_be_kept() -> None:
     rows = [
         evaluated(0, -3.0, wall_s=1.0), evaluated(50, 200.0, wall_s=2.5),
         evaluated(100, 90.0, wall_s=4.0), evaluated(150, 210.0, wall_s=5.0),
@@ -277,7 +277,7 @@ def test_a_run_reaches_what_it_equals_and_need_not_keep_it() -> None:
     assert found == [(200.0, 50, 2.5), (-5, 0, 1.0), (300, None, None)]
 
 
-def test_what_was_not_reached_is_an_empty_field(tmp_path: Path) -> None:
+def test_unreached_threshold_is_an_empty_field(tmp_path: Path) -> None:
     write(tmp_path / "reached.csv", Reached, reached([evaluated(50, 1.0)], [2.0]))
     with (tmp_path / "reached.csv").open(encoding="utf-8", newline="") as file:
         (row,) = csv.DictReader(file)

@@ -27,7 +27,7 @@ def job(seed: int, max_env_steps: int = 100, variant: str = "") -> Job:
 
 
 class World:
-    """A study whose runs are only noted."""
+    """A study whose runs are only recorded."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -43,7 +43,7 @@ class World:
             self.done = list(planned)
 
         study = Study("try", jobs, self.report, run_jobs)
-        self.said = run_study(
+        self.output = run_study(
             study, self.root, side_by_side=1, resume=resume, stop=threading.Event(),
             echo=lambda text: None,
         )  # fmt: skip
@@ -54,21 +54,21 @@ def world(tmp_path: Path) -> World:
     return World(tmp_path)
 
 
-def test_runs_first_and_then_the_report(world: World) -> None:
+def test_report_follows_the_runs(world: World) -> None:
     world.conduct(job(1), job(2))
     assert world.done == [job(1), job(2)]
     assert world.reported == [StudyFolders(world.root, world.root / "try")]
-    assert world.said == "all is well"
+    assert world.output == "all is well"
 
 
-def test_what_is_done_is_written_down(world: World) -> None:
+def test_finished_study_is_recorded(world: World) -> None:
     world.conduct(job(1), job(2))
     about = json.loads((world.root / "try" / "study.json").read_text())
     assert msgspec.convert(about["runs"], list[Job]) == [job(1), job(2)]
     assert about["study"] == "try"
 
 
-def test_provenance_names_versions_and_the_kind_of_machine() -> None:
+def test_provenance_has_versions_and_the_kind_of_machine() -> None:
     found = provenance()
     assert {"udrl", "python", "torch", "numpy", "gymnasium"} <= set(found["versions"])
     assert found["machine"].cores >= 1
@@ -79,7 +79,7 @@ def test_provenance_names_versions_and_the_kind_of_machine() -> None:
     ("module", "algorithm"),
     [("matplotlib", "UDRL"), ("stable_baselines3", "A2C"), ("Box2D", "UDRL")],
 )
-def test_what_is_missing_is_told_before_the_first_run(
+def test_missing_package_is_reported_before_the_first_run(
     world: World, monkeypatch: pytest.MonkeyPatch, module: str, algorithm: Algorithm
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -91,34 +91,34 @@ def test_what_is_missing_is_told_before_the_first_run(
     assert not (world.root / "try").exists()
 
 
-def test_a_study_is_not_done_over_another(world: World) -> None:
+def test_existing_study_is_not_overwritten(world: World) -> None:
     world.conduct(job(1))
     with pytest.raises(ConfigError, match=r"already contains a study; pass --resume to resume it"):
         world.conduct(job(1))
 
 
 @pytest.mark.parametrize("jobs", [(job(1), job(2)), (job(1, 500),), (job(1), job(1, 7))])
-def test_it_goes_on_with_as_much_or_more(world: World, jobs: tuple[Job, ...]) -> None:
+def test_study_is_resumed_with_the_same_or_more_runs(world: World, jobs: tuple[Job, ...]) -> None:
     world.conduct(job(1))
     world.conduct(*jobs, resume=True)
     assert world.done == list(jobs)
 
 
 @pytest.mark.parametrize("jobs", [(job(2),), (job(1, 99),), ()])
-def test_it_does_not_go_on_with_less(world: World, jobs: tuple[Job, ...]) -> None:
+def test_study_is_not_resumed_with_fewer_runs(world: World, jobs: tuple[Job, ...]) -> None:
     world.conduct(job(1))
     with pytest.raises(ConfigError, match=r"seed 1: 100 env steps, which is not in this one"):
         world.conduct(*jobs, resume=True)
 
 
-def test_a_search_begun_without_variants_is_resumed(world: World) -> None:
+def test_search_begun_without_variants_is_resumed(world: World) -> None:
     world.conduct(job(1))
     world.conduct(job(1, variant="configuration 0"), resume=True)
     with pytest.raises(ConfigError, match=r"configuration 0, .*which is not in this one"):
         world.conduct(job(1), resume=True)
 
 
-def test_a_run_that_is_too_short_for_an_evaluation_is_refused(world: World) -> None:
+def test_run_too_short_for_an_evaluation_is_rejected(world: World) -> None:
     world.conduct(job(1, 5))
     with pytest.raises(
         ConfigError, match=r"a run of 4 env steps has no evaluation, because eval_every = 5; raise"
@@ -127,14 +127,14 @@ def test_a_run_that_is_too_short_for_an_evaluation_is_refused(world: World) -> N
     assert world.done == [job(1, 5)]
 
 
-def test_a_damaged_book_is_told(world: World) -> None:
+def test_damaged_record_is_reported(world: World) -> None:
     world.conduct(job(1))
     (world.root / "try" / "study.json").write_text('{"runs": [{}]}')
     with pytest.raises(InvalidData, match=r"study\.json.*delete it"):
         world.conduct(job(1), resume=True)
 
 
-def test_without_the_runs_there_is_no_report(world: World) -> None:
+def test_failed_runs_prevent_the_report(world: World) -> None:
     def fail(*arguments: Any) -> None:
         raise RunFailed("no")
 
@@ -146,7 +146,9 @@ def test_without_the_runs_there_is_no_report(world: World) -> None:
 
 
 @pytest.mark.parametrize(("shares_runs", "place"), [(True, "."), (False, "try")])
-def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: str) -> None:
+def test_runs_are_taken_from_other_folders(
+    tmp_path: Path, *, shares_runs: bool, place: str
+) -> None:
     other = tmp_path / "other"
     folder = job(1).folder(other / place)
     folder.mkdir(parents=True)
@@ -162,12 +164,14 @@ def test_runs_from_other_folders(tmp_path: Path, *, shares_runs: bool, place: st
         return str(job(1).evaluations(place.root)[0].mean)
 
     study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
-    said = run_study(study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
-                   echo=lambda text: None, runs_from=[other])  # fmt: skip
-    assert said == "2.0"
+    output = run_study(
+        study, tmp_path / "here", side_by_side=1, resume=False, stop=threading.Event(),
+        echo=lambda text: None, runs_from=[other],
+    )  # fmt: skip
+    assert output == "2.0"
 
 
-def test_a_source_without_runs_leaves_no_study(world: World, tmp_path: Path) -> None:
+def test_source_without_runs_creates_no_study(world: World, tmp_path: Path) -> None:
     study = Study("try", [job(1)], world.report, lambda *_: None)
     with pytest.raises(ConfigError, match=r"--runs-from .*nowhere: expected a folder of studies"):
         run_study(study, world.root, side_by_side=1, resume=False, stop=threading.Event(),
@@ -175,14 +179,14 @@ def test_a_source_without_runs_leaves_no_study(world: World, tmp_path: Path) -> 
     assert not (world.root / "try").exists()
 
 
-def test_a_strategy_that_is_not_there_is_told_before_the_first_run(world: World) -> None:
+def test_missing_strategy_is_reported_before_the_first_run(world: World) -> None:
     settings = flat(job(1).config) | {"command_strategy": "not.there:Missing"}
     with pytest.raises(ConfigError, match=r"not\.there:Missing"):
         world.conduct(job(1), msgspec.structs.replace(job(1), settings=settings))
     assert not world.done
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"--folder .*file.*choose a writable folder"):
         World(tmp_path / "file").conduct(job(1))

@@ -20,7 +20,7 @@ def job(seed: int, max_env_steps: int = 1000, variant: str = "") -> Job:
 
 
 def begin(root: Path, one: Job, env_steps: int) -> Path:
-    """Leave what a run leaves after an evaluation."""
+    """Write the files of a run that has had one evaluation."""
     folder = one.folder(root)
     folder.mkdir(parents=True)
     row = EvaluationRecord(
@@ -37,7 +37,7 @@ def plan(root: Path, name: str, *jobs: Job) -> None:
     (root / name / "study.json").write_bytes(msgspec.json.encode({"runs": jobs}))
 
 
-def test_how_far_runs_are(tmp_path: Path) -> None:
+def test_progress_of_runs(tmp_path: Path) -> None:
     done = begin(tmp_path, job(1), 1004)
     (done / "done.json").write_text(json.dumps({"max_env_steps": 1000}))
     begin(tmp_path, job(2), 400)
@@ -52,7 +52,7 @@ def test_how_far_runs_are(tmp_path: Path) -> None:
     assert job_progress(more, tmp_path) == JobProgress(more, "unfinished", 1004, 61.0, 12.5)
 
 
-def test_a_study_that_does_not_share_its_runs_has_them_in_its_folder(tmp_path: Path) -> None:
+def test_study_with_its_own_runs_has_them_in_its_folder(tmp_path: Path) -> None:
     plan(tmp_path, "lander", job(1))
     plan(tmp_path, "lead", job(1))
     begin(tmp_path / "lead", job(1), 400)
@@ -61,7 +61,7 @@ def test_a_study_that_does_not_share_its_runs_has_them_in_its_folder(tmp_path: P
     assert [name for name, _ in studies(tmp_path, ("lead",))] == ["lead"]
 
 
-def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_missing_study_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"contains no study; start one"):
         list(studies(tmp_path, ()))
     plan(tmp_path, "lander", job(1))
@@ -69,7 +69,7 @@ def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
         list(studies(tmp_path, ("moon",)))
 
 
-def test_the_table_has_a_summary_and_a_line_for_each_run() -> None:
+def test_table_has_a_summary_and_a_line_for_each_run() -> None:
     runs = [
         JobProgress(job(1, variant="lead 2"), "done", 1000, 61.0, -12.54),
         JobProgress(job(2, 2000), "not begun"),
@@ -82,7 +82,7 @@ def test_the_table_has_a_summary_and_a_line_for_each_run() -> None:
     ]
 
 
-def test_runs_of_the_papers_preset_and_of_configurations_are_named() -> None:
+def test_runs_of_the_papers_preset_and_of_configurations_are_labelled() -> None:
     runs = [
         JobProgress(msgspec.structs.replace(job(1, variant=variant), algorithm="UDRL"), "not begun")
         for variant in ("paper", "configuration 3")
@@ -93,7 +93,7 @@ def test_runs_of_the_papers_preset_and_of_configurations_are_named() -> None:
     ]
 
 
-def test_the_command_starts_nothing(tmp_path: Path) -> None:
+def test_command_starts_no_run(tmp_path: Path) -> None:
     plan(tmp_path, "lander", job(1))
     plan(tmp_path, "sparse", job(2))
     before = sorted(tmp_path.rglob("*"))

@@ -1,4 +1,4 @@
-"""Environments of other people's conventions, one for each: some are borne, others refused."""
+"""Environments that deviate from Gymnasium's conventions: some are accepted, others rejected."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 
 class Plain(gym.Env[Any, Any]):
-    """Ten steps by the book: shows the step's number and the seed; action 1 pays 1."""
+    """Ten regular steps: observes the step's number and the seed; action 1 pays 1."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
     observation_space: spaces.Space[Any] = spaces.Box(-np.inf, np.inf, (2,), np.float32)
@@ -40,7 +40,7 @@ class Plain(gym.Env[Any, Any]):
         return np.zeros((32, 32, 3), np.uint8)
 
 
-# Conventions that are borne: what is meant is plain.
+# Accepted conventions: their meaning is unambiguous.
 
 
 class ShowsFloat64(Plain):
@@ -104,7 +104,7 @@ class ClosesWithAnError(Plain):
         raise AttributeError("'NoneType' object has no attribute 'close'")
 
 
-# Conventions that are refused: what is meant, nobody can know.
+# Rejected conventions: their meaning is ambiguous.
 
 
 class ResetsToObservation(Plain):
@@ -236,7 +236,7 @@ BORNE: tuple[type[Plain], ...] = (
     EndsInIntegers, StepsToList, WantsNumpysAction, WantsAnActionOfItsSpace, ClosesWithAnError,
 )  # fmt: skip
 
-#: And what the refusal says of what came and of what was declared.
+#: For each: the error's description of the returned value and of the declared one.
 REFUSED: dict[type[Plain], tuple[str, str]] = {
     ResetsToObservation: ("an array of float32, shape (2,)", "(observation, info)"),
     ResetsToThree: ("a tuple of 3", "(observation, info)"),
@@ -265,7 +265,7 @@ REFUSED: dict[type[Plain], tuple[str, str]] = {
 
 
 def register(kind: Callable[..., gym.Env[Any, Any]], max_steps: int | None = 50) -> str:
-    """Let Gymnasium know an environment; return its id."""
+    """Register an environment with Gymnasium; return its id."""
     name = f"{getattr(kind, '__name__', 'Some')}-v0"
     gym.registry.pop(name, None)
     gym.register(name, entry_point=kind, max_episode_steps=max_steps)

@@ -1,4 +1,4 @@
-"""What environments return is checked, in the same way wherever they are used."""
+"""Return values of environments are checked wherever environments are used."""
 
 import logging
 from pathlib import Path
@@ -34,7 +34,7 @@ def episode(kind: type[Plain]) -> Episode:
 
 
 @pytest.mark.parametrize("kind", BORNE, ids=lambda kind: kind.__name__)
-def test_conventions_whose_meaning_is_plain_are_borne(kind: type[Plain]) -> None:
+def test_unambiguous_conventions_are_accepted(kind: type[Plain]) -> None:
     found, expected = episode(kind), episode(Plain)
     assert found.observations.tolist() == expected.observations.tolist()
     assert found.observations.dtype == expected.observations.dtype
@@ -43,21 +43,25 @@ def test_conventions_whose_meaning_is_plain_are_borne(kind: type[Plain]) -> None
 
 
 @pytest.mark.parametrize("kind", REFUSED, ids=lambda kind: kind.__name__)
-def test_others_are_refused_when_a_run_is_created(kind: type[Plain], tmp_path: Path) -> None:
+def test_ambiguous_conventions_are_rejected_when_a_run_is_created(
+    kind: type[Plain], tmp_path: Path
+) -> None:
     came, declared = REFUSED[kind]
     with pytest.raises(UdrlError) as refusal:
         create(tmp_path / "run", config(kind))
     assert isinstance(refusal.value, EnvironmentFault)
     assert came in str(refusal.value)
     assert declared in str(refusal.value)
-    assert not (tmp_path / "run").exists(), "there is no run that cannot begin"
+    assert not (tmp_path / "run").exists(), "no run must be created"
 
 
-# What is not finite is found when an episode is whole, and by whoever asks the network.
+# Non-finite values are found when an episode is complete, and by the network's caller.
 @pytest.mark.parametrize(
     "kind", [kind for kind in REFUSED if kind is not ShowsNan], ids=lambda kind: kind.__name__
 )
-def test_others_are_refused_by_whoever_steps_one_environment(kind: type[Plain]) -> None:
+def test_ambiguous_conventions_are_rejected_when_stepping_one_environment(
+    kind: type[Plain],
+) -> None:
     env = make_environment(config(kind))
 
     def ten_steps() -> None:
@@ -69,7 +73,7 @@ def test_others_are_refused_by_whoever_steps_one_environment(kind: type[Plain]) 
         ten_steps()
 
 
-def test_error_in_close_is_logged_and_does_no_harm(
+def test_error_in_close_is_logged_and_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "udrl"):
@@ -77,7 +81,7 @@ def test_error_in_close_is_logged_and_does_no_harm(
     assert "failed in close(): AttributeError: 'NoneType' object" in caplog.text
 
 
-def test_actions_are_of_the_spaces_own_type() -> None:
+def test_actions_have_the_type_of_the_space() -> None:
     taken = []
 
     class Watched(Plain):

@@ -1,4 +1,4 @@
-"""Datasets are read and written as their environment shows and takes things."""
+"""Datasets have the observations and actions of their environment."""
 
 import warnings
 from pathlib import Path
@@ -59,7 +59,7 @@ def config(kind: type[Plain]) -> Config:
 
 
 def record(kind: type[Plain], actions: list[int]) -> EpisodeBuffer:
-    """Play an episode in the environment itself, without us."""
+    """Record an episode in the environment itself, without udrl."""
     env = gym.make(register(kind), disable_env_checker=True)
     start = int(env.action_space.start)  # type: ignore[attr-defined]
     parts: dict[str, list[Any]] = {
@@ -76,7 +76,7 @@ def record(kind: type[Plain], actions: list[int]) -> EpisodeBuffer:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_dataset_of_an_environment_is_what_acting_in_it_gives(kind: type[Plain]) -> None:
+def test_dataset_of_an_environment_equals_acting_in_it(kind: type[Plain]) -> None:
     settings = config(kind)
     generator = EpisodeGenerator(settings, 1)
     command = Command(
@@ -94,7 +94,7 @@ def test_dataset_of_an_environment_is_what_acting_in_it_gives(kind: type[Plain])
     found = read_dataset("some/theirs-v0", settings, generator.spec)
     assert dataset_digest(found) == dataset_digest([ours])
 
-    # And what we write of it is what the environment would have: the same again, with its name.
+    # The exported dataset equals the environment's own, including its name.
     write_dataset("some/ours-v0", [ours], settings, generator.spec)
     written = minari.load_dataset("some/ours-v0")
     assert written.observation_space == env.observation_space
@@ -107,7 +107,7 @@ def test_dataset_of_an_environment_is_what_acting_in_it_gives(kind: type[Plain])
     generator.close()
 
 
-def test_dataset_names_the_environment_that_it_is_of() -> None:
+def test_dataset_has_the_id_of_its_environment() -> None:
     settings = build(Config, {"environment": "Obedience-v0", "environment_kwargs": {"steps": 4}})
     generator = EpisodeGenerator(settings, 1)
     command = Command(
@@ -122,7 +122,7 @@ def test_dataset_names_the_environment_that_it_is_of() -> None:
     assert (recovered.spec.id, recovered.spec.kwargs["steps"]) == ("Obedience-v0", 4)
 
 
-def test_dataset_of_other_spaces_is_refused() -> None:
+def test_dataset_of_other_spaces_is_rejected() -> None:
     write_dataset("some/ours-v0", [], config(ShowsStates), _spec(ShowsStates))
     with pytest.raises(ConfigError, match=r"Discrete\(20, start=-5\).*Vector\(size=2\)"):
         read_dataset("some/ours-v0", config(Plain), _spec(Plain))

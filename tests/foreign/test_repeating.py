@@ -1,4 +1,4 @@
-"""Environments that do not repeat themselves, or have changed since a run was created."""
+"""Environments that are nondeterministic, or have changed since a run was created."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -35,7 +35,7 @@ class Unseeded(Plain):
 
 
 class Changing(Plain):
-    """Eighty steps, of which those from ``late`` on pay what is paid today."""
+    """Eighty steps, of which those after ``late`` pay the current value of ``today``."""
 
     late, today = 0, 1.0
 
@@ -55,7 +55,7 @@ def train(kind: type[Plain], run_dir: Path, **more: Any) -> Status:
     return udrl.train(name, run_dir=run_dir, **SMALL | {"max_env_steps": 400} | more).status
 
 
-def test_run_of_an_unseeded_environment_goes_on_with_other_actors(tmp_path: Path) -> None:
+def test_run_of_an_unseeded_environment_resumes_with_other_actors(tmp_path: Path) -> None:
     train(Unseeded, tmp_path / "run")
     status = train(Unseeded, tmp_path / "run", resume=True, max_env_steps=800, actors=2)
     assert status.state == "ended"
@@ -64,20 +64,22 @@ def test_run_of_an_unseeded_environment_goes_on_with_other_actors(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"),
+    ("kind", "message"),
     [
         (Changing, "its first steps differ"),
         (ChangingLate, r"in episode \d+ the reward of step 7\d is 10, it was 1"),
     ],
 )
-def test_changed_environment_is_found_when_a_run_goes_on(
-    kind: type[Changing], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_changed_environment_is_detected_on_resume(
+    kind: type[Changing], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(kind, tmp_path / "run")
     monkeypatch.setattr(kind, "today", 10.0)
-    with pytest.raises(OtherConfiguration, match=rf"has changed .*{says}.*--allow-inexact"):
+    with pytest.raises(OtherConfiguration, match=rf"has changed .*{message}.*--allow-inexact"):
         train(kind, tmp_path / "run", resume=True, max_env_steps=800)
-    assert read_status(tmp_path / "run").exact, "nothing of what it does now is in the run"
+    assert read_status(tmp_path / "run").exact, (
+        "no episode of the changed environment is in the run"
+    )
 
     with closing(Store(tmp_path / "run", read_only=True)) as store:
         config = store.fact("hello", Hello).config
@@ -88,7 +90,7 @@ def test_changed_environment_is_found_when_a_run_goes_on(
     assert "has changed" in status.inexact_reason
 
 
-def test_a_liar_is_named_although_its_episodes_are_not_the_environments(
+def test_liar_is_reported_before_a_changed_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(Changing, tmp_path / "run")
@@ -101,7 +103,7 @@ def test_a_liar_is_named_although_its_episodes_are_not_the_environments(
         train(Changing, tmp_path / "run", resume=True, max_env_steps=800)
 
 
-def test_difference_is_the_first_step_that_is_another() -> None:
+def test_difference_is_the_first_differing_step() -> None:
     config = build(Config, {"environment": register(Changing, max_steps=100)})
     command = Command(
         id=0, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=7,
@@ -120,8 +122,8 @@ def test_difference_is_the_first_step_that_is_another() -> None:
 
     assert found() is None
     paid = episode.rewards[41]
-    says = f"the reward of step 41 is {paid:g}, it was {paid + 1:g}"
-    assert found(rewards=changed(episode.rewards, 41)) == says
+    message = f"the reward of step 41 is {paid:g}, it was {paid + 1:g}"
+    assert found(rewards=changed(episode.rewards, 41)) == message
     assert (
         found(observations=changed(episode.observations, 3)) == "the observation of step 3 differs"
     )

@@ -1,4 +1,4 @@
-"""Settings and circumstances that other people's environments need."""
+"""Settings and circumstances that third-party environments need."""
 
 import errno
 import os
@@ -34,13 +34,13 @@ def test_keyword_arguments_may_be_lists_and_tables(tmp_path: Path) -> None:
     layout = make_environment(config).unwrapped
     assert isinstance(layout, Layout)
     assert layout.given == NESTED
-    # It can be stored, and written as TOML.
+    # They can be stored, and written as TOML.
     create(tmp_path / "run", config).close()
     write_config(tmp_path / "run", config, Budget())
     assert read_toml(tmp_path / "run" / "config.toml")["environment_kwargs"] == NESTED
 
 
-def test_every_environment_can_learn_an_index_of_its_own() -> None:
+def test_every_environment_gets_its_own_index() -> None:
     found = []
 
     class Indexed(Plain):
@@ -51,12 +51,12 @@ def test_every_environment_can_learn_an_index_of_its_own() -> None:
     config = build(Config, {"environment": register(Indexed)})
     EpisodeGenerator(config, 3, first_index=32).close()
     assert found == [32, 33, 34]
-    make_environment(config).close()  # as whoever looks at a run does
+    make_environment(config).close()  # as commands do that only read the run
     assert found[3:] == [0]
     assert INDEX not in os.environ
 
 
-def test_what_was_made_is_closed_when_another_cannot_be_made() -> None:
+def test_created_environments_are_closed_if_another_fails() -> None:
     closed = []
 
     class Single(Plain):
@@ -78,7 +78,7 @@ def test_what_was_made_is_closed_when_another_cannot_be_made() -> None:
 
 
 class OldStyle(Plain):
-    """Its spaces and its limit are not supported, three times over."""
+    """Has two unsupported spaces and no step limit."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
@@ -86,7 +86,7 @@ class OldStyle(Plain):
         self.action_space = spaces.Text(5)
 
 
-def test_all_that_is_not_supported_is_said_at_once() -> None:
+def test_all_unsupported_features_are_listed_at_once() -> None:
     config = build(Config, {"environment": register(OldStyle, max_steps=None)})
     with pytest.raises(UnsupportedEnvironment) as refusal:
         make_environment(config)
@@ -114,7 +114,7 @@ SMALL = (
 
 
 def udrl(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the installed command where the user is, without a hint at modules."""
+    """Run the installed command in the user's folder, without PYTHONPATH."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     return subprocess.run(
         [sys.executable, "-P", "-m", "udrl_launch", *arguments],
@@ -122,7 +122,7 @@ def udrl(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def test_environments_have_the_main_thread_and_modules_of_the_user_are_found_last(
+def test_environments_run_in_the_main_thread_and_user_modules_come_last_in_the_path(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "mine.py").write_text(PROGRAM)
@@ -134,7 +134,7 @@ def test_environments_have_the_main_thread_and_modules_of_the_user_are_found_las
     assert evaluated.returncode == 0, evaluated.stderr
 
 
-def test_thread_is_named_as_the_cause_where_an_environment_wants_the_main_one() -> None:
+def test_environment_that_needs_the_main_thread_is_reported_in_another() -> None:
     class Handles(Plain):
         def __init__(self, render_mode: str | None = None) -> None:
             super().__init__(render_mode)

@@ -6,10 +6,10 @@
     .venv/bin/python -m tests.fuzz coverage --inputs 1000000
     .venv/bin/python -m tests.fuzz hypothesis --inputs 1000000
 
-``coverage`` mutates honest questions, guided by the branches of our code that they reach;
+``coverage`` mutates valid requests, guided by the branches of our code that they reach;
 ``hypothesis`` draws messages from the types of the protocol. Either ends with an error at the
 first input that raises, hangs for five seconds, takes more than a gigabyte, unbalances a ledger,
-or is accepted though it is invalid; and prints how many were answered and refused otherwise.
+or is accepted though invalid. Otherwise it prints the numbers of accepted and refused inputs.
 """
 
 import argparse
@@ -21,12 +21,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 _MOST_MIB = 1024
-#: Hypothesis remembers all that it draws, more than a kilobyte each time; so it is begun anew.
+#: Hypothesis keeps more than a kilobyte for each example; hence it is restarted.
 _ROUND = 20_000
 
 
 def main() -> None:
-    """Fuzz as the command line says."""
+    """Parse the command line and fuzz."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("engine", choices=("coverage", "hypothesis"))
     parser.add_argument("--inputs", type=int, default=1_000_000)
@@ -45,18 +45,18 @@ def main() -> None:
 
 
 def by_coverage(inputs: int, seed: int) -> None:
-    """Let libFuzzer mutate; it ends the process at the first input that fails."""
+    """Let libFuzzer mutate inputs; it ends the process at the first failure."""
     import atheris
 
     with atheris.instrument_imports(include=["udrl", "udrl_proto", "udrl_replay"]):
-        from tests.fuzz.world import Target, honest_questions, read_as_everything
+        from tests.fuzz.world import Target, decode_as_every_message, valid_requests
 
-    target = Target(honest_questions())
+    target = Target(valid_requests())
 
     def one(data: bytes) -> None:
         target(data)
-        read_as_everything(data[1:])
-        if target.accepted + target.refused == inputs:  # libFuzzer ends the process itself
+        decode_as_every_message(data[1:])
+        if target.accepted + target.refused == inputs:  # libFuzzer exits by itself
             print(f"{target.accepted:,} answered, {target.refused:,} refused", flush=True)
 
     with TemporaryDirectory() as corpus:
@@ -71,16 +71,16 @@ def by_coverage(inputs: int, seed: int) -> None:
 
 
 def by_type(inputs: int, seed: int) -> None:
-    """Draw messages of every kind, with values of every kind."""
+    """Draw messages of every type with values of every kind."""
     import hypothesis
     from hypothesis import strategies as st
 
-    from tests.fuzz.world import NAMES, Target, honest_questions, read_as_everything
+    from tests.fuzz.world import NAMES, Target, decode_as_every_message, valid_requests
     from tests.proto.strategies import messages
     from udrl_proto import verbs
     from udrl_proto.codec import encode
 
-    target = Target(honest_questions())
+    target = Target(valid_requests())
     drawn = st.sampled_from(NAMES).flatmap(
         lambda verb: messages(verbs.BY_NAME[verb].request).map(
             lambda message: bytes([NAMES.index(verb)]) + encode(message)
@@ -91,9 +91,9 @@ def by_type(inputs: int, seed: int) -> None:
         lambda given: given[0][: given[1]] + given[2] + given[0][given[1] + len(given[2]) :]
     )
 
-    def knock(data: bytes) -> None:
+    def send(data: bytes) -> None:
         target(data)
-        read_as_everything(data[1:])
+        decode_as_every_message(data[1:])
 
     for done in range(0, inputs, _ROUND):
         rounds = hypothesis.settings(
@@ -101,7 +101,7 @@ def by_type(inputs: int, seed: int) -> None:
             phases=[hypothesis.Phase.generate],
             suppress_health_check=list(hypothesis.HealthCheck),
         )  # fmt: skip
-        hypothesis.seed(seed + done)(rounds(hypothesis.given(drawn | changed)(knock)))()
+        hypothesis.seed(seed + done)(rounds(hypothesis.given(drawn | changed)(send)))()
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(
             f"{target.accepted:,} answered, {target.refused:,} refused, {memory:,.0f} MiB",

@@ -1,7 +1,7 @@
-"""A run whose every door can be knocked at without a network: whatever bytes come, what must hold.
+"""A run that is given arbitrary bytes as requests, without a network, and its invariants.
 
-What is asked of each input: one answer, which is a message of the protocol; ledgers that balance;
-no exception; and nothing accepted that a reader of ``proto/README.md`` would refuse.
+Each input must lead to one reply, which is a message of the protocol; the ledgers must balance;
+nothing raises; and nothing is accepted that is invalid by ``proto/README.md``.
 """
 
 import tempfile
@@ -57,12 +57,12 @@ CONFIG = build(
 
 NAMES = list(verbs.BY_NAME)
 
-#: Where a file is synced at once.
+#: A file system that syncs at once.
 _MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 class Query:
-    """A question by nobody."""
+    """A query without a sender."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -81,7 +81,7 @@ class Query:
 
 
 class World:
-    """One run, and a way to ask it anything."""
+    """A run that accepts requests as bytes."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(dir=_MEMORY)
@@ -95,18 +95,18 @@ class World:
         self.service.open()
 
     def close(self) -> None:
-        """Forget the run."""
+        """Close and delete the run."""
         self.service.close()
         self._store.close()
         self._folder.cleanup()
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has failed, so that most of it cannot be reached any more."""
+        """Whether the run has failed, and refuses most requests."""
         return self.service.run.progress.state != "running"
 
-    def knock(self, verb: str, data: bytes) -> Message:
-        """Ask with any bytes and return the answer, after checking all that must hold."""
+    def send_raw(self, verb: str, data: bytes) -> Message:
+        """Send any bytes, check all invariants, and return the reply."""
         query = Query(data)
         accepted = self.service.run.progress.accepted
         self._exchange.answering[key_expressions.key(self._run_id, verb)](query)
@@ -127,7 +127,7 @@ class World:
         assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
 
     def _check_accepted(self, data: bytes) -> None:
-        """Read an accepted episode by the page alone."""
+        """Decode an accepted episode by the documentation alone."""
         fields = msgpack.unpackb(data, strict_map_key=True)
         length = fields["rewards"]["shape"][0]
         assert 1 <= length <= self.spec.max_episode_steps
@@ -145,20 +145,20 @@ class World:
         assert fields["terminated"] or fields["truncated"]
 
 
-def honest_questions() -> list[tuple[str, bytes]]:
-    """Return what a learner and an actor ask in a run's first iterations, as the bytes they send.
+def valid_requests() -> list[tuple[str, bytes]]:
+    """Return the requests of a learner and an actor in a run's first iterations, encoded.
 
-    A fresh world that is asked these in order accepts them all.
+    A new world accepts them all in this order.
     """
-    world, asked = World(), []
+    world, requests = World(), []
     generator = EpisodeGenerator(CONFIG, 4)
     states: list[TrainingState] = [untrained(CONFIG, generator.spec)]
     graph = acting_graph(CONFIG.network, generator.spec)
 
     def ask(verb: str, request: Message | bytes) -> Message:
         data = request if isinstance(request, bytes) else encode(request)
-        asked.append((verb, data))
-        answer = world.knock(verb, data)
+        requests.append((verb, data))
+        answer = world.send_raw(verb, data)
         assert not isinstance(answer, Problem), answer
         return answer
 
@@ -214,7 +214,7 @@ def honest_questions() -> list[tuple[str, bytes]]:
     ask(verbs.CONTENTS.name, ContentsRequest())
     generator.close()
     world.close()
-    return asked
+    return requests
 
 
 def _train(world: World, version: int, states: list[TrainingState]) -> TrainingState:
@@ -228,9 +228,9 @@ def _train(world: World, version: int, states: list[TrainingState]) -> TrainingS
 
 
 class Target:
-    """What a fuzzer calls with one input after another."""
+    """The function that a fuzzer calls with one input after another."""
 
-    #: Inputs after which a new run is begun, so that no state is out of reach for long.
+    #: Inputs after which a new run is created, so that no state is unreachable for long.
     PERIOD = 5000
 
     def __init__(self, questions: list[tuple[str, bytes]]) -> None:
@@ -240,17 +240,17 @@ class Target:
         self.accepted = self.refused = 0
 
     def seeds(self) -> list[bytes]:
-        """Return inputs to begin with: a byte for the verb, then the payload."""
+        """Return initial inputs: a byte for the verb, then the payload."""
         return [bytes([NAMES.index(verb)]) + data for verb, data in self._questions]
 
     def __call__(self, data: bytes) -> None:
-        """Knock with one input."""
+        """Send one input."""
         if self._left == 0 or self._world is None or self._world.is_over:
             self._begin()
         self._left -= 1
         assert self._world is not None
         verb = NAMES[(data[0] if data else 0) % len(NAMES)]
-        answer = self._world.knock(verb, data[1:])
+        answer = self._world.send_raw(verb, data[1:])
         if isinstance(answer, Problem):
             self.refused += 1
         else:
@@ -261,19 +261,19 @@ class Target:
             self._world.close()
         self._world = World()
         self._left = self.PERIOD
-        # Runs are met at their beginning and at three places on their way, in turn.
+        # Runs start at the beginning and at three later states, in turn.
         skip = (self.accepted + self.refused) // self.PERIOD % 4
         for verb, data in self._questions[: len(self._questions) * skip // 4]:
-            self._world.knock(verb, data)
+            self._world.send_raw(verb, data)
 
     def close(self) -> None:
-        """End."""
+        """Close the run."""
         if self._world is not None:
             self._world.close()
 
 
-def read_as_everything(data: bytes) -> None:
-    """Read bytes as every message: each gives one that says the same again, or is refused."""
+def decode_as_every_message(data: bytes) -> None:
+    """Decode bytes as every message type: each result must round-trip, or the bytes be rejected."""
     for kind in Message.__subclasses__():
         try:
             message = decode(data, kind)

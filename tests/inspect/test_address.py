@@ -1,4 +1,4 @@
-"""Endpoints of runs on this machine, and names of services."""
+"""Endpoints of local runs, and names of services."""
 
 import fcntl
 import platform
@@ -9,41 +9,41 @@ import pytest
 from udrl_inspect.address import announced, host_name, is_of_this_machine, served_at, unique_name
 
 
-def on(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def set_hostname(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "node", lambda: host)
 
 
-def test_names_differ_and_are_known_as_this_machines() -> None:
+def test_names_are_distinct_and_recognised_as_local() -> None:
     names = [unique_name("actor") for _ in range(2)]
     assert len(set(names)) == 2
     assert all(is_of_this_machine(name, "actor") for name in names)
     assert not any(is_of_this_machine(name, "learner") for name in names)
 
 
-def test_machine_whose_name_goes_on_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    on("gpu-2", monkeypatch)
+def test_host_with_a_longer_name_is_another_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_hostname("gpu-2", monkeypatch)
     name = unique_name("actor")
-    on("gpu", monkeypatch)
+    set_hostname("gpu", monkeypatch)
     assert not is_of_this_machine(name, "actor")
 
 
-def test_long_names_differ_though_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_names_are_truncated_and_stay_distinct(monkeypatch: pytest.MonkeyPatch) -> None:
     names = []
     for pod in (
         "research-team-alpha-actor-7d9c5b6f4d-abcde",
         "research-team-alpha-actor-7d9c5b6f4d-f",
     ):
-        on(pod, monkeypatch)
+        set_hostname(pod, monkeypatch)
         names.append(host_name("actor"))
         assert len(unique_name("actor")) <= 64
     assert names[0] != names[1]
 
 
 @pytest.mark.parametrize("host", ["", "ä.ö", "a.b_c"])
-def test_any_host_makes_a_name_that_can_be_a_key(
+def test_name_of_any_host_is_valid_in_a_key_expression(
     host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on(host, monkeypatch)
+    set_hostname(host, monkeypatch)
     assert set(host_name("actor")) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ-")
 
 
@@ -57,7 +57,7 @@ def test_any_host_makes_a_name_that_can_be_a_key(
         ("tcp/[fe80::1]:7447", "tcp/[fe80::1]:7447"),
     ],
 )
-def test_a_run_that_listens_on_all_interfaces_is_reached_over_loopback(
+def test_run_on_all_interfaces_is_reached_over_loopback(
     listening: str, reached: str, tmp_path: Path
 ) -> None:
     with announced(tmp_path, listening), (tmp_path / "lock").open("w") as lock:

@@ -20,7 +20,7 @@ def checked(kind: type[Plain], **settings: Any) -> Any:
     return check(build(Config, {"environment": register(kind), "return_scale": 0.3} | settings))
 
 
-def test_what_an_environment_is_like() -> None:
+def test_report_on_an_environment() -> None:
     found = checked(Plain, horizon_scale=0.1)
     assert found.repeats
     assert (found.max_episode_steps, found.length_mean, found.episodes) == (50, 10.0, 20)
@@ -32,7 +32,7 @@ def test_what_an_environment_is_like() -> None:
     assert found.advice == ()
 
 
-def test_advice_for_what_is_unusual() -> None:
+def test_unusual_environment_gets_advice() -> None:
     class Poor(Unseeded):
         def pay(self, action: Any) -> float:
             return 0.0
@@ -50,14 +50,14 @@ def test_advice_for_what_is_unusual() -> None:
         assert part in advice
 
 
-def test_what_gymnasiums_checker_finds_is_advice() -> None:
+def test_findings_of_gymnasiums_checker_are_advice() -> None:
     class Outside(Plain):
         observation_space = spaces.Box(0, 1, (2,), np.float32)
 
     assert any("Gymnasium's checker" in sentence for sentence in checked(Outside).advice)
 
 
-def test_what_cannot_be_trained_on_is_refused() -> None:
+def test_unsupported_environment_is_rejected() -> None:
     with pytest.raises(EnvironmentFault, match=r"reset\(\) returned an array"):
         checked(ResetsToObservation)
     with pytest.raises(UnsupportedEnvironment, match="no step limit"):
@@ -65,18 +65,20 @@ def test_what_cannot_be_trained_on_is_refused() -> None:
 
 
 def test_command_prints_lines_or_json() -> None:
-    told = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
-    assert "repeats       yes, from its seed" in told.stdout
-    assert "verdict       supported; train with: udrl train CartPole-v1" in told.stdout
-    told = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
-    assert json.loads(told.stdout)["max_episode_steps"] == 500
-    told = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
+    result = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
+    assert "repeats       yes, from its seed" in result.stdout
+    assert "verdict       supported; train with: udrl train CartPole-v1" in result.stdout
+    result = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
+    assert json.loads(result.stdout)["max_episode_steps"] == 500
+    result = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
     chosen = "baseline = value, held_actions = 0.25, held_rate = 0.05, hold_steps = 32"
-    assert f"settings      {chosen}" in told.stdout
-    assert "All random episodes return" not in told.stdout  # held for 32 steps, some succeed
+    assert f"settings      {chosen}" in result.stdout
+    assert (
+        "All random episodes return" not in result.stdout
+    )  # with actions held for 32 steps, some episodes succeed
 
 
-def test_settings_that_are_left_open_are_chosen_and_named() -> None:
+def test_automatic_settings_are_chosen_and_listed() -> None:
     config = build(Config, {"environment": "FrozenLake-v1"})
     chosen = check(config, ("baseline", "n_warm_up_episodes", "horizon_scale")).chosen
     assert chosen["baseline"] == "action_value"

@@ -20,9 +20,7 @@ REACHED = st.builds(
 
 
 @given(rows=st.lists(REACHED, max_size=5))
-def test_what_is_written_is_read(
-    tmp_path_factory: pytest.TempPathFactory, rows: list[Reached]
-) -> None:
+def test_table_round_trips(tmp_path_factory: pytest.TempPathFactory, rows: list[Reached]) -> None:
     path = tmp_path_factory.mktemp("table") / "rows.csv"
     write(path, Reached, rows)
     assert read(path, Reached) == rows
@@ -32,19 +30,19 @@ def test_what_is_written_is_read(
     "text",
     ["", "seed,mean\n1,2\n", "environment,algorithm,variant,seed\nx,UDRL,,one\n", "\xff\0"],
 )
-def test_what_is_no_table_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_table_is_rejected(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rows.csv"
     path.write_text(text + "environment\nx\n", encoding="latin-1")
     with pytest.raises(InvalidData, match=r"rows\.csv: .*delete it"):
         read(path, EvaluationRecord)
 
 
-def test_a_missing_table_is_told(tmp_path: Path) -> None:
+def test_missing_table_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InvalidData, match=r"none\.csv"):
         read(tmp_path / "none.csv", Obtained)
 
 
-def test_the_first_line_names_the_columns(tmp_path: Path) -> None:
+def test_first_line_has_the_column_names(tmp_path: Path) -> None:
     write(tmp_path / "empty.csv", Obtained, [])
     first = (tmp_path / "empty.csv").read_text(encoding="utf-8")
     assert first == ",".join(f.name for f in msgspec.structs.fields(Obtained)) + "\n"

@@ -1,4 +1,4 @@
-"""A Compose project of ours with a real engine, and what one can do to it."""
+"""A Compose project with a real engine, and operations on it."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def _status(text: str) -> Status:
 
 
 def run(*command: str, timeout: float = 120, env: Mapping[str, str] | None = None) -> str:
-    """Return what a command prints; it must succeed."""
+    """Return the output of a command, which must succeed."""
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=timeout, env=os.environ | (env or {})
     )
@@ -33,32 +33,32 @@ def run(*command: str, timeout: float = 120, env: Mapping[str, str] | None = Non
 
 
 def compose_command() -> list[str]:
-    """Return how Compose is called here: v2 is a plugin, 1.29 a program.
+    """Return the command of Compose: v2 is a plugin, 1.29 a program.
 
-    Without an engine that answers, the test is skipped.
+    Skips the test without a running engine.
     """
     if shutil.which("docker") is None:
-        pytest.skip("no Docker here: the command docker is not installed")
+        pytest.skip("docker is not installed")
     engine = subprocess.run(["docker", "info"], capture_output=True, text=True, timeout=30)
     if engine.returncode != 0:
-        pytest.skip(f"no Docker engine answers: {engine.stderr.strip().splitlines()[-1]}")
+        pytest.skip(f"no Docker engine replies: {engine.stderr.strip().splitlines()[-1]}")
     plugin = subprocess.run(["docker", "compose", "version"], capture_output=True, timeout=30)
     if plugin.returncode == 0:
         return ["docker", "compose"]
     if shutil.which("docker-compose") is None:
-        pytest.skip("no Docker Compose here, neither `docker compose` nor `docker-compose`")
+        pytest.skip("neither `docker compose` nor `docker-compose` is installed")
     return ["docker-compose"]
 
 
 class Project:
-    """``compose.yaml`` and its overrides, under a name of their own.
+    """``compose.yaml`` and its overrides, as a project with its own name.
 
-    A context: when it is left nothing remains, and a failure tells what the services logged.
+    A context manager: on exit it removes everything; a failure includes the services' logs.
 
     Args:
-        name: of the project; what an earlier one of that name left is removed.
-        files: in the repository's root.
-        variables: what the files are given.
+        name: name of the project; remains of an earlier one are removed.
+        files: file names in the repository's root.
+        variables: environment variables for the files.
     """
 
     def __init__(self, name: str, files: list[str], variables: Mapping[str, str]) -> None:
@@ -78,55 +78,55 @@ class Project:
             error.add_note(self.compose("logs", "--no-color", "--timestamps", "--tail", "50"))
         self.down()
 
-    def give(self, **variables: str) -> None:
-        """Give the files other values from the next command on."""
+    def set_variables(self, **variables: str) -> None:
+        """Set variables for later commands."""
         self._variables |= variables
 
     def compose(self, *arguments: str, timeout: float = 120) -> str:
-        """Call Compose."""
+        """Run Compose."""
         return run(*self._command, *arguments, timeout=timeout, env=self._variables)
 
     def containers(self, service: str) -> list[str]:
-        """Return the ids of a service's containers, those that ended included."""
+        """Return the ids of a service's containers, including those that have exited."""
         labels = {"project": self.name, "service": service}
         filters = [f"--filter=label=com.docker.compose.{k}={v}" for k, v in labels.items()]
         return run("docker", "ps", "--all", "--quiet", *filters).split()
 
     def scale(self, actors: int) -> None:
-        """Have so many actors."""
+        """Set the number of actors."""
         self.compose("up", "--detach", "--scale", f"actor={actors}")
 
     def store(self) -> Status:
-        """Return what the run's store says, whoever works on it."""
+        """Return the run's status from the store."""
         volume = ["--volume", f"{self.name}_runs:/runs"]
         command = ["status", f"/runs/{self._variables['ENV']}", "--json"]
         return _status(run("docker", "run", "--rm", "--read-only", *volume, IMAGE, *command))
 
     def live(self, *options: str) -> Status | None:
-        """Return what the replay service answers; None while it does not."""
+        """Return the status of the replay service; None while it does not reply."""
         (replay,) = self.containers("replay")
         command = ["docker", "exec", replay, "udrl", "status", "--json", *options]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
         return _status(done.stdout) if done.returncode == 0 else None
 
     def kill(self, service: str) -> None:
-        """Kill what runs in a service's first container; its restart policy is to mend that."""
+        """Kill all processes of a service's first container; the restart policy must restart it."""
         container = self.containers(service)[0]
         before = self._restarts(container)
         subprocess.run(
             ["docker", "exec", container, "sh", "-c", "kill -9 -1"], capture_output=True, timeout=30
         )
-        wait_for(lambda: self._restarts(container) > before, f"{service} to be started again")
+        wait_for(lambda: self._restarts(container) > before, f"{service} to be restarted")
 
     def _restarts(self, container: str) -> int:
         found: Any = json.loads(run("docker", "inspect", container))
         return int(found[0]["RestartCount"])
 
     def exit_codes(self, service: str) -> list[int]:
-        """Return how a service's containers ended."""
+        """Return the exit codes of a service's containers."""
         ids = self.containers(service)
         return [int(code) for code in run("docker", "wait", *ids, timeout=300).split()]
 
     def down(self) -> None:
-        """Remove everything, the run included."""
+        """Remove everything, including the run."""
         self.compose("down", "--volumes", "--remove-orphans")

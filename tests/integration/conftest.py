@@ -57,7 +57,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
 
 @pytest.fixture(scope="session")
 def ended_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of a short run on CartPole; nobody changes it."""
+    """The directory of a short run on CartPole; tests must not change it."""
     run_dir = tmp_path_factory.mktemp("ended") / "cart"
     settings = Settings(small(), Budget(max_env_steps=3000), Fleet(actors=1, envs_per_actor=16))
     assert train(settings, run_dir, threading.Event(), in_process=True).state == "ended"

@@ -1,4 +1,4 @@
-"""Environments that fail, importable as ``flaky_environments:Flaky-v0`` and so on."""
+"""Failing environments, importable as ``flaky_environments:Flaky-v0`` and so on."""
 
 import ctypes
 from typing import Any, ClassVar
@@ -8,9 +8,9 @@ from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
 
 class Flaky(CartPoleEnv):
-    """CartPole that raises in many episodes, and never twice in the same one."""
+    """CartPole that raises in many episodes, but at most once in each."""
 
-    raised_for: ClassVar[set[int]] = set()  # seeds of training episodes
+    raised_for: ClassVar[set[int]] = set()  # reset seeds of training episodes
     _seed = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -26,7 +26,7 @@ class Flaky(CartPoleEnv):
 
 
 class Cursed(CartPoleEnv):
-    """CartPole that raises whenever it starts from the same few states."""
+    """CartPole that always raises in episodes with certain reset seeds."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         if seed is not None and seed > 1_000_100 and seed % 7 == 0:
@@ -35,7 +35,7 @@ class Cursed(CartPoleEnv):
 
 
 class Hung(CartPoleEnv):
-    """CartPole that hangs in native code, with Python's lock, when it starts from a few states."""
+    """CartPole that hangs in native code, while it holds the GIL, for certain reset seeds."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         if seed is not None and seed > 1_000_100 and seed % 7 == 0:

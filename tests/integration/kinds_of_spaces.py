@@ -1,7 +1,7 @@
 """Environments of every kind of space, importable as ``kinds_of_spaces:Nested-v0`` and so on.
 
-Each has a goal that is learned quickly: a reward for every component of the action that equals what
-the observation says.
+Each is learned quickly: it pays for every component of the action that equals its counterpart in
+the observation.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ STEPS = 8
 
 
 class Nested(gym.Env[Any, Any]):
-    """Dictionaries and tuples of everything, as observation and as action."""
+    """Dictionaries and tuples of all kinds of spaces, as observation and as action."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
 
@@ -64,7 +64,7 @@ class Nested(gym.Env[Any, Any]):
 
 
 class Reach(gym.Env[Any, Any]):
-    """One number to match with one number."""
+    """Pays if the action is close to the observed number."""
 
     def __init__(self) -> None:
         self.observation_space = spaces.Box(-1, 1, (), np.float32)

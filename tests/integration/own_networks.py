@@ -1,4 +1,4 @@
-"""Behavior functions that somebody else wrote, importable as ``own_networks:Concatenating``."""
+"""Custom behavior functions, importable as ``own_networks:Concatenating``."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from udrl.setting_groups import NetworkSettings
 
 
 class Concatenating(nn.Module):
-    """Observation and command side by side, with a layer normalisation and a constant."""
+    """Concatenates observation and command; has a layer normalisation and a constant."""
 
     def __init__(self, spec: EnvironmentSpec, network: NetworkSettings) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Concatenating(nn.Module):
 
 
 class Idle(Concatenating):
-    """Has a layer that it does not use."""
+    """Has an unused layer."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -36,7 +36,7 @@ class Idle(Concatenating):
 
 
 class Narrow(Concatenating):
-    """Returns too little."""
+    """Returns too few logits."""
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return super().forward(*inputs)[:, :1]
@@ -50,7 +50,7 @@ class Broken(Concatenating):
 
 
 class Persistent(Concatenating):
-    """Has a buffer that looks like a parameter from outside."""
+    """Has a buffer, which its state dict lists like a parameter."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -58,7 +58,7 @@ class Persistent(Concatenating):
 
 
 class NoModule:
-    """No module at all."""
+    """Is no module."""
 
     def __init__(self, *given: Any) -> None:
         pass

@@ -21,7 +21,7 @@ from whole_run import SMALL, digests, small
 SETTINGS: dict[str, Any] = {k: v for k, v in SMALL.items() if k != "environment"}
 
 
-def test_it_trains_what_the_command_trains(run: Callable[..., Status], tmp_path: Path) -> None:
+def test_training_equals_that_of_the_command(run: Callable[..., Status], tmp_path: Path) -> None:
     seen: list[Status] = []
     trained = udrl.train(
         "CartPole-v1", run_dir=tmp_path / "api", preset="none", callbacks=seen.append,
@@ -31,23 +31,23 @@ def test_it_trains_what_the_command_trains(run: Callable[..., Status], tmp_path:
     assert seen[-1] == trained.status
     assert trained.status.state == "ended"
     assert trained.run_dir == tmp_path / "api"
-    told = trained.policy
+    trained_policy = trained.policy
     seen_now = [0.0, 0.1, 0.0, -0.1]
-    assert told.logits(seen_now, 50.0, 50).tolist() == (
+    assert trained_policy.logits(seen_now, 50.0, 50).tolist() == (
         load_agent(tmp_path / "api").policy.logits(seen_now, 50.0, 50).tolist()
     )
 
 
-def test_a_callback_stops_a_run_that_can_be_resumed(
+def test_callback_stops_a_run_that_can_be_resumed(
     run: Callable[..., Status], tmp_path: Path
 ) -> None:
-    def enough(status: Status) -> bool:
+    def stop(status: Status) -> bool:
         return status.iteration < 2
 
     others: list[int] = []
     stopped = udrl.train(
         "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
-        callbacks=[enough, lambda status: others.append(status.iteration)], **SETTINGS,
+        callbacks=[stop, lambda status: others.append(status.iteration)], **SETTINGS,
     )  # fmt: skip
     assert stopped.status.state == "stopped"
     assert stopped.status.ended_because == "stopped on request"
@@ -57,7 +57,7 @@ def test_a_callback_stops_a_run_that_can_be_resumed(
     assert digests(ended.status) == digests(run(small(), budget))
 
 
-def test_events_are_passed_on_once_and_in_order(tmp_path: Path) -> None:
+def test_events_are_passed_once_and_in_order(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     iterations: list[IterationStatus] = []
     evaluations: list[EvaluationStatus] = []
@@ -74,12 +74,12 @@ def test_events_are_passed_on_once_and_in_order(tmp_path: Path) -> None:
     assert [i.iteration for i in iterations] == list(range(last.status.iteration + 1))
     with closing(Store(run_dir, read_only=True)) as store:
         found = history(store, -1)
-    # Exactly what the store has, before and after the resumption.
+    # Exactly the rows of the store, from before and after the resumption.
     assert iterations == list(found.iterations)
     assert evaluations == list(found.evaluations)
 
 
-def test_a_run_that_was_stopped_in_its_warm_up_has_all_iterations_to_come(tmp_path: Path) -> None:
+def test_run_stopped_in_its_warm_up_reports_all_iterations_on_resume(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     create(run_dir, small()).close()
     seen: list[int] = []
@@ -90,7 +90,7 @@ def test_a_run_that_was_stopped_in_its_warm_up_has_all_iterations_to_come(tmp_pa
     assert seen[:2] == [0, 1]
 
 
-def test_a_run_that_fails_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_run_calls_on_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise RunFailed("an environment crashed")
 
@@ -103,14 +103,14 @@ def test_a_run_that_fails_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("event", ["on_iteration", "on_evaluation"])
-def test_an_event_can_stop_a_run(event: str, tmp_path: Path) -> None:
+def test_event_callback_can_stop_a_run(event: str, tmp_path: Path) -> None:
     seen: list[object] = []
 
-    def enough(found: object) -> bool:
+    def stop(found: object) -> bool:
         seen.append(found)
         return False
 
-    callback: dict[str, Any] = {event: enough}
+    callback: dict[str, Any] = {event: stop}
     stopped = udrl.train(
         "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
         **callback, **SETTINGS,
@@ -119,7 +119,7 @@ def test_an_event_can_stop_a_run(event: str, tmp_path: Path) -> None:
     assert stopped.status.state == "stopped"
 
 
-def test_a_run_directory_can_be_loaded(ended_run: Path, tmp_path: Path) -> None:
+def test_run_directory_can_be_loaded(ended_run: Path, tmp_path: Path) -> None:
     policy, agent = udrl.load(ended_run), load_agent(ended_run)
     seen = [0.0, 0.1, 0.0, -0.1]
     assert policy.logits(seen, 50.0, 50).tolist() == agent.policy.logits(seen, 50.0, 50).tolist()
@@ -138,14 +138,16 @@ def test_a_run_directory_can_be_loaded(ended_run: Path, tmp_path: Path) -> None:
         udrl.load(ended_run, 10**6)
 
 
-def test_a_run_that_ends_with_its_warm_up_has_no_agent(tmp_path: Path) -> None:
+def test_run_that_ends_with_its_warm_up_has_no_agent(tmp_path: Path) -> None:
     trained = udrl.train("CartPole-v1", run_dir=tmp_path / "run", max_env_steps=1, **SETTINGS)
     assert trained.status.state == "ended"
     with pytest.raises(StoreError, match="nothing was trained"):
         _ = trained.policy
 
 
-def test_a_new_directory_is_made_in_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_directory_is_created_in_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     trained = udrl.train(
         "Figure2-v0", max_env_steps=60, n_warm_up_episodes=5, n_episodes_per_iter=5,
@@ -155,7 +157,7 @@ def test_a_new_directory_is_made_in_runs(tmp_path: Path, monkeypatch: pytest.Mon
     assert (trained.run_dir / "run.sqlite").exists()
 
 
-def test_what_cannot_be_trained(tmp_path: Path) -> None:
+def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="did you mean 'batch_size'"):
         udrl.train("CartPole-v1", batchsize=3)
     with pytest.raises(ConfigError, match="resume needs run_dir"):

@@ -1,4 +1,4 @@
-"""An actor that lies about its episodes is found among honest ones, over the wire."""
+"""An actor that delivers false episodes is identified among honest ones."""
 
 import threading
 from collections.abc import Callable
@@ -22,7 +22,7 @@ BUDGET = 600
 FLEET = Fleet(actors=3, envs_per_actor=2)
 
 
-def test_honest_actors_agree_and_the_result_stays(run: Callable[..., Status]) -> None:
+def test_honest_actors_agree_and_the_result_is_unchanged(run: Callable[..., Status]) -> None:
     audited = run(toy(lead=2), BUDGET, actors=3, audit=0.5)
     assert audited.audit.rate == 0.5
     assert audited.audit.agreed > 20
@@ -33,7 +33,7 @@ def test_honest_actors_agree_and_the_result_stays(run: Callable[..., Status]) ->
     assert digests(audited) == digests(run(toy(lead=2), BUDGET))
 
 
-def test_liar_ends_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_liar_fails_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     liars: list[str] = []
     lock = threading.Lock()
 
@@ -48,16 +48,16 @@ def test_liar_ends_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     monkeypatch.setattr(udrl_actor.outbox, "encode_episode", lie)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
-    def go(*, resume: bool) -> None:
+    def run_training(*, resume: bool) -> None:
         train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
               resume=resume)  # fmt: skip
 
     with pytest.raises(UdrlError, match=r"lied|quarantined"):
-        go(resume=False)
+        run_training(resume=False)
     status = status_of(tmp_path / "run")
     assert status.state == "failed"
     assert [actor.id for actor in status.quarantined] == liars
     assert f"actor {liars[0]} lied" in status.problem
     assert_conserved(status)
     with pytest.raises(Deceived, match=liars[0]):
-        go(resume=True)
+        run_training(resume=True)

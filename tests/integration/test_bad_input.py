@@ -1,4 +1,4 @@
-"""Bad input gets a clear error: the value, what was expected, the remedy; within five seconds."""
+"""Bad input is rejected within five seconds, with the value, what was expected, and the remedy."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -50,7 +50,7 @@ def refusal(process: Cli) -> tuple[int, str]:
         (["evaluate", "nowhere", "--weights", "new"], "latest, best or a version number"),
     ],
 )
-def test_bad_argument_is_named_with_the_remedy(
+def test_bad_argument_is_rejected_with_the_remedy(
     given: list[str], expected: str, cli: Callable[..., Cli]
 ) -> None:
     code, error = refusal(cli(*given))
@@ -67,7 +67,7 @@ def taken_port() -> Iterator[int]:
         yield taken.getsockname()[1]
 
 
-def test_port_in_use_is_refused(taken_port: int, cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_port_in_use_is_rejected(taken_port: int, cli: Callable[..., Cli], tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{taken_port}"
     for command in ("replay", "train"):
         run_dir = tmp_path / command
@@ -76,11 +76,11 @@ def test_port_in_use_is_refused(taken_port: int, cli: Callable[..., Cli], tmp_pa
         assert code == 2
         assert endpoint in error
         assert "in use" in error
-        assert not run_dir.exists()  # so that another port can be tried
+        assert not run_dir.exists()  # so that another port can be chosen
 
 
 @pytest.mark.parametrize("role", ["actor", "learner"])
-def test_endpoint_that_nobody_answers_is_reported(role: str, cli: Callable[..., Cli]) -> None:
+def test_endpoint_without_a_reply_is_reported(role: str, cli: Callable[..., Cli]) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     code, error = refusal(cli(role, "--connect", endpoint))
     assert code == 6
@@ -98,7 +98,7 @@ def test_run_directory_with_a_run_is_not_overwritten(
     assert "--resume" in error
 
 
-def test_run_directory_that_leads_nowhere_is_named(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_invalid_run_directory_is_rejected(cli: Callable[..., Cli], tmp_path: Path) -> None:
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     code, error = refusal(cli("train", "Figure2-v0", "--run-dir", str(loop)))
@@ -107,7 +107,7 @@ def test_run_directory_that_leads_nowhere_is_named(cli: Callable[..., Cli], tmp_
     assert "Too many levels of symbolic links" in error
 
 
-def test_run_directory_of_another_configuration_is_refused(
+def test_run_directory_of_another_configuration_is_rejected(
     cli: Callable[..., Cli], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -117,7 +117,7 @@ def test_run_directory_of_another_configuration_is_refused(
     assert "batch_size = 64, not 32" in error
 
 
-def test_run_directory_in_use_is_refused(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_run_directory_in_use_is_rejected(cli: Callable[..., Cli], tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     given = arguments(TOY, 10_000_000, run_dir)
     cli(*given)

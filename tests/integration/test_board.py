@@ -1,4 +1,4 @@
-"""The board's server on real runs: its news, its refusals and its stage."""
+"""The board's server on real runs: updates, access, and the stage."""
 
 import json
 import os
@@ -47,7 +47,7 @@ def client(ended_run: Path) -> Iterator[TestClient]:
         yield client
 
 
-# What it tells.
+# Updates.
 
 
 def scripts(client: TestClient) -> list[str]:
@@ -59,7 +59,7 @@ def scripts(client: TestClient) -> list[str]:
     return found
 
 
-def test_the_page_and_its_parts(client: TestClient) -> None:
+def test_page_and_its_assets_are_served(client: TestClient) -> None:
     main = client.get("/")
     assert "<title>udrl board</title>" in main.text
     assert "default-src 'none'" in main.headers["content-security-policy"]
@@ -67,10 +67,12 @@ def test_the_page_and_its_parts(client: TestClient) -> None:
     for part in ("board.css", "vendor/uplot/LICENSE", *scripts(client)):
         assert client.get(f"/{part}").status_code == 200
     assert client.get("/../app.py").status_code == 404
-    assert "://" not in main.text.replace("http://www.w3.org", ""), "the page is self-contained"
+    assert "://" not in main.text.replace("http://www.w3.org", ""), (
+        "the page must be self-contained"
+    )
 
 
-def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
+def test_updates_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
     news = client.get("/news", params={"after": -1}).json()
     status = read_status(ended_run)
     assert msgspec.convert(news["status"], Status) == status
@@ -81,7 +83,7 @@ def test_news_of_an_ended_run(client: TestClient, ended_run: Path) -> None:
     assert client.get("/news", params=known).json()["iterations"] == []
 
 
-def test_news_of_what_the_agent_obeys(ended_run: Path, tmp_path: Path) -> None:
+def test_updates_have_the_report_on_obedience(ended_run: Path, tmp_path: Path) -> None:
     run_dir = Path(shutil.copytree(ended_run, tmp_path / "run"))
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=2, episodes=2))
@@ -91,7 +93,7 @@ def test_news_of_what_the_agent_obeys(ended_run: Path, tmp_path: Path) -> None:
     assert (found["answer"], found["weights_version"]) == (summary(report), agent.version)
 
 
-def test_several_runs(ended_run: Path, tmp_path: Path) -> None:
+def test_several_runs_are_listed(ended_run: Path, tmp_path: Path) -> None:
     other = Path(shutil.copytree(ended_run, tmp_path / "other"))
     app = make_app(Feed(Directory(ended_run)), Feed(Directory(other)))
     with TestClient(app, base_url="http://127.0.0.1") as client:
@@ -107,13 +109,15 @@ def test_several_runs(ended_run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("after", ["x", "1.5", "--1", "9" * 40])
-def test_bad_questions(client: TestClient, after: str) -> None:
+def test_invalid_queries_are_rejected(client: TestClient, after: str) -> None:
     answer = client.get("/news", params={"after": after})
     assert answer.status_code == 400
     assert "expected an iteration" in answer.text
 
 
-def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_stored_and_served_run_give_the_same_updates(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
     endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
     process = cli(*arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
     wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 3, "some iterations")
@@ -124,7 +128,7 @@ def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_pat
         stored = Stored(run_dir)
         assert served.hello().run_id == directory.hello().run_id == stored.hello().run_id
         assert served.status().actors
-        assert directory.status().actors, "the service of a directory is queried"
+        assert directory.status().actors, "the service of the directory must be queried"
         first = served.history(-1).iterations[:3]
         assert first == directory.history(-1).iterations[:3] == stored.history(-1).iterations[:3]
         assert served.contents().returns
@@ -140,7 +144,7 @@ def test_a_stored_and_a_served_run_say_the_same(cli: Callable[..., Cli], tmp_pat
         assert directory.weights("latest") == stored.weights("latest")
 
 
-def test_a_service_that_hangs_is_not_queried_again_at_once(
+def test_unresponsive_service_is_not_queried_again_at_once(
     cli: Callable[..., Cli], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = tmp_path / "run"
@@ -157,7 +161,7 @@ def test_a_service_that_hangs_is_not_queried_again_at_once(
             assert "the board shows the run's file: " in directory.doubt()
 
             def query(*_: object) -> None:
-                raise AssertionError("it is queried again at once")
+                raise AssertionError("queried again at once")
 
             with monkeypatch.context() as patch:
                 patch.setattr(Served, "_query", query)
@@ -165,13 +169,13 @@ def test_a_service_that_hangs_is_not_queried_again_at_once(
         finally:
             os.kill(service, signal.SIGCONT)
         monkeypatch.setattr(source, "_SILENT_S", 0.0)
-        wait_for(lambda: directory.status().actors and not directory.doubt(), "an answer")
+        wait_for(lambda: directory.status().actors and not directory.doubt(), "a reply")
 
 
-# Who may look.
+# Access.
 
 
-def test_a_board_has_a_name(ended_run: Path) -> None:
+def test_board_checks_the_host_header(ended_run: Path) -> None:
     with page(ended_run, hosts=("127.0.0.1", "localhost")) as client:
         assert client.get("/").status_code == 200
         answer = client.get("/", headers={"host": "evil.example"})
@@ -180,11 +184,11 @@ def test_a_board_has_a_name(ended_run: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [{"host": "["}, {"origin": "http://["}])
-def test_headers_that_cannot_be_read(client: TestClient, bad: dict[str, str]) -> None:
+def test_invalid_headers_are_rejected(client: TestClient, bad: dict[str, str]) -> None:
     assert client.get("/", headers=bad).status_code == 400
 
 
-def test_boards_do_not_take_each_others_cookies(ended_run: Path) -> None:
+def test_boards_use_different_cookies(ended_run: Path) -> None:
     jar: dict[str, str] = {}
     with page(ended_run, token="one") as one, page(ended_run, token="two") as two:
         for client, token in ((one, "one"), (two, "two")):
@@ -199,7 +203,7 @@ def test_boards_do_not_take_each_others_cookies(ended_run: Path) -> None:
 @pytest.mark.parametrize(
     "strange", ['prefs={"theme":"dark"}', "a b c", "a/b=1", "a@b=1", "[x]=1", "=", "x=é"]
 )
-def test_cookies_of_other_programs_do_no_harm(ended_run: Path, strange: str) -> None:
+def test_foreign_cookies_are_ignored(ended_run: Path, strange: str) -> None:
     with page(ended_run, token="secret") as client:
         client.get("/", params={"token": "secret"})
         ((name, value),) = client.cookies.items()
@@ -209,7 +213,7 @@ def test_cookies_of_other_programs_do_no_harm(ended_run: Path, strange: str) -> 
             assert client.get("/news", headers=headers).status_code == 200  # type: ignore[arg-type]
 
 
-def test_pages_of_elsewhere_may_not_use_it(client: TestClient) -> None:
+def test_cross_origin_requests_are_rejected(client: TestClient) -> None:
     assert client.get("/news", headers={"origin": "http://evil.example"}).status_code == 403
     assert client.get("/news", headers={"origin": "http://127.0.0.1"}).status_code == 200
     with (
@@ -220,7 +224,7 @@ def test_pages_of_elsewhere_may_not_use_it(client: TestClient) -> None:
     assert refused.value.code == 1008
 
 
-def test_a_token_is_asked_for_and_becomes_a_cookie(ended_run: Path) -> None:
+def test_token_is_required_and_becomes_a_cookie(ended_run: Path) -> None:
     with page(ended_run, token="open-sesame") as client:
         for path in ("/", "/news", "/board.js"):
             answer = client.get(path)
@@ -251,7 +255,7 @@ def start(**changes: Any) -> dict[str, Any]:
 
 
 def moments(socket: Any) -> Iterator[dict[str, Any]]:
-    """Yield moments, with their pictures under the name that they have as a promise."""
+    """Yield moments, each with its frame under the announced name."""
     while True:
         moment = socket.receive_json()
         if moment.get("picture"):
@@ -272,7 +276,7 @@ def played(run_dir: Path, *options: object) -> dict[str, Any]:
     return report
 
 
-def test_the_stage_shows_the_episode_that_play_shows(client: TestClient, ended_run: Path) -> None:
+def test_stage_shows_the_episode_of_play(client: TestClient, ended_run: Path) -> None:
     with client.websocket_connect("/stage") as socket:
         for temperature in (1.0, 0.0):
             socket.send_json(start(temperature=temperature))
@@ -292,7 +296,7 @@ def test_the_stage_shows_the_episode_that_play_shows(client: TestClient, ended_r
             assert last["version"] == load_agent(ended_run).version
 
 
-def test_pause_step_and_another_command_on_the_way(client: TestClient) -> None:
+def test_pause_step_and_a_changed_command(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         seen = moments(socket)
         socket.send_json(start(paused=True))
@@ -304,9 +308,9 @@ def test_pause_step_and_another_command_on_the_way(client: TestClient) -> None:
         socket.send_json(
             {"do": "change", "desired_return": 90.0, "desired_horizon": 70, "temperature": 0.0}
         )
-        told = next(seen)
-        assert (told["desired_return"], told["desired_horizon"]) == (90.0, 70)
-        assert (told["step"], told["is_changed"], told["temperature"]) == (2, True, 0.0)
+        changed = next(seen)
+        assert (changed["desired_return"], changed["desired_horizon"]) == (90.0, 70)
+        assert (changed["step"], changed["is_changed"], changed["temperature"]) == (2, True, 0.0)
         socket.send_json({"do": "pause", "paused": False})
         last = ending(socket)
         assert last["is_changed"]
@@ -332,7 +336,7 @@ def test_speed_changes_no_episode_and_delays_no_request(
         assert obtained[0] == obtained[1]
 
 
-def test_a_checkpoint_of_the_run_can_be_chosen(client: TestClient, ended_run: Path) -> None:
+def test_checkpoint_of_the_run_can_be_selected(client: TestClient, ended_run: Path) -> None:
     kept = client.get("/news").json()["contents"]["versions"]
     assert len(kept) > 1
     with client.websocket_connect("/stage") as socket:
@@ -350,7 +354,7 @@ def test_a_checkpoint_of_the_run_can_be_chosen(client: TestClient, ended_run: Pa
      json.dumps(start(seed=-1)), json.dumps(start(temperature=-1.0)),
      json.dumps(start(surplus=1, desired_horizon=2**40))],
 )  # fmt: skip
-def test_invalid_requests(client: TestClient, request_: str) -> None:
+def test_invalid_requests_are_reported(client: TestClient, request_: str) -> None:
     with client.websocket_connect("/stage") as socket:
         socket.send_text(request_)
         assert "invalid request" in socket.receive_json()["problem"]
@@ -358,7 +362,7 @@ def test_invalid_requests(client: TestClient, request_: str) -> None:
         assert next(moments(socket))["step"] == 0
 
 
-def test_requests_before_an_episode_do_nothing(client: TestClient) -> None:
+def test_requests_before_an_episode_have_no_effect(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         for request in (
             {"do": "step"},
@@ -370,7 +374,7 @@ def test_requests_before_an_episode_do_nothing(client: TestClient) -> None:
         assert next(moments(socket))["step"] == 0
 
 
-def test_leaving_amid_a_flood_of_requests_frees_the_stage(client: TestClient) -> None:
+def test_disconnecting_during_many_requests_frees_the_stage(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         for _ in range(300):
             socket.send_json(start())
@@ -380,7 +384,7 @@ def test_leaving_amid_a_flood_of_requests_frees_the_stage(client: TestClient) ->
         assert next(moments(socket))["step"] == 0
 
 
-def test_a_refused_request_does_not_end_the_episode(client: TestClient) -> None:
+def test_rejected_request_does_not_end_the_episode(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         seen = moments(socket)
         socket.send_json(start(paused=True))
@@ -391,7 +395,7 @@ def test_a_refused_request_does_not_end_the_episode(client: TestClient) -> None:
         assert next(seen)["step"] == 1
 
 
-def test_an_exception_of_a_picture_is_shown(
+def test_exception_while_rendering_is_reported(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(rollout: object) -> None:
@@ -405,7 +409,7 @@ def test_an_exception_of_a_picture_is_shown(
         assert trouble["is_over"]
 
 
-def test_after_a_failure_an_episode_can_start(
+def test_episode_can_start_after_a_failure(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with client.websocket_connect("/stage") as socket:
@@ -417,7 +421,7 @@ def test_after_a_failure_an_episode_can_start(
         assert ending(socket)["over"]
 
 
-def test_what_a_change_does_not_name_stays_as_it_is(client: TestClient) -> None:
+def test_fields_missing_in_a_change_stay_unchanged(client: TestClient) -> None:
     with client.websocket_connect("/stage") as socket:
         socket.send_json(start(paused=True, desired_return=33.0, desired_horizon=44))
         next(moments(socket))
@@ -428,7 +432,7 @@ def test_what_a_change_does_not_name_stays_as_it_is(client: TestClient) -> None:
         assert moment["is_changed"]
 
 
-def test_an_idle_stage_is_closed(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_stage_is_closed(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     with client.websocket_connect("/stage") as socket:
         socket.send_json(start(paused=True))
         next(moments(socket))
@@ -440,7 +444,7 @@ def test_an_idle_stage_is_closed(client: TestClient, monkeypatch: pytest.MonkeyP
         assert "without a request" in left.value.reason
 
 
-def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_stages_is_limited(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board, "MOST_STAGES", 1)
     with client.websocket_connect("/stage") as first:
         first.send_json(start(paused=True))
@@ -452,7 +456,7 @@ def test_there_are_so_many_stages(client: TestClient, monkeypatch: pytest.Monkey
         assert next(moments(third))["step"] == 0
 
 
-def test_an_environment_without_pictures_is_played_all_the_same(
+def test_environment_without_rendering_is_played(
     run: Callable[..., Status], tmp_path: Path
 ) -> None:
     from whole_run import toy
@@ -465,7 +469,7 @@ def test_an_environment_without_pictures_is_played_all_the_same(
         assert last["step"] in (1, 2)
 
 
-def test_actions_of_several_components(run: Callable[..., Status], tmp_path: Path) -> None:
+def test_actions_with_several_components(run: Callable[..., Status], tmp_path: Path) -> None:
     run(build(Config, SETTINGS), 400, run_dir=tmp_path / "nested")
     with page(tmp_path / "nested") as client, client.websocket_connect("/stage") as socket:
         socket.send_json(start(desired_horizon=8))
@@ -486,7 +490,7 @@ HUB, UNDER = "https://hub.example", "/user/board"
 
 
 class Proxy:
-    """Shows a board under a path of another host, as a reverse proxy does."""
+    """Serves a board under a path of another host, as a reverse proxy does."""
 
     def __init__(self, board: ASGIApp, host: str) -> None:
         self._board = board
@@ -494,7 +498,7 @@ class Proxy:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "lifespan":
-            assert scope["path"].startswith(UNDER), "the board led out of its path"
+            assert scope["path"].startswith(UNDER), "link outside of the board's path"
             path = scope["path"].removeprefix(UNDER)
             headers = [(k, self._host if k == b"host" else v) for k, v in scope["headers"]]
             scope = dict(scope) | {"path": path, "raw_path": path.encode(), "headers": headers}
@@ -502,7 +506,7 @@ class Proxy:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8765", "hub.example"])
-def test_a_proxy_may_show_the_board_under_a_path(ended_run: Path, host: str) -> None:
+def test_board_works_under_a_path_of_a_proxy(ended_run: Path, host: str) -> None:
     board = make_app(
         Feed(Directory(ended_run)), hosts=("127.0.0.1", "hub.example"), token="t", origins=(HUB,)
     )
@@ -513,7 +517,7 @@ def test_a_proxy_may_show_the_board_under_a_path(ended_run: Path, host: str) -> 
         assert main.url == f"{HUB}{UNDER}/"
         assert "<title>udrl board</title>" in main.text
         (cookie,) = client.cookies.jar
-        assert cookie.path == UNDER, "no other page behind the proxy gets it"
+        assert cookie.path == UNDER, "other pages behind the proxy must not get it"
         for part in re.findall(r'(?:src|href)="([^"#]+)"', main.text):
             assert client.get(main.url.join(part), headers=own).status_code == 200
         assert client.get(main.url.join("news"), headers=own).status_code == 200
@@ -526,7 +530,7 @@ def test_a_proxy_may_show_the_board_under_a_path(ended_run: Path, host: str) -> 
         assert "--allow-origin https://evil.example" in strange.text
 
 
-def test_the_page_of_an_unknown_proxy_says_how_to_allow_it(ended_run: Path) -> None:
+def test_page_of_an_unknown_proxy_explains_how_to_allow_it(ended_run: Path) -> None:
     board = make_app(Feed(Directory(ended_run)))
     with TestClient(Proxy(board, "127.0.0.1"), base_url=HUB) as client:
         answer = client.get(f"{UNDER}/news", headers={"origin": HUB})
@@ -537,7 +541,7 @@ def test_the_page_of_an_unknown_proxy_says_how_to_allow_it(ended_run: Path) -> N
 # The command.
 
 
-def test_the_command_refuses_what_cannot_be(tmp_path: Path, ended_run: Path) -> None:
+def test_command_rejects_invalid_arguments(tmp_path: Path, ended_run: Path) -> None:
     def call(*words: object) -> None:
         CliRunner().invoke(
             command, list(map(str, words)), standalone_mode=False, catch_exceptions=False
@@ -561,12 +565,14 @@ def test_the_command_refuses_what_cannot_be(tmp_path: Path, ended_run: Path) -> 
             call(ended_run, "--allow-origin", origin)
 
 
-def test_beyond_loopback_a_token_is_made(cli: Callable[..., Cli], ended_run: Path) -> None:
+def test_listening_beyond_loopback_creates_a_token(
+    cli: Callable[..., Cli], ended_run: Path
+) -> None:
     process = cli("board", str(ended_run), "--host", "0.0.0.0").process
     assert process.stdout is not None
-    said = process.stdout.readline()
-    # By a name that other machines may know it by, which 0.0.0.0 is not.
-    assert said.startswith(f"board: http://{socket.gethostname()}:")
-    assert len(said.split("?token=")[1].strip()) >= 20
+    line = process.stdout.readline()
+    # By a name that other machines may use, unlike 0.0.0.0.
+    assert line.startswith(f"board: http://{socket.gethostname()}:")
+    assert len(line.split("?token=")[1].strip()) >= 20
     process.terminate()
     assert process.wait(20) == 128 + signal.SIGTERM

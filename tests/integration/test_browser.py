@@ -1,4 +1,4 @@
-"""The board in a real browser: it shows a live run, takes commands, and is self-contained."""
+"""The board in a real browser: live runs, commands, accessibility."""
 
 import os
 import re
@@ -42,12 +42,12 @@ from whole_run import (
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
-#: What keeps Chromium from calling home.
+#: Disables Chromium's own connections.
 _ALONE = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update",
 ]  # fmt: skip
-#: Milliseconds that a page gets on a slow machine.
+#: Timeout in milliseconds, for slow machines.
 SOON = 20_000
 
 
@@ -55,7 +55,7 @@ SOON = 20_000
 def browser() -> Iterator[Browser]:
     path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
-        pytest.skip("no Chromium here; name one with the environment variable CHROMIUM")
+        pytest.skip("no Chromium found; set the environment variable CHROMIUM")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=_ALONE)
         yield browser
@@ -64,13 +64,13 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def pages(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Open pages that may talk to loopback only, and must not fail."""
+    """Open pages that may connect to loopback only, and must not raise errors."""
     wrong: list[str] = []
     contexts = []
 
     def watch(url: str) -> None:
         if urlsplit(url).hostname not in ("127.0.0.1", None):
-            wrong.append(f"asked for {url}")
+            wrong.append(f"requested {url}")
 
     def start(url: str, **options: Any) -> Page:
         contexts.append(browser.new_context(**options))
@@ -102,14 +102,14 @@ def board(cli: Callable[..., Cli]) -> Callable[..., str]:
     def start(*words: object) -> str:
         process = cli("board", *map(str, words)).process
         assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.startswith("board: "), said
-        return said.split()[1]
+        line = process.stdout.readline()
+        assert line.startswith("board: "), line
+        return line.split()[1]
 
     return start
 
 
-#: An episode may be over before a click from here arrives.
+#: Slow enough that an episode is not over before a click arrives.
 PAUSE_AT_ONCE = """() => {
     const button = document.getElementById("pause");
     new MutationObserver((_, observer) => {
@@ -126,7 +126,7 @@ def start(page: Page, desired_return: float, horizon: int = 4, seed: int = 1) ->
 
 
 def fact(page: Page, name: str, facts: str = "#moment") -> Any:
-    """Return the value of a number with a name."""
+    """Return the value of a named number."""
     return page.locator(f"{facts} div").filter(has=page.get_by_text(name, exact=True)).locator("dd")
 
 
@@ -134,7 +134,7 @@ def rows(page: Page) -> Any:
     return page.locator("#episodes tbody tr")
 
 
-def test_a_live_run_appears_and_its_curve_grows(
+def test_live_run_appears_and_its_curve_grows(
     cli: Callable[..., Cli], board: Callable[..., str], pages: Callable[..., Page], tmp_path: Path
 ) -> None:
     endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
@@ -171,7 +171,7 @@ def test_a_live_run_appears_and_its_curve_grows(
 
 
 def read_at_the_end(page: Page) -> str:
-    """Return what the cursor reads at the right end of the curve."""
+    """Return the cursor's reading at the right end of the curve."""
     page.locator("#curve").scroll_into_view_if_needed()
     box = page.locator("#curve .u-over").bounding_box()
     assert box is not None
@@ -180,7 +180,7 @@ def read_at_the_end(page: Page) -> str:
 
 
 def read_after_zooming(page: Page) -> str:
-    """Drag the middle of the curve open; return what the cursor reads at its right end then."""
+    """Zoom into the middle of the curve; return the cursor's reading at its new right end."""
     before = read_at_the_end(page)
     box = page.locator("#curve .u-over").bounding_box()
     assert box is not None
@@ -193,7 +193,7 @@ def read_after_zooming(page: Page) -> str:
     return after
 
 
-def test_a_command_is_given_and_obeyed(
+def test_given_command_is_obeyed(
     board: Callable[..., str], pages: Callable[..., Page], obedient: Path
 ) -> None:
     page = pages(board(obedient))
@@ -211,7 +211,7 @@ def test_a_command_is_given_and_obeyed(
     expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
 
 
-def test_keyboard_only(
+def test_keyboard_operation(
     board: Callable[..., str], pages: Callable[..., Page], obedient: Path
 ) -> None:
     page = pages(board(obedient))
@@ -248,7 +248,7 @@ def test_keyboard_only(
     assert rows(page).first.locator("td").all_text_contents()[1] == "2"
 
 
-def test_a_command_is_changed_during_the_episode(
+def test_command_is_changed_during_the_episode(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     page = pages(board(ended_run))
@@ -267,12 +267,12 @@ def test_a_command_is_changed_during_the_episode(
     expect(fact(page, "desired return now")).to_have_text("77")
     expect(page.locator(".primary")).to_have_text("Resume")
     expect(page.locator("#picture")).to_be_visible()
-    # Enter in a field changes the command too, and does not start another episode.
+    # Enter in a field changes the command too, without starting another episode.
     page.get_by_label("Desired horizon, steps", exact=True).fill("55")
     page.keyboard.press("Enter")
     expect(fact(page, "desired horizon now")).to_have_text("55 steps")
     expect(page.locator("#map .active")).to_have_count(1)
-    # What is no number changes nothing; neither does another temperature.
+    # Invalid numbers have no effect, nor has another temperature.
     page.get_by_label("Desired return", exact=True).fill("")
     change.click()
     page.get_by_label("Greedy").check()
@@ -286,7 +286,7 @@ def test_a_command_is_changed_during_the_episode(
 
 
 @pytest.mark.parametrize("settings", [LANDER | {"max_episode_steps": 120}, TAKE_COVER])
-def test_the_agent_is_watched_in_its_world(
+def test_environment_is_shown(
     settings: dict[str, Any], board: Callable[..., str], pages: Callable[..., Page],
     run: Callable[..., Status], tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -311,7 +311,7 @@ def test_the_agent_is_watched_in_its_world(
     assert height > 100
 
 
-def test_the_map_is_clicked_and_says_whether_there_are_similar_episodes(
+def test_map_sets_the_command_and_shows_whether_similar_episodes_exist(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     url = board(ended_run)
@@ -328,7 +328,7 @@ def test_the_map_is_clicked_and_says_whether_there_are_similar_episodes(
     chosen = [
         float(page.locator(f"#desired-{what}").input_value()) for what in ("return", "horizon")
     ]
-    # On CartPole a return is a length: few points of the plane are possible.
+    # On CartPole, returns equal lengths: few points of the plane are possible.
     assert chosen[0] < chosen[1]
     expect(page.locator("#map .chosen.outside")).to_have_count(0)
     page.get_by_label("Desired return", exact=True).fill("100000")
@@ -336,19 +336,19 @@ def test_the_map_is_clicked_and_says_whether_there_are_similar_episodes(
     expect(page.locator("#map .chosen.outside")).to_have_count(1)
 
 
-def test_the_map_shows_which_returns_the_agent_obeys(
+def test_map_shows_the_obeyed_returns(
     board: Callable[..., str], pages: Callable[..., Page], obedient: Path, tmp_path: Path
 ) -> None:
     run_dir = Path(shutil.copytree(obedient, tmp_path / "run"))
     page = pages(board(run_dir))
-    said, shaded = page.locator("#obeys"), page.locator("#map rect.obeys")
-    expect(said).to_contain_text(f"udrl obedience {run_dir}", timeout=SOON)
+    caption, shaded = page.locator("#obeys"), page.locator("#map rect.obeys")
+    expect(caption).to_contain_text(f"udrl obedience {run_dir}", timeout=SOON)
     expect(shaded).to_have_count(0)
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=5, episodes=20, temperature=0.0))
     save_report(run_dir, report)
-    expect(said).to_have_text(summary(report), timeout=SOON)
-    expect(said).to_contain_text("Command returns between 0 and 4")
+    expect(caption).to_have_text(summary(report), timeout=SOON)
+    expect(caption).to_contain_text("Command returns between 0 and 4")
     expect(shaded).to_have_count(1)
     left, right = shaded.bounding_box(), page.locator("#map svg").bounding_box()
     assert left is not None
@@ -356,13 +356,13 @@ def test_the_map_shows_which_returns_the_agent_obeys(
     assert 0.5 * right["width"] < left["width"] < right["width"]
     latest = report.weights_version
     save_report(run_dir, msgspec.structs.replace(report, weights_version=latest - 1, obeyed=None))
-    expect(said).to_contain_text(
+    expect(caption).to_contain_text(
         f"Measured with weights version {latest - 1}; the latest is {latest}.", timeout=SOON
     )
     expect(shaded).to_have_count(0)
 
 
-def test_the_server_dies_and_comes_back(
+def test_page_reconnects_to_a_restarted_server(
     cli: Callable[..., Cli], pages: Callable[..., Page], obedient: Path
 ) -> None:
     port = str(free_port())
@@ -382,24 +382,24 @@ def test_the_server_dies_and_comes_back(
     expect(rows(page)).to_have_count(2, timeout=SOON)
 
 
-def test_the_cursor_reads_the_curve(
+def test_cursor_reads_the_curve(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     page = pages(board(ended_run))
-    said, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
+    caption, curve = page.locator("#curve-said"), page.locator("#curve .u-over")
     final = read_status(ended_run).final_evaluation
     assert final is not None
-    expect(said).to_contain_text("best evaluation", timeout=SOON)
-    summary = said.inner_text()
+    expect(caption).to_contain_text("best evaluation", timeout=SOON)
+    summary = caption.inner_text()
     box = curve.bounding_box()
     assert box is not None
     curve.hover(position={"x": box["width"] - 2, "y": 20})
-    expect(said).to_contain_text(f"final evaluation {final.mean:,.1f}".removesuffix(".0"))
+    expect(caption).to_contain_text(f"final evaluation {final.mean:,.1f}".removesuffix(".0"))
     page.mouse.move(0, 0)
-    expect(said).to_have_text(summary)
+    expect(caption).to_have_text(summary)
 
 
-def test_a_failed_run_says_why_and_how_to_resume(
+def test_failed_run_shows_the_reason_and_how_to_resume(
     board: Callable[..., str], pages: Callable[..., Page], run: Callable[..., Status],
     tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -413,7 +413,7 @@ def test_a_failed_run_says_why_and_how_to_resume(
     expect(page.locator("#next")).to_contain_text(f"Fix the cause, then resume the run: {again}")
 
 
-def test_a_stopped_run_says_how_to_resume(
+def test_stopped_run_shows_how_to_resume(
     cli: Callable[..., Cli], board: Callable[..., str], pages: Callable[..., Page], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -448,7 +448,7 @@ def test_several_runs_are_compared(
     expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
 
 
-def test_quarantined_actors_are_named(
+def test_quarantined_actors_are_listed(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -461,7 +461,7 @@ def test_quarantined_actors_are_named(
     )
 
 
-def test_presets_are_commands_of_the_buffer(
+def test_presets_are_commands_from_the_buffer(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     url = board(ended_run)
@@ -505,7 +505,7 @@ def test_actions_of_several_components_have_names(
     expect(fact(page, "last action")).to_have_text(re.compile(r"^[123](, (on|off)){2}(, \S+){2}$"))
 
 
-def test_on_a_phone_the_picture_and_pause_are_seen_together(
+def test_phone_layout_shows_frame_and_pause_together(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path
 ) -> None:
     page = pages(board(ended_run), viewport={"width": 400, "height": 800})
@@ -522,12 +522,12 @@ def test_on_a_phone_the_picture_and_pause_are_seen_together(
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [400, 1200])
-def test_it_is_accessible_and_fits(
+def test_page_is_accessible_and_fits_the_window(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, scheme: str, width: int
 ) -> None:
     page = pages(
         board(ended_run), viewport={"width": width, "height": 800}, color_scheme=scheme,
-        bypass_csp=True,  # the checker is put into the page
+        bypass_csp=True,  # injects the checker into the page
     )  # fmt: skip
     expect(page.locator("#curve canvas")).to_be_visible(timeout=SOON)
     start(page, 50, 50)

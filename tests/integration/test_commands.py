@@ -1,4 +1,4 @@
-"""The other commands: status, evaluate, and joining by hand."""
+"""Commands: status, evaluate, health, and services started by hand."""
 
 import json
 import re
@@ -66,7 +66,7 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
     assert (run_dir / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_usual_training_warns_of_nothing_and_says_why_it_ended(
+def test_usual_training_warns_of_nothing_and_prints_its_reason_to_end(
     cli: Callable[..., Cli], tmp_path: Path
 ) -> None:
     code, out, error = cli(
@@ -84,7 +84,7 @@ def test_budget_spent_in_the_warm_up_trains_nothing(
     code, out, error = cli(*arguments(TOY, 1, tmp_path / "run"), "--in-process").finish()
     assert code == 0, error
     assert "none: the warm-up spent the budget; raise --max-env-steps" in error
-    assert json.loads(out)["weights_version"] == 0, "with --json there is nothing else"
+    assert json.loads(out)["weights_version"] == 0, "--json must print nothing else"
 
 
 def test_resuming_an_ended_run_returns_at_once(cli: Callable[..., Cli], tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_health_of_each_service(cli: Callable[..., Cli], tmp_path: Path) -> None
         service = cli(role, "--connect", endpoint)
         wait_for(partial(has_health, role, 0), f"a healthy {role}")
         service.process.kill()
-        wait_for(partial(has_health, role, 6), f"no {role} any more")
+        wait_for(partial(has_health, role, 6), f"{role} to be gone")
 
 
 def test_light_commands_do_not_load_torch(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The Python of the documentation runs, as it stands there."""
+"""The Python examples of the documentation run as printed."""
 
 import os
 import re
@@ -24,7 +24,7 @@ BLOCKS = re.findall(
 
 @pytest.fixture
 def agent(tmp_path: Path) -> Path:
-    """Make the folder that the examples load: an agent that nobody has trained."""
+    """Create the folder that the examples load: an untrained agent."""
     settings = {k: v for k, v in preset("LunarLander-v3").items() if k != "max_env_steps"}
     config = build(Config, settings)
     env = make_environment(config)
@@ -36,7 +36,7 @@ def agent(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_there_is_python_to_run() -> None:
+def test_documentation_has_python_examples() -> None:
     assert [("udrl.train" in block, "udrl.load" in block) for block in BLOCKS] == [
         (True, False),
         (False, True),
@@ -46,7 +46,7 @@ def test_there_is_python_to_run() -> None:
 
 @pytest.mark.parametrize("block", BLOCKS, ids=["train", "load", "batch"])
 def test_examples_run(agent: Path, block: str) -> None:
-    # As written, but for the length of the training.
+    # As printed, except for the length of the training.
     code = block.replace("max_env_steps=100_000", "max_env_steps=1_000")
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=agent, env=os.environ, capture_output=True, text=True,

@@ -33,7 +33,7 @@ def test_services_at_lead_0_equal_the_reference(
 
 @pytest.mark.parametrize("lead", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize(("make", "budget"), CASES)
-def test_result_does_not_depend_on_actors_or_environments(
+def test_result_is_independent_of_actors_and_environments(
     make: Callable[..., Config], budget: int, lead: int, run: Runner
 ) -> None:
     results = [
@@ -55,9 +55,7 @@ def test_another_seed_gives_another_result(run: Runner) -> None:
 
 
 @pytest.mark.parametrize("lead", [0, 2])
-def test_resumed_run_equals_one_that_was_longer_from_the_start(
-    lead: int, run: Runner, tmp_path: Path
-) -> None:
+def test_resumed_run_equals_an_uninterrupted_one(lead: int, run: Runner, tmp_path: Path) -> None:
 
     config, run_dir = small(lead=lead), tmp_path / "short"
     first = run(config, 2000, run_dir=run_dir)
@@ -65,7 +63,7 @@ def test_resumed_run_equals_one_that_was_longer_from_the_start(
     straight = run(config, 4000)
     assert first.iteration < longer.iteration
     assert digests(longer) == digests(straight)
-    assert longer.eval_env_steps > straight.eval_env_steps  # it was closed twice
+    assert longer.eval_env_steps > straight.eval_env_steps  # its final evaluation ran twice
 
 
 def test_resuming_an_ended_run_with_the_same_budget_changes_nothing(

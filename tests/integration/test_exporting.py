@@ -1,4 +1,4 @@
-"""``udrl export``, and what others read of it."""
+"""``udrl export`` and its output."""
 
 import os
 import re
@@ -41,7 +41,7 @@ def folder(ended_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_folder_holds_the_runs_agent(ended_run: Path, folder: Path) -> None:
+def test_folder_has_the_runs_agent(ended_run: Path, folder: Path) -> None:
     agent, loaded = load_agent(ended_run), udrl.load(folder)
     seen = [0.1, 0.2, -0.3, 0.4]
     assert loaded.logits(seen, 70.0, 50).tolist() == agent.policy.logits(seen, 70.0, 50).tolist()
@@ -50,7 +50,7 @@ def test_the_folder_holds_the_runs_agent(ended_run: Path, folder: Path) -> None:
     )  # fmt: skip
 
 
-def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
+def test_card_has_the_hubs_metadata(ended_run: Path, folder: Path) -> None:
     card = ModelCard.load(folder / "README.md")
     last = read_status(ended_run).final_evaluation
     assert last is not None
@@ -61,7 +61,7 @@ def test_the_card_is_one_for_the_hub(ended_run: Path, folder: Path) -> None:
     assert card.data.library_name == "udrl"
 
 
-def test_the_cards_example_runs(folder: Path) -> None:
+def test_example_of_the_card_runs(folder: Path) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)
     subprocess.run(
         [sys.executable, "-W", "error", "-c", example + "assert terminated or truncated"],
@@ -69,7 +69,7 @@ def test_the_cards_example_runs(folder: Path) -> None:
     )  # fmt: skip
 
 
-def test_the_cards_command_trains_the_same_agent(
+def test_command_of_the_card_trains_the_same_agent(
     folder: Path, tmp_path: Path, cli: Callable[..., Cli]
 ) -> None:
     (command,) = re.findall(r"```sh\nudrl (.*)\n```", (folder / "README.md").read_text())
@@ -80,25 +80,23 @@ def test_the_cards_command_trains_the_same_agent(
     assert "this command trains bit-identical weights" in (folder / "README.md").read_text()
 
 
-def test_earlier_weights_have_the_evaluation_that_was_theirs(
-    ended_run: Path, tmp_path: Path
-) -> None:
+def test_earlier_weights_have_their_own_evaluation(ended_run: Path, tmp_path: Path) -> None:
     with closing(Store(ended_run, read_only=True)) as store:
         version = store.evaluations(-1, 10**9)[0].iteration - small().lead
     export(ended_run, "--folder", tmp_path / "best", "--weights", version)
     card = (tmp_path / "best" / "README.md").read_text()
-    told = re.search(r"\*\*Mean return.*desired return of (\S+) within (\d+) steps", card)
-    assert told is not None
+    found = re.search(r"\*\*Mean return.*desired return of (\S+) within (\d+) steps", card)
+    assert found is not None
     loaded = udrl.load(tmp_path / "best")
-    assert f"{loaded.desired_return:.1f}" == told[1]
-    assert str(loaded.desired_horizon) == told[2]
-    # It does not end with these, and does not say so.
+    assert f"{loaded.desired_return:.1f}" == found[1]
+    assert str(loaded.desired_horizon) == found[2]
+    # The command does not end with these weights, and the card must not claim so.
     assert f"version {version} of this command's run has bit-identical weights" in card
     assert "this command trains bit-identical weights" not in card
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_model_for_onnx(ended_run: Path, tmp_path: Path) -> None:
+def test_onnx_model_is_exported(ended_run: Path, tmp_path: Path) -> None:
     path = tmp_path / "agent.onnx"
     assert str(path) in export(ended_run, "--onnx", path)
     model = onnxruntime.InferenceSession(str(path))
@@ -107,7 +105,7 @@ def test_a_model_for_onnx(ended_run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_what_cannot_be_exported(ended_run: Path, tmp_path: Path) -> None:
+def test_invalid_exports_are_rejected(ended_run: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nothing to export"):
         export(ended_run)
     with pytest.raises(ConfigError, match="is the directory of a run"):

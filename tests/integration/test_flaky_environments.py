@@ -1,4 +1,4 @@
-"""An environment that fails costs an episode's time, or stops the run and says which command."""
+"""A failing environment costs time, or stops the run and reports the command."""
 
 import os
 import sys
@@ -19,16 +19,16 @@ from udrl_replay.store import Store
 from whole_run import assert_conserved, digests, free_port, live_status, small, wait_for
 
 
-def test_environment_that_raises_now_and_then_changes_nothing(run: Callable[..., Status]) -> None:
+def test_environment_that_sometimes_raises_changes_no_result(run: Callable[..., Status]) -> None:
     flaky_environments.Flaky.raised_for.clear()
     flaky = run(small(environment="flaky_environments:Flaky-v0"), 2000, actors=2)
-    # What fails after the run's end, under commands that are cancelled, nobody counts.
+    # Failures after the run's end, in cancelled commands, are not counted.
     raised = len(flaky_environments.Flaky.raised_for)
     assert 10 < raised - flaky.commands.cancelled <= flaky.env_failures <= raised
     assert digests(flaky) == digests(run(small(), 2000))
 
 
-def test_command_that_always_fails_stops_the_run_and_can_be_reproduced(
+def test_command_that_always_raises_stops_the_run_and_can_be_reproduced(
     run: Callable[..., Status], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "cursed"
@@ -43,7 +43,7 @@ def test_command_that_always_fails_stops_the_run_and_can_be_reproduced(
         reproduce(run_dir, command_id)
 
 
-def test_command_that_always_hangs_stops_the_run_and_is_named(
+def test_command_that_always_hangs_stops_the_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
@@ -68,7 +68,7 @@ def test_command_that_always_hangs_stops_the_run_and_is_named(
                 name, "actor", "--connect", endpoint, "--patience", "60", "--hang-timeout", "2"
             )
         with pytest.raises(RunFailed, match=r"udrl reproduce RUN_DIR \d+") as caught:
-            wait_for(ended, "the end", timeout=100)
+            wait_for(ended, "the run to end", timeout=100)
     finally:
         supervisor.end()
     assert caught.value.exit_code == 9

@@ -1,4 +1,4 @@
-"""A disk that fills up stops the run; with space again it goes on as if nothing had been."""
+"""A full disk stops the run; with free space, it resumes with the same result."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ BUDGET = 6000
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of one megabyte; only root may make one."""
+    """A file system of one megabyte; needs root."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "udrl-test", str(folder)]
@@ -41,7 +41,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-def test_run_whose_disk_is_full_stops_and_goes_on_with_more_space(
+def test_run_stops_on_a_full_disk_and_resumes_with_free_space(
     disk: Path, cli: Callable[..., Cli], run: Callable[..., Status]
 ) -> None:
     run_dir = disk / "run"
@@ -68,7 +68,7 @@ def test_run_whose_disk_is_full_stops_and_goes_on_with_more_space(
 
 
 @pytest.mark.parametrize("more_pages", [4, 10, 20, 40])
-def test_store_that_may_not_grow_keeps_its_ledgers(
+def test_store_that_cannot_grow_keeps_its_ledgers_balanced(
     more_pages: int, run: Callable[..., Status], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -81,7 +81,7 @@ def test_store_that_may_not_grow_keeps_its_ledgers(
     services = Threads(run_dir, store, settings, endpoint, insecure=False, keys=None)
     try:
         with pytest.raises(StoreError, match="disk is full; nothing acknowledged is lost"):
-            wait_for(services.check, "the end of the run")
+            wait_for(services.check, "the run to end")
     finally:
         services.end()
     stopped = live_status(run_dir)

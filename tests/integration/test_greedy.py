@@ -1,4 +1,4 @@
-"""Who asks for greedy acting is told where sampled acting does far better."""
+"""A warning if greedy actions obtain far less than sampled ones."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def sampled(ended_run: Path) -> Evaluation:
     return Evaluation(found.mean, found.std, found.ci95_low, found.ci95_high, found.episodes)
 
 
-def test_far_worse_is_said_with_both_returns(
+def test_far_lower_return_is_warned_of_with_both_returns(
     agent: Agent, ended_run: Path, greedy: Command, sampled: Evaluation
 ) -> None:
     low = sampled.mean - 2 * sampled.std
@@ -44,22 +44,24 @@ def test_far_worse_is_said_with_both_returns(
 
 
 @pytest.mark.parametrize("deviations", [-1.0, 0.0, 0.9])
-def test_not_far_worse_is_not_worth_a_word(
+def test_slightly_lower_return_is_not_warned_of(
     agent: Agent, ended_run: Path, greedy: Command, sampled: Evaluation, deviations: float
 ) -> None:
     assert not caution(agent, ended_run, greedy, [sampled.mean - deviations * sampled.std] * 100)
 
 
-def test_one_unlucky_episode_proves_nothing(
+def test_one_bad_episode_is_not_warned_of(
     agent: Agent, ended_run: Path, greedy: Command, sampled: Evaluation
 ) -> None:
     assert not caution(agent, ended_run, greedy, [sampled.mean - 1.5 * sampled.std])
     assert not caution(agent, ended_run, greedy, [])
 
 
-def test_what_cannot_be_compared_is_not(agent: Agent, ended_run: Path, greedy: Command) -> None:
-    for told in (replace(greedy, temperature=1.0), replace(greedy, desired_return=1.0)):
-        assert not caution(agent, ended_run, told, [-1e6] * 20)
+def test_incomparable_evaluations_are_not_warned_of(
+    agent: Agent, ended_run: Path, greedy: Command
+) -> None:
+    for other in (replace(greedy, temperature=1.0), replace(greedy, desired_return=1.0)):
+        assert not caution(agent, ended_run, other, [-1e6] * 20)
     of_greedy_run = agent._replace(config=change(agent.config, eval_temperature=0.0))
     assert not caution(of_greedy_run, ended_run, greedy, [-1e6] * 20)
 
@@ -68,16 +70,16 @@ def test_what_cannot_be_compared_is_not(agent: Agent, ended_run: Path, greedy: C
     ("command", "module"),
     [("evaluate", "inspection_commands"), ("play", "play_command")],
 )
-def test_commands_say_it_beside_their_results(
+def test_commands_print_the_warning_to_stderr(
     ended_run: Path, monkeypatch: pytest.MonkeyPatch, command: str, module: str
 ) -> None:
     given: list[float] = []
 
-    def said(agent: Agent, run_dir: Path, told: Command, returns: list[float]) -> str:
+    def fake_caution(agent: Agent, run_dir: Path, other: Command, returns: list[float]) -> str:
         given.extend(returns)
-        return f"temperature {told.temperature:g}"
+        return f"temperature {other.temperature:g}"
 
-    monkeypatch.setattr(f"udrl_launch.subcommands.{module}.caution", said)
+    monkeypatch.setattr(f"udrl_launch.subcommands.{module}.caution", fake_caution)
     result = CliRunner().invoke(
         cli, [command, str(ended_run), "--episodes", "2", "--greedy", "--json"],
         standalone_mode=False, catch_exceptions=False,
@@ -87,7 +89,7 @@ def test_commands_say_it_beside_their_results(
     assert len(given) == 2
 
 
-def test_help_gives_no_greedy_example() -> None:
+def test_help_has_no_greedy_example() -> None:
     for name in ("evaluate", "play"):
         command = cli.get_command(click.Context(cli), name)
         assert command is not None

@@ -1,4 +1,4 @@
-"""Agents on the Hugging Face Hub, played by a server on this machine."""
+"""Uploads to and downloads from a local stand-in for the Hugging Face Hub."""
 
 import base64
 import hashlib
@@ -24,13 +24,13 @@ TOKEN = "hf_secret"
 
 
 class Hub(ThreadingHTTPServer):
-    """What the Hub answers to uploads and downloads of small files in model repositories."""
+    """The Hub's replies to uploads and downloads of small files in model repositories."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.files: dict[str, bytes] = {}
         self.commits: list[dict[str, Any]] = []
-        self.private: bool | None = None  # None: there is no repository
+        self.private: bool | None = None  # None: no repository
         self.claimed_size: int | None = None
 
     @property
@@ -119,7 +119,7 @@ def hub() -> Iterator[Hub]:
 
 
 def run(hub: Hub, home: Path, *arguments: object, token: str = TOKEN) -> tuple[int, str, str]:
-    """Run Python with this Hub, whose address huggingface_hub reads when it is imported."""
+    """Run Python with this Hub; huggingface_hub reads its address on import."""
     environment = os.environ | {
         "HF_ENDPOINT": hub.address, "HF_HOME": str(home), "HF_TOKEN": token,
         "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_PROGRESS_BARS": "1",
@@ -149,7 +149,7 @@ LOAD = (
 )
 
 
-def test_an_agent_is_uploaded_in_one_commit_and_loaded_again(
+def test_agent_is_uploaded_in_one_commit_and_loaded_again(
     ended_run: Path, tmp_path: Path, hub: Hub
 ) -> None:
     code, out, err = export(hub, tmp_path, ended_run)
@@ -189,7 +189,7 @@ def test_an_agent_is_uploaded_in_one_commit_and_loaded_again(
 
 
 @pytest.mark.parametrize(("private", "options"), [(False, []), (True, ["--public"])])
-def test_a_repository_of_another_visibility_is_left_alone(
+def test_repository_of_another_visibility_is_not_changed(
     ended_run: Path, tmp_path: Path, hub: Hub, private: bool, options: list[str]
 ) -> None:
     hub.private = private
@@ -200,13 +200,13 @@ def test_a_repository_of_another_visibility_is_left_alone(
     assert not hub.commits
 
 
-def test_a_public_repository_is_asked_for(ended_run: Path, tmp_path: Path, hub: Hub) -> None:
+def test_public_repository_is_created_on_request(ended_run: Path, tmp_path: Path, hub: Hub) -> None:
     code, _, err = export(hub, tmp_path, ended_run, "--public")
     assert code == 0, err
     assert hub.private is False
 
 
-def test_what_the_hub_refuses_is_told(ended_run: Path, tmp_path: Path, hub: Hub) -> None:
+def test_error_of_the_hub_is_reported(ended_run: Path, tmp_path: Path, hub: Hub) -> None:
     code, _, err = export(hub, tmp_path, ended_run, token="hf_other")
     assert code == 2
     assert "udrl: error: the Hub refused me/lander: " in err
@@ -217,14 +217,14 @@ def test_what_the_hub_refuses_is_told(ended_run: Path, tmp_path: Path, hub: Hub)
     assert out.startswith("ConfigError: a/b/c: ")
 
 
-def test_a_hub_that_does_not_answer_is_unreachable(tmp_path: Path) -> None:
+def test_unresponsive_hub_is_unreachable(tmp_path: Path) -> None:
     with Hub() as closed:
         pass
     _, out, err = run(closed, tmp_path, "-c", LOAD, "hf://me/lander")
     assert out.startswith("Unreachable: the Hugging Face Hub did not answer for me/lander: "), err
 
 
-def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub.errors", None)
     with pytest.raises(ConfigError, match=r'pip install "udrl\[hub\]"'):
         udrl.load("hf://me/lander")

@@ -1,4 +1,4 @@
-"""Runs with keys give what runs without give, and show nobody a key."""
+"""Runs with keys: the same results as without, and no key in any output."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -33,7 +33,7 @@ BUDGET = 3000
 
 
 def secrets_of(keys_dir: Path) -> list[str]:
-    """Return a line of each private key."""
+    """Return one line of each private key."""
     files = [*keys_dir.rglob("key.pem"), *keys_dir.rglob("ca.key")]
     assert len(files) == 5
     return [file.read_text().splitlines()[1] for file in files]
@@ -43,12 +43,12 @@ def test_run_with_keys_equals_one_without(run: Callable[..., Status], keys_dir: 
     assert digests(run(small(), BUDGET, actors=2, keys=keys_dir)) == digests(run(small(), BUDGET))
 
 
-def test_services_that_have_only_their_own_keys_equal_one_process(
+def test_services_with_their_own_keys_only_equal_one_process(
     cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
 ) -> None:
     port, run_dir = free_port(), tmp_path / "run"
     config = toml(SMALL | {"max_env_steps": BUDGET}, tmp_path / "config.toml")
-    # Beyond loopback, and without --insecure.
+    # Beyond loopback, but without --insecure.
     replay = cli(
         "replay", "CartPole-v1", "--listen", f"tls/0.0.0.0:{port}", "--run-dir", str(run_dir),
         "--preset", "none", "--config", str(config), "--keys", str(keys_dir / "replay"),
@@ -67,7 +67,7 @@ def test_services_that_have_only_their_own_keys_equal_one_process(
     assert load_agent(run_dir).weights == (run_dir / "weights.safetensors").read_bytes()
 
 
-def test_services_meet_at_a_router_of_somebody_else(
+def test_services_meet_at_an_external_router(
     cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
 ) -> None:
     endpoint, run_dir = f"tls/127.0.0.1:{free_port()}", tmp_path / "run"
@@ -91,7 +91,7 @@ def test_services_meet_at_a_router_of_somebody_else(
 
 
 @pytest.mark.slow
-def test_killed_services_come_back_with_their_keys(
+def test_killed_services_restart_with_their_keys(
     cli: Callable[..., Cli], run: Callable[..., Status], keys_dir: Path, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
@@ -102,7 +102,7 @@ def test_killed_services_come_back_with_their_keys(
     assert digests(process.status()) == digests(run(small(), 2 * BUDGET))
 
 
-def test_status_of_a_live_run_needs_an_observers_key(
+def test_status_of_a_live_run_requires_an_observers_key(
     cli: Callable[..., Cli], keys_dir: Path, foreign_keys_dir: Path, tmp_path: Path
 ) -> None:
     port, run_dir = free_port(), tmp_path / "run"
@@ -115,11 +115,11 @@ def test_status_of_a_live_run_needs_an_observers_key(
     def actors() -> list[int]:
         try:
             return [a.environments for a in status_of(run_dir, keys_dir / "observer").actors]
-        except UdrlError:  # there is no run yet
+        except UdrlError:  # no run yet
             return []
 
     wait_for(lambda: actors() == [16], "an actor")
-    assert status_of(run_dir).actors == ()  # without a key it is what the store says
+    assert status_of(run_dir).actors == ()  # without a key, the status is read from the store
     for place in ((str(run_dir),), ("--connect", endpoint)):
         status = cli("status", *place, "--keys", str(keys_dir), "--json").status()
         assert status.state == "running"
@@ -148,7 +148,7 @@ def test_status_of_a_live_run_needs_an_observers_key(
     assert not [secret for secret in secrets_of(keys_dir) if secret in logs]
 
 
-def test_keys_that_cannot_be_used_are_refused_before_anything_is_written(
+def test_invalid_keys_are_rejected_before_anything_is_written(
     run: Callable[..., Status], keys_dir: Path, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"

@@ -1,4 +1,4 @@
-"""Whoever is killed, whenever: the run goes on and its result is the same."""
+"""Killed services are restarted, and the result is the same."""
 
 import signal
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def undisturbed() -> dict[str, object]:
     ],
     ids=["actor", "learner", "replay", "each"],
 )
-def test_killed_services_are_replaced_and_the_result_is_the_same(
+def test_killed_services_are_restarted_and_the_result_is_the_same(
     kills: list[tuple[str, int]],
     cli: Callable[..., Cli],
     run: Callable[..., Status],
@@ -58,7 +58,7 @@ def test_killed_services_are_replaced_and_the_result_is_the_same(
     assert digests(status) == undisturbed["digests"]
 
 
-def test_run_killed_as_a_whole_goes_on_from_its_directory(
+def test_killed_run_resumes_from_its_directory(
     cli: Callable[..., Cli], run: Callable[..., Status], tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"

@@ -1,4 +1,4 @@
-"""The determinism matrix on LunarLander: the same digests whoever runs it and whatever dies."""
+"""Determinism on LunarLander: equal digests for all fleets, kills and interruptions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,12 +28,12 @@ Runner = Callable[..., Status]
 
 @pytest.fixture(scope="module")
 def expected() -> dict[int, Any]:
-    """Digests of the undisturbed run with one actor in one process, by lead."""
+    """Digests, by lead, of the undisturbed run with one actor in one process."""
     return {}
 
 
 @pytest.fixture
-def same(expected: dict[int, Any], run: Runner) -> Callable[[int, Status], None]:
+def check_digests(expected: dict[int, Any], run: Runner) -> Callable[[int, Status], None]:
     def check(lead: int, status: Status) -> None:
         if lead not in expected:
             expected[lead] = digests(run(lander(lead=lead), BUDGET))
@@ -55,27 +55,29 @@ def test_reference_equals_the_services_at_lead_0(run: Runner) -> None:
 @pytest.mark.parametrize(
     ("actors", "envs", "in_process"), [(2, 16, False), (4, 3, True), (1, 40, True)]
 )
-def test_fleet_does_not_matter(
-    lead: int, actors: int, envs: int, in_process: bool, run: Runner, same: Same
+def test_result_is_independent_of_the_fleet(
+    lead: int, actors: int, envs: int, in_process: bool, run: Runner, check_digests: Same
 ) -> None:
     config = lander(lead=lead)
-    same(lead, run(config, BUDGET, actors=actors, envs=envs, in_process=in_process))
+    check_digests(lead, run(config, BUDGET, actors=actors, envs=envs, in_process=in_process))
 
 
 @pytest.mark.parametrize("lead", LEADS)
-def test_kills_do_not_matter(
-    lead: int, cli: Callable[..., Cli], same: Same, tmp_path: Path
+def test_result_is_independent_of_kills(
+    lead: int, cli: Callable[..., Cli], check_digests: Same, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "killed"
     process = cli(*arguments(LANDER | {"lead": lead}, BUDGET, run_dir), "--actors", "1")
     for role, iteration in [("actor", 1), ("learner", 3), ("replay", 5), ("actor", 7)]:
         kill_at(process, run_dir, role, iteration)
-    same(lead, process.status(timeout=120))
+    check_digests(lead, process.status(timeout=120))
 
 
 @pytest.mark.parametrize("lead", LEADS)
-def test_stops_do_not_matter(lead: int, run: Runner, same: Same, tmp_path: Path) -> None:
+def test_result_is_independent_of_interruptions(
+    lead: int, run: Runner, check_digests: Same, tmp_path: Path
+) -> None:
     config, run_dir = lander(lead=lead), tmp_path / "stopped"
     run(config, 6_000, run_dir=run_dir)
     run(config, 12_000, run_dir=run_dir, resume=True, actors=2)
-    same(lead, run(config, BUDGET, run_dir=run_dir, resume=True))
+    check_digests(lead, run(config, BUDGET, run_dir=run_dir, resume=True))

@@ -1,4 +1,4 @@
-"""All three services in one process, on real Zenoh, learn something."""
+"""All three services in one process, with real Zenoh, learn CartPole."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ from udrl.config import Config, build, preset
 from udrl_proto.reports import Status
 
 
-def test_cartpole_passes_200(run: Callable[..., Status]) -> None:
+def test_cartpole_reaches_200(run: Callable[..., Status]) -> None:
     settings = {k: v for k, v in preset("CartPole-v1").items() if k != "max_env_steps"}
     settings |= {"eval_every": 10_000, "eval_episodes": 20, "eval_temperature": 0.0}
     status = run(build(Config, settings), 200_000, stop_return=200.0)

@@ -1,4 +1,4 @@
-"""Looking at runs: play, runs, plot, completion."""
+"""Commands that read runs: play, runs, plot, completion."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def lines(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_greedy_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) -> None:
+def test_greedy_play_shows_the_episodes_of_evaluate(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     commands = evaluation_commands(
         agent, episodes=4, temperature=0, desired_return=60, desired_horizon=50
@@ -60,12 +60,14 @@ def test_greedy_play_shows_the_episodes_that_evaluate_counts(ended_run: Path) ->
              "--desired-horizon", 50, "--json")
     )  # fmt: skip
     assert [p["episode_return"] for p in played] == counted.returns
-    told = {"desired_return": 60.0, "desired_horizon": 50, "temperature": 0.0}
-    assert all(told.items() <= p.items() for p in played)
-    assert all(p["length"] == p["episode_return"] for p in played)  # CartPole: 1 a step
+    expected = {"desired_return": 60.0, "desired_horizon": 50, "temperature": 0.0}
+    assert all(expected.items() <= p.items() for p in played)
+    assert all(
+        p["length"] == p["episode_return"] for p in played
+    )  # on CartPole, returns equal lengths
 
 
-def test_a_seed_that_play_prints_gives_its_episode_again(ended_run: Path) -> None:
+def test_printed_seed_reproduces_the_episode(ended_run: Path) -> None:
     played = lines(call("play", ended_run, "--episodes", 4, "--json"))
     for episode in played:
         (again,) = lines(
@@ -78,7 +80,7 @@ def test_a_seed_that_play_prints_gives_its_episode_again(ended_run: Path) -> Non
         assert call("play", ended_run, "--seed", seed, "--episodes", 1).splitlines()[1:] == [line]
 
 
-def test_a_seed_decides_every_action_wherever_it_stands(ended_run: Path) -> None:
+def test_seed_decides_every_action_at_any_position(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     commands = evaluation_commands(agent, episodes=3)
     third = with_seeds(commands)[2]
@@ -98,7 +100,7 @@ def test_a_seed_decides_every_action_wherever_it_stands(ended_run: Path) -> None
     assert last[2].stream_key == with_seeds(commands, 0)[0].stream_key
 
 
-def test_evaluations_in_one_go_are_those_one_by_one(ended_run: Path) -> None:
+def test_batched_evaluations_equal_single_ones(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     evaluations = [
         evaluation_commands(agent, episodes=n, temperature=t, desired_return=r)
@@ -108,18 +110,20 @@ def test_evaluations_in_one_go_are_those_one_by_one(ended_run: Path) -> None:
     together = evaluate_all(agent, evaluations, 3, lambda: ended.append(None))
     assert together == [evaluate(agent, commands) for commands in evaluations]
     assert [(r.desired_return, r.temperature) for r in together] == [(20, 1), (80, 0), (50, 0.5)]
-    assert all(r.lengths == r.returns for r in together)  # CartPole: 1 a step
+    assert all(r.lengths == r.returns for r in together)  # on CartPole, returns equal lengths
     assert len(ended) == 8
     assert evaluate_all(agent, []) == []
 
 
-def test_play_says_what_was_asked_for_and_obtained(ended_run: Path) -> None:
-    said = call("play", ended_run, "--episodes", 1, "--desired-return", 60, "--desired-horizon", 50)
-    assert "desired return 60.0 within 50 steps (temperature 1, weights version" in said
-    assert ": return " in said
+def test_play_prints_desired_and_obtained_return(ended_run: Path) -> None:
+    output = call(
+        "play", ended_run, "--episodes", 1, "--desired-return", 60, "--desired-horizon", 50
+    )
+    assert "desired return 60.0 within 50 steps (temperature 1, weights version" in output
+    assert ": return " in output
 
 
-def test_a_seed_gives_the_same_episodes_again_and_the_next_seed_shares_them(
+def test_seed_reproduces_episodes_and_consecutive_seeds_share_them(
     ended_run: Path,
 ) -> None:
     first = lines(call("play", ended_run, "--seed", 5, "--episodes", 3, "--json"))
@@ -130,13 +134,13 @@ def test_a_seed_gives_the_same_episodes_again_and_the_next_seed_shares_them(
 
 
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_films_have_a_picture_for_every_moment(ended_run: Path, tmp_path: Path, kind: str) -> None:
+def test_video_has_a_frame_for_every_moment(ended_run: Path, tmp_path: Path, kind: str) -> None:
     film = tmp_path / "films" / f"cart.{kind}"
     (episode,) = lines(call("play", ended_run, "--episodes", 1, "--json", "--video", film))
     moments = episode["length"] + 1
     if kind == "mp4":
         assert imageio_ffmpeg.count_frames_and_secs(str(film)) == (moments, moments / 50)
-    else:  # every second: no browser plays 50 a second
+    else:  # every second frame: browsers do not play 50 a second
         with Image.open(film) as gif:
             assert gif.size == (600, 426)
             assert sum(1 for _ in ImageSequence.Iterator(gif)) == -(-moments // 2)
@@ -144,26 +148,28 @@ def test_films_have_a_picture_for_every_moment(ended_run: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("film.avi", "ends with .mp4 or .gif"),
         ("taken/film.gif", "choose a writable file"),
     ],
 )
-def test_films_that_cannot_be_made(ended_run: Path, tmp_path: Path, name: str, says: str) -> None:
+def test_invalid_video_is_rejected(
+    ended_run: Path, tmp_path: Path, name: str, message: str
+) -> None:
     (tmp_path / "taken").write_text("a file where a folder should be")
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device here")
-def test_a_full_disk_ends_a_film(ended_run: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_full_disk_ends_a_video(ended_run: Path, tmp_path: Path) -> None:
     (tmp_path / "film.mp4").symlink_to("/dev/full")
     with pytest.raises(ConfigError, match="No space left on device"):
         call("play", ended_run, "--episodes", 1, "--video", tmp_path / "film.mp4")
 
 
-def test_what_ffmpeg_says_is_told_and_no_empty_film_remains(
+def test_error_of_ffmpeg_is_reported_and_no_empty_video_remains(
     ended_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ffmpeg = tmp_path / "ffmpeg"
@@ -176,23 +182,23 @@ def test_what_ffmpeg_says_is_told_and_no_empty_film_remains(
 
 
 @pytest.mark.parametrize("name", ["seed:7.mp4", "-x.gif", "a film%03d.mp4"])
-def test_films_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> None:
+def test_video_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> None:
     call("play", ended_run, "--episodes", 1, "--video", tmp_path / name)
     assert (tmp_path / name).stat().st_size > 1000
 
 
-def test_a_wrong_extension_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
+def test_wrong_extension_is_rejected_before_anything_is_loaded(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
-    for arguments, says in [
+    for arguments, message in [
         (("play", nowhere, "--video", tmp_path / "film.avi"), "ends with .mp4 or .gif"),
         (("obedience", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
         (("plot", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
     ]:
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=message):
             call(*arguments)
 
 
-def test_play_needs_a_run(tmp_path: Path) -> None:
+def test_play_requires_a_run(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds no run"):
         call("play", tmp_path)
 
@@ -217,7 +223,7 @@ def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
     assert table[1].endswith(str(ended_run))
 
 
-def test_runs_that_cannot_be_read_are_listed_too(ended_run: Path, tmp_path: Path) -> None:
+def test_unreadable_runs_are_listed(ended_run: Path, tmp_path: Path) -> None:
     broken = tmp_path / "deep" / "broken"
     broken.mkdir(parents=True)
     (broken / "run.sqlite").write_text("not a database, but long enough to be taken for one" * 99)
@@ -226,21 +232,21 @@ def test_runs_that_cannot_be_read_are_listed_too(ended_run: Path, tmp_path: Path
     assert "run.sqlite" in summary.problem
 
 
-def test_no_runs(tmp_path: Path) -> None:
+def test_no_runs_are_listed_as_none(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["runs", str(tmp_path)])
     assert "start one with: udrl train LunarLander-v3" in result.stderr
     with pytest.raises(ConfigError, match=r"no such directory; give the folder"):
         call("runs", tmp_path / "nowhere")
 
 
-def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
+def test_several_runs_are_plotted_in_one_figure(ended_run: Path, tmp_path: Path) -> None:
     twin = tmp_path / "twin"
     twin.mkdir()
     (twin / "metrics.csv").write_bytes((ended_run / "metrics.csv").read_bytes())
     picture = tmp_path / "pictures" / "both.svg"
     assert str(picture) in call("plot", ended_run, twin, "--output", picture, "--x", "wall_s")
     drawn = ElementTree.fromstring(picture.read_text())
-    # The interval of a final evaluation, which the twin without a store lacks.
+    # The interval of a final evaluation, which the copy without a store lacks.
     assert picture.read_text().count('id="LineCollection_') == 1
     assert "cart" in picture.read_text()
     assert drawn.tag.endswith("svg")
@@ -250,7 +256,7 @@ def test_several_runs_in_one_picture(ended_run: Path, tmp_path: Path) -> None:
         compare([tmp_path], tmp_path / "picture.png")
 
 
-def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path: Path) -> None:
+def test_folder_of_runs_is_plotted_as_means_over_seeds(ended_run: Path, tmp_path: Path) -> None:
     runs, figure = tmp_path / "runs", tmp_path / "all.svg"
     for seed in (7, 8):
         settings = Settings(small(seed=seed), Budget(max_env_steps=3000), Fleet(actors=1))
@@ -262,8 +268,8 @@ def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path
     assert call("plot", runs, "--output", figure) == f"figure: {figure}\n"
     drawn = figure.read_text()
     assert [name in drawn for name in ("CartPole-v1", "Figure2-v0", "2 seeds")] == [True] * 3
-    assert drawn.count('id="axes_') == 2  # a panel for each environment
-    assert drawn.count('id="LineCollection_') == 2  # a final evaluation in each
+    assert drawn.count('id="axes_') == 2  # one panel for each environment
+    assert drawn.count('id="LineCollection_') == 2  # one final evaluation in each
 
     lines, missing = curve._lines([runs])
     assert [len(line) for line in lines] == [2, 1]
@@ -276,7 +282,7 @@ def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path
     assert final is not None
     assert (final.low, final.mean, final.high) == (min(ends), sum(ends) / 2, max(ends))
 
-    # Named one by one, each is a line of its own.
+    # Listed individually, each run has its own line.
     call("plot", runs / "cart-7", runs / "cart-8", "--output", figure)
     assert [name in figure.read_text() for name in ("cart-7", "cart-8", "seeds")] == [
         True,
@@ -293,7 +299,7 @@ def test_a_folder_of_runs_is_drawn_as_means_over_seeds(ended_run: Path, tmp_path
     "damaged",
     [b"\xff\xfe\x00", b"iteration,loss\n1,2\n", b"HEAD\n1,2\n", b"HEAD\n" + b"x," * 19 + b"x\n"],
 )
-def test_metrics_that_no_run_wrote(ended_run: Path, tmp_path: Path, damaged: bytes) -> None:
+def test_damaged_metrics_are_rejected(ended_run: Path, tmp_path: Path, damaged: bytes) -> None:
     head = (ended_run / "metrics.csv").read_bytes().splitlines()[0]
     (tmp_path / "metrics.csv").write_bytes(damaged.replace(b"HEAD", head))
     with pytest.raises(StoreError, match=r"metrics\.csv is damaged"):
@@ -301,7 +307,7 @@ def test_metrics_that_no_run_wrote(ended_run: Path, tmp_path: Path, damaged: byt
 
 
 @pytest.mark.parametrize("command", ["play", "evaluate"])
-def test_orders_that_contradict_themselves_or_name_no_return(command: str, ended_run: Path) -> None:
+def test_invalid_commands_are_rejected(command: str, ended_run: Path) -> None:
     with pytest.raises(ConfigError, match="give one of them"):
         call(command, ended_run, "--greedy", "--temperature", "0.5")
     for words in ("1e300", "nan", "-inf", "much"):
@@ -309,7 +315,7 @@ def test_orders_that_contradict_themselves_or_name_no_return(command: str, ended
             call(command, ended_run, "--desired-return", words)
 
 
-def test_nothing_to_plot(ended_run: Path, tmp_path: Path) -> None:
+def test_plot_without_data_is_rejected(ended_run: Path, tmp_path: Path) -> None:
     head = (ended_run / "metrics.csv").read_text().splitlines()[0]
     (tmp_path / "metrics.csv").write_text(head + "\n")
     with pytest.raises(StoreError, match=r"no evaluation in metrics.csv yet"):
@@ -317,12 +323,12 @@ def test_nothing_to_plot(ended_run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion(shell: str) -> None:
+def test_completion_script_is_printed(shell: str) -> None:
     assert "_UDRL_COMPLETE" in call("completion", shell)
 
 
 def completed(*words: str) -> list[str]:
-    """Return what bash offers for the last word."""
+    """Return bash's completions of the last word."""
     given = {
         "COMP_WORDS": shlex.join(("udrl", *words[:-1])) + f" {words[-1]}",
         "COMP_CWORD": str(len(words)),
@@ -355,7 +361,7 @@ def test_commands_and_values_are_completed(ended_run: Path) -> None:
     assert completed("play", "nowhere", "--weights", "b") == ["best"]
 
 
-def test_kept_versions_act_and_the_rest_are_gone(tmp_path: Path) -> None:
+def test_kept_versions_can_act_and_others_are_missing(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     settings = Settings(toy(lead=0), Budget(max_env_steps=400, keep_versions=1), Fleet(actors=1))
     ended = train(settings, run_dir, threading.Event(), in_process=True)
@@ -363,7 +369,7 @@ def test_kept_versions_act_and_the_rest_are_gone(tmp_path: Path) -> None:
     with closing(Store(run_dir, read_only=True)) as store:
         evaluated = {e.iteration for e in store.evaluations(-1, 2**62)}
         best = store.fact("progress", RunProgress).best_version
-    needed = {c for c in ended.weights_kept if c >= max(evaluated)}  # to extend the run
+    needed = {c for c in ended.weights_kept if c >= max(evaluated)}  # extends the run
     assert set(ended.weights_kept) == {best, max(evaluated)} | needed
     for version in ended.weights_kept:
         (played,) = lines(
@@ -378,7 +384,7 @@ def test_kept_versions_act_and_the_rest_are_gone(tmp_path: Path) -> None:
 
 @pytest.fixture
 def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
-    """A window without a screen, and the keys that are pressed in it, a list for each moment."""
+    """A window without a screen, and the keys that are pressed in it, one list for each moment."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     import pygame
 
@@ -395,18 +401,18 @@ def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     assert set(seen) == {50.0}  # the environment's own speed
 
 
-def test_a_window_shows_an_episode(ended_run: Path, keyboard: list[Any]) -> None:
+def test_window_shows_an_episode(ended_run: Path, keyboard: list[Any]) -> None:
     (shown,) = lines(call("play", ended_run, "--episodes", 1, "--window", "--json"))
     (played,) = lines(call("play", ended_run, "--episodes", 1, "--json"))
     assert shown == played
 
 
-def test_whoever_watches_can_end_it(ended_run: Path, keyboard: list[Any]) -> None:
+def test_window_can_be_closed_during_an_episode(ended_run: Path, keyboard: list[Any]) -> None:
     keyboard += [[], ["q"]]
     assert call("play", ended_run, "--window", "--json") == ""
 
 
-def test_no_screen_for_a_window(ended_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_screen_is_reported(ended_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import pygame
 
     def init() -> None:

@@ -1,4 +1,4 @@
-"""``udrl obedience`` on real agents: one that obeys, one that hardly does, and model cards."""
+"""``udrl obedience`` on an obedient agent and on one that hardly obeys, and in model cards."""
 
 import csv
 import json
@@ -49,12 +49,12 @@ def obedient(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run_dir(ended_run: Path, tmp_path: Path) -> Path:
-    """A copy of a run, whose directory may be written to."""
+    """A copy of a run, whose directory may be changed."""
     return Path(shutil.copytree(ended_run, tmp_path / "cart"))
 
 
-def test_an_agent_that_obeys_is_said_to(obedient: Path) -> None:
-    said, _ = call("obedience", obedient, "--episodes", 30, "--points", 5, "--greedy")
+def test_obedient_agent_is_reported_as_such(obedient: Path) -> None:
+    text, _ = call("obedience", obedient, "--episodes", 30, "--points", 5, "--greedy")
     report = load_report(obedient)
     assert report is not None
     assert [p.desired_return for p in report.by_return] == [0, 1, 2, 3, 4]
@@ -63,11 +63,11 @@ def test_an_agent_that_obeys_is_said_to(obedient: Path) -> None:
     assert report.obeyed is not None
     assert (report.obeyed.low, report.obeyed.high) == (0.0, 4.0)
     assert report.obeyed.correlation > 0.99
-    assert said.splitlines()[-1] == answer(report)
-    assert "Command returns between 0 and 4; mean absolute error 0.0" in said
+    assert text.splitlines()[-1] == answer(report)
+    assert "Command returns between 0 and 4; mean absolute error 0.0" in text
 
 
-def test_one_document_and_the_same_each_time(run_dir: Path) -> None:
+def test_output_is_one_document_and_reproducible(run_dir: Path) -> None:
     options = ("--episodes", 3, "--points", 3, "--json")
     first, errors = call("obedience", run_dir, *options)
     assert errors == ""
@@ -85,10 +85,10 @@ def test_one_document_and_the_same_each_time(run_dir: Path) -> None:
     assert (run_dir / "obedience.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_tolerance_of_ones_own(obedient: Path) -> None:
+def test_custom_tolerance(obedient: Path) -> None:
     agent = load_agent(obedient)
     plan = plan_commands(agent, points=5, episodes=10, temperature=0.0)
-    # All commands are obeyed to the bit, and none is beyond itself.
+    # All commands are obeyed exactly, and none exceeds the agent's ability.
     exact = measure(agent, plan, 0.0)
     assert exact.tolerance == 0.0
     assert exact.obeyed is not None
@@ -99,7 +99,7 @@ def test_a_tolerance_of_ones_own(obedient: Path) -> None:
     assert report.tolerance == 1.5
 
 
-def test_every_point_is_what_evaluate_says(run_dir: Path) -> None:
+def test_every_point_equals_evaluate(run_dir: Path) -> None:
     agent = load_agent(run_dir)
     report = measure(agent, plan_commands(agent, points=3, episodes=4, temperature=0.5))
     assert [p.desired_return for p in report.by_return] == sorted(
@@ -117,42 +117,42 @@ def test_every_point_is_what_evaluate_says(run_dir: Path) -> None:
         assert found == (
             point.return_mean, point.return_std, point.return_ci95_low, point.return_ci95_high, 4
         )  # fmt: skip
-        # CartPole: 1 a step.
+        # on CartPole, returns equal lengths
         assert (point.length_mean, point.length_std) == (point.return_mean, point.return_std)
 
 
-def test_commands_lie_among_what_the_buffer_did(ended_run: Path) -> None:
+def test_commands_are_within_the_range_of_the_buffer(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     plan = plan_commands(agent, points=4, episodes=2)
     returns = sorted(e.episode_return for e in agent.buffer)
-    asked = [commands[0] for commands in plan.by_return]
-    assert plan.reachable == (asked[0].desired_return, asked[-1].desired_return)
-    # Rounded to a tenth of their spacing at most.
+    commanded = [commands[0] for commands in plan.by_return]
+    assert plan.reachable == (commanded[0].desired_return, commanded[-1].desired_return)
+    # Rounded to at most a tenth of their spacing.
     room = (returns[-1] - returns[0]) / 3 / 10
     assert plan.reachable[0] == pytest.approx(returns[(len(returns) - 1) // 20], abs=room)
     assert plan.reachable[1] == pytest.approx(returns[-1], abs=room)
     lengths = [e.length for e in agent.buffer]
-    assert all(min(lengths) <= c.desired_horizon <= max(lengths) for c in asked)
+    assert all(min(lengths) <= c.desired_horizon <= max(lengths) for c in commanded)
     wider = plan_commands(agent, points=3, episodes=2, desired_returns=(0.0, 1000.0))
     assert [c[0].desired_return for c in wider.by_return] == [0.0, 500.0, 1000.0]
     assert wider.reachable == plan.reachable
     assert plan.total == 2 * len(plan.by_return + plan.by_horizon)
 
 
-def with_horizons_that_follow(agent: Agent) -> Agent:
+def with_horizons_from_returns(agent: Agent) -> Agent:
     config = change(agent.config, desired_horizon="return")
     return agent._replace(config=config)
 
 
-def test_where_horizons_follow_from_returns_they_are_not_varied(ended_run: Path) -> None:
-    agent = with_horizons_that_follow(load_agent(ended_run))
+def test_horizons_that_follow_from_returns_are_not_varied(ended_run: Path) -> None:
+    agent = with_horizons_from_returns(load_agent(ended_run))
     plan = plan_commands(agent, points=9, episodes=2, desired_returns=(1.0, 4.0))
-    asked = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
-    assert asked == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]
+    commanded = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
+    assert commanded == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]
     assert plan.by_horizon == []
 
 
-def test_horizons_that_are_not_read_are_neither_varied_nor_commanded(ended_run: Path) -> None:
+def test_ignored_horizons_are_neither_varied_nor_commanded(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     agent = agent._replace(config=change(agent.config, horizon_scale=0))
     assert plan_commands(agent, points=3, episodes=2).by_horizon == []
@@ -160,7 +160,7 @@ def test_horizons_that_are_not_read_are_neither_varied_nor_commanded(ended_run: 
         evaluation_commands(agent, episodes=2, desired_horizon=9)
 
 
-def test_a_buffer_of_equal_returns_leaves_nothing_to_compare(ended_run: Path) -> None:
+def test_buffer_of_equal_returns_is_rejected(ended_run: Path) -> None:
     agent = load_agent(ended_run)
     best = ReplayBuffer(agent.config.buffer, [e._replace(episode_return=9.0) for e in agent.buffer])
     agent = agent._replace(buffer=best)
@@ -170,7 +170,7 @@ def test_a_buffer_of_equal_returns_leaves_nothing_to_compare(ended_run: Path) ->
     assert measure(agent, plan).tolerance == pytest.approx(2.0)
 
 
-def test_the_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: Path) -> None:
+def test_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: Path) -> None:
     _, hint = call("export", run_dir, "--folder", tmp_path / "agent")
     version = load_agent(run_dir).version
     assert f"udrl obedience {run_dir} --weights {version}" in hint
@@ -190,7 +190,7 @@ def test_the_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: P
         call("export", run_dir, "--folder", tmp_path / "agent")
 
 
-def test_another_place_for_the_picture(run_dir: Path, tmp_path: Path) -> None:
+def test_custom_path_of_the_figure(run_dir: Path, tmp_path: Path) -> None:
     few = ("--episodes", 2, "--points", 2)
     call("obedience", run_dir, *few, "--output", tmp_path / "pictures" / "it.svg")
     assert (tmp_path / "pictures" / "it.svg").exists()
@@ -199,9 +199,9 @@ def test_another_place_for_the_picture(run_dir: Path, tmp_path: Path) -> None:
         call("obedience", run_dir, *few, "--output", tmp_path / "it.bmp")
 
 
-def test_a_directory_that_cannot_be_written_costs_no_report(run_dir: Path) -> None:
+def test_unwritable_directory_does_not_lose_the_report(run_dir: Path) -> None:
     (run_dir / "obedience.json.part").mkdir()
-    said, problem = call("obedience", run_dir, "--episodes", 2, "--points", 2)
-    assert "Highest mean return" in said
+    text, problem = call("obedience", run_dir, "--episodes", 2, "--points", 2)
+    assert "Highest mean return" in text
     assert "the report cannot be written to" in problem
     assert "make the directory writable" in problem

@@ -1,4 +1,4 @@
-"""Datasets: written, read by Minari itself, and begun with."""
+"""Datasets: exported, read by Minari itself, and used to start a run."""
 
 import threading
 from collections.abc import Callable
@@ -42,7 +42,7 @@ def _datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
 
 
-def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Episode]:
+def some_episodes(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Episode]:
     rng = np.random.default_rng(1)
 
     def observations(n: int) -> Any:
@@ -65,8 +65,8 @@ def some(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -> list[Ep
 
 
 @pytest.mark.parametrize("spec", [VECTOR, IMAGE], ids=["vector", "image"])
-def test_what_is_written_is_what_is_read_to_the_bit(spec: EnvironmentSpec) -> None:
-    episodes = some(spec)
+def test_dataset_round_trips_bit_identically(spec: EnvironmentSpec) -> None:
+    episodes = some_episodes(spec)
     write_dataset("some/ours-v0", episodes, small(), spec)
     assert dataset_digest(read_dataset("some/ours-v0", small(), spec)) == dataset_digest(episodes)
     # As Minari itself reads it.
@@ -79,16 +79,16 @@ def test_what_is_written_is_what_is_read_to_the_bit(spec: EnvironmentSpec) -> No
         assert theirs.truncations.tolist()[-1] == ours.truncated
 
 
-def test_a_name_that_is_taken_or_unknown() -> None:
-    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+def test_existing_or_unknown_name_is_rejected() -> None:
+    write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"already exists.*another name, or a new version"):
-        write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
+        write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=r"not found locally.*minari list local"):
         read_dataset("some/thing-v0", small(), VECTOR)
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         (replace(VECTOR, observation_space=Vector(size=5)),
          r"has observations Box.* and actions .* environment has Vector\(size=5\)"),
@@ -98,20 +98,20 @@ def test_a_name_that_is_taken_or_unknown() -> None:
         (IMAGE, "name a dataset of the run's environment"),
     ],
 )  # fmt: skip
-def test_datasets_of_another_environment(spec: EnvironmentSpec, says: str) -> None:
-    write_dataset("some/ours-v0", some(VECTOR), small(), VECTOR)
-    with pytest.raises(ConfigError, match=says):
+def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, message: str) -> None:
+    write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
+    with pytest.raises(ConfigError, match=message):
         read_dataset("some/ours-v0", small(), spec)
 
 
 @pytest.mark.parametrize(
     "name", ["../../etc-v0", "bad name-v0", "mine", "", "/x-v0", "é-v0", "-x-v0"]
 )
-def test_names_that_minari_has_not(name: str, tmp_path: Path) -> None:
+def test_name_that_minari_does_not_allow_is_rejected(name: str, tmp_path: Path) -> None:
     found = set(minari.list_local_datasets())
     with pytest.raises(ConfigError, match=r"a name with a version.*e\.g\. CartPole/mine-v0"):
-        write_dataset(name, some(VECTOR), small(), VECTOR)
-    assert set(minari.list_local_datasets()) == found, "nothing is left behind"
+        write_dataset(name, some_episodes(VECTOR), small(), VECTOR)
+    assert set(minari.list_local_datasets()) == found, "no files must remain"
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def offline(dataset: str, **changes: object) -> Config:
     return small(dataset=dataset, lead=0, **changes)
 
 
-def test_the_exported_dataset_is_the_buffer(dataset: str, ended_run: Path) -> None:
+def test_exported_dataset_equals_the_buffer(dataset: str, ended_run: Path) -> None:
     store = Store(ended_run, read_only=True)
     held = store.buffer(10**9)
     store.close()
@@ -135,7 +135,7 @@ def test_the_exported_dataset_is_the_buffer(dataset: str, ended_run: Path) -> No
     assert [float(np.sum(e.rewards)) for e in found] == [p.entry.episode_return for p in held]
 
 
-def test_a_run_begins_with_a_dataset(
+def test_run_starts_with_a_dataset(
     dataset: str, run: Callable[..., Status], tmp_path: Path
 ) -> None:
     config = offline(dataset)
@@ -145,13 +145,13 @@ def test_a_run_begins_with_a_dataset(
     assert settings["n_warm_up_episodes"] == n
     assert len(settings["dataset_sha256"]) == 64
     assert status.episodes.accepted >= n
-    # The services equal the reference, and so do they with other actors.
+    # The services equal the reference for any number of actors.
     assert digests(status) == digests(algorithm1(config, Budget(max_env_steps=3000)))
     assert digests(status) == digests(run(config, 3000, actors=2, envs=3))
     assert digests(status) != digests(run(small(lead=0), 3000))
 
 
-def test_it_goes_on_without_the_dataset(
+def test_run_resumes_without_the_dataset(
     dataset: str, run: Callable[..., Status], tmp_path: Path
 ) -> None:
     config = offline(dataset)
@@ -162,13 +162,13 @@ def test_it_goes_on_without_the_dataset(
     assert digests(status) == whole
 
 
-def test_another_dataset_of_the_same_name_is_noticed(dataset: str, tmp_path: Path) -> None:
+def test_changed_dataset_of_the_same_name_is_detected(dataset: str, tmp_path: Path) -> None:
     settings = Settings(offline(dataset, dataset_sha256="0" * 64), Budget(), Fleet())
     with pytest.raises(ConfigError, match=r"expected [0-9a-f]+; restore the dataset"):
         train(settings, tmp_path / "run", threading.Event(), in_process=True)
 
 
-def test_a_run_with_another_beginning_is_another_run(
+def test_run_with_another_dataset_is_another_configuration(
     dataset: str, run: Callable[..., Status], tmp_path: Path
 ) -> None:
     run(offline(dataset), 1000, run_dir=tmp_path / "run")

@@ -1,4 +1,4 @@
-"""A behavior function of somebody's own, where torch and its class are and where they are not."""
+"""Custom behavior functions, with and without torch and their class."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ def settings(name: str = "Concatenating", **values: Any) -> Config:
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("frame_stack", [1, 2])
-def test_the_graph_is_the_module(baseline: str, frame_stack: int) -> None:
+def test_graph_equals_the_module(baseline: str, frame_stack: int) -> None:
     config = settings(baseline=baseline, frame_stack=frame_stack)
     spec = specify(make_environment(config), config)
     behavior, graph = initialise(config, spec), acting_graph(config.network, spec)
@@ -51,7 +51,7 @@ def test_the_graph_is_the_module(baseline: str, frame_stack: int) -> None:
     np.testing.assert_allclose(function.logits(seen, command), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_run_equals_the_reference_and_its_folder_needs_no_class(
+def test_run_equals_the_reference_and_its_folder_needs_no_class(
     run: Runner, tmp_path: Path
 ) -> None:
     config, run_dir = settings(), tmp_path / "run"
@@ -59,7 +59,7 @@ def test_a_run_equals_the_reference_and_its_folder_needs_no_class(
     assert digests(status) == digests(reference(config, 3000))
     agent = load_agent(run_dir)
     export_folder(agent, run_dir, tmp_path / "folder")
-    told = agent.policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist()
+    logits = agent.policy.logits([0.1, 0.2, 0.3, 0.4], 50.0, 50).tolist()
     program = (
         "import sys, udrl\n"
         f"policy = udrl.load({str(tmp_path / 'folder')!r})\n"
@@ -69,10 +69,10 @@ def test_a_run_equals_the_reference_and_its_folder_needs_no_class(
     found = subprocess.run(
         [sys.executable, "-c", program], check=True, capture_output=True, text=True
     )
-    assert found.stdout.strip() == str(told)
+    assert found.stdout.strip() == str(logits)
 
 
-def test_its_first_weights_follow_from_the_seed() -> None:
+def test_initial_weights_are_a_function_of_the_seed() -> None:
     def weights(seed: int) -> Any:
         config = settings(seed=seed)
         spec = specify(make_environment(config), config)
@@ -85,7 +85,7 @@ def test_its_first_weights_follow_from_the_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("NoSuchClass", "AttributeError.*importable here, as package.module:Class"),
         ("NoModule", "is NoModule, expected a torch.nn.Module"),
@@ -95,11 +95,11 @@ def test_its_first_weights_follow_from_the_seed() -> None:
         ("Broken", "cannot be computed or exported: RuntimeError: not today"),
     ],
 )
-def test_what_cannot_be_one_is_refused_when_the_run_begins(name: str, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_invalid_module_is_rejected_when_the_run_is_created(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         algorithm1(settings(name), Budget(max_env_steps=100))
 
 
-def test_it_has_no_memory() -> None:
+def test_custom_module_has_no_memory() -> None:
     with pytest.raises(ConfigError, match="a network of your own has no memory"):
         settings(memory="gru")

@@ -1,4 +1,4 @@
-"""A peer that would break the run is told why, and the run goes on."""
+"""Requests that would break the run are refused with the reason, and the run continues."""
 
 import threading
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ BUDGET = 300
 
 
 class Hosted:
-    """A replay service in this process, and a line to it."""
+    """A replay service in this process, and a connection to it."""
 
     def __init__(self, run_dir: Path) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -58,7 +58,7 @@ class Hosted:
         self.asker.ask(verbs.JOIN, request)
 
     def finish(self) -> Status:
-        """Let a good actor and a good learner end the run; return its last status."""
+        """Let a valid actor and learner end the run; return its last status."""
         address = Address(self.endpoint, patience_s=10)
         peers = [
             threading.Thread(target=roles.learner, args=(address, self.stop)),
@@ -87,7 +87,7 @@ def hosted(tmp_path: Path) -> Iterator[Hosted]:
     one.close()
 
 
-#: Of command 3, and as good as any other: the warm-up is random.
+#: For command 3, and valid for any command of the warm-up, which is random.
 EPISODE = EpisodeMessage(
     actor="one",
     command_id=3,
@@ -107,7 +107,7 @@ def test_actor_with_another_environment_is_refused(hosted: Hosted) -> None:
     assert no.value.code == "other_environment"
 
 
-def test_actor_whose_environment_does_something_else_is_refused(
+def test_actor_with_another_environment_digest_is_refused(
     hosted: Hosted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -118,7 +118,7 @@ def test_actor_whose_environment_does_something_else_is_refused(
     assert no.value.code == "other_environment"
 
 
-def test_first_that_delivers_says_how_all_must_round(hosted: Hosted) -> None:
+def test_first_delivery_sets_the_numerics_class(hosted: Hosted) -> None:
     hosted.join("actor", "two", "of two")
     hosted.join("actor", "one", "of one")
     assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
@@ -135,14 +135,14 @@ def test_first_that_delivers_says_how_all_must_round(hosted: Hosted) -> None:
 
 
 @pytest.mark.slow
-def test_peers_that_round_differently_and_deliver_nothing_keep_nobody_away(hosted: Hosted) -> None:
+def test_joining_without_delivery_sets_no_numerics_class(hosted: Hosted) -> None:
     hosted.join("actor", "idle", "of its own")
     hosted.join("learner", "idle", "of its own")
     assert hosted.asker.ask(verbs.COMMANDS, CommandsRequest(actor="idle", wanted=1)).commands
     assert digests(hosted.finish()) == digests(reference(hosted.hello.config, BUDGET))
 
 
-def test_run_of_another_protocol_is_named(hosted: Hosted) -> None:
+def test_run_of_another_protocol_is_reported(hosted: Hosted) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply("udrl/999/future/hello", b"whatever that will be")
@@ -153,7 +153,7 @@ def test_run_of_another_protocol_is_named(hosted: Hosted) -> None:
     queryable.undeclare()
 
 
-def test_bad_episodes_are_refused_and_the_run_goes_on(hosted: Hosted) -> None:
+def test_bad_episodes_are_refused_and_the_run_continues(hosted: Hosted) -> None:
     hosted.join("actor", "mallory")
     good = msgspec.structs.replace(EPISODE, actor="mallory", command_id=0)
     nan = encode_array(np.full(1, np.nan, np.float32))

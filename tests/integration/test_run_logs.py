@@ -1,4 +1,4 @@
-"""Logs of runs for TensorBoard, Weights & Biases and MLflow, each read by its own code."""
+"""Logs for TensorBoard, Weights & Biases and MLflow, each read by its own library."""
 
 import csv
 import json
@@ -35,8 +35,8 @@ Series = dict[str, list[tuple[int, float]]]
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let no log leave this machine."""
+def _local_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Keep all logs on this machine."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
     yield
@@ -61,7 +61,7 @@ def log(run_dir: Path, *names: str, stopped: bool = False) -> list[str]:
 
 
 def event_files(run_dir: Path) -> Series:
-    """Return what TensorBoard reads of a run."""
+    """Return the scalars that TensorBoard reads for a run."""
     log(run_dir, "tensorboard")
     found = EventAccumulator(str(run_dir / FOLDER), size_guidance={"scalars": 0})
     found.Reload()
@@ -72,7 +72,7 @@ def event_files(run_dir: Path) -> Series:
 
 
 def assert_same(found: Series, expected: Series) -> None:
-    """Compare values; event files have them in single precision."""
+    """Compare values; event files have single precision."""
     assert {tag: [step for step, _ in points] for tag, points in found.items()} == {
         tag: [step for step, _ in points] for tag, points in expected.items()
     }
@@ -91,7 +91,7 @@ def records(folder: Path) -> Iterator[Any]:
         _, size, kind = struct.unpack("<IHB", data[at : at + 7])
         parts += data[at + 7 : at + 7 + size]
         at += 7 + size
-        if kind in (1, 4):  # the whole record, or its last part
+        if kind in (1, 4):  # a whole record, or its last part
             yield Record.FromString(parts)
             parts = b""
 
@@ -101,7 +101,7 @@ def values(items: Sequence[Any]) -> dict[str, Any]:
 
 
 class OfflineRun:
-    """What an offline run of W&B has; its file may be completed after ``finish`` has returned."""
+    """An offline run of W&B; its file may be completed after ``finish`` has returned."""
 
     def __init__(self, folder: Path) -> None:
         self.runs: list[Any] = []
@@ -119,9 +119,9 @@ class OfflineRun:
                         self.series[tag].append((row["env_steps"], value))
 
 
-def test_weights_and_biases_has_what_event_files_have(run_dir: Path) -> None:
+def test_weights_and_biases_log_equals_the_event_files(run_dir: Path) -> None:
     (place,) = log(run_dir, "wandb")
-    wait_for(lambda: "ended_because" in OfflineRun(Path(place)).summary, "the end of the log")
+    wait_for(lambda: "ended_because" in OfflineRun(Path(place)).summary, "the log to be complete")
     found = OfflineRun(Path(place))
     status = read_status(run_dir)
     run = found.runs[0]
@@ -133,7 +133,7 @@ def test_weights_and_biases_has_what_event_files_have(run_dir: Path) -> None:
 
 
 class ServedRun:
-    """A run at W&B's server: what it has is there when the run is resumed."""
+    """A run on W&B's server, which keeps its history when the run is resumed."""
 
     id, offline, url, dir = "", False, "https://wandb.example/run", "/"
 
@@ -155,8 +155,8 @@ class ServedRun:
     def finish(self) -> None: ...
 
 
-def shorten(run_dir: Path, share: float) -> str:
-    """Cut ``metrics.csv`` as if the run had been stopped; return the whole text."""
+def truncate_metrics(run_dir: Path, share: float) -> str:
+    """Truncate ``metrics.csv`` as if the run had been stopped; return the whole text."""
     path = run_dir / "metrics.csv"
     text = path.read_text()
     lines = text.splitlines(keepends=True)
@@ -165,18 +165,18 @@ def shorten(run_dir: Path, share: float) -> str:
     return text
 
 
-def test_a_resumed_run_continues_at_weights_and_biases(
+def test_resumed_run_continues_at_weights_and_biases(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     served = ServedRun()
     monkeypatch.setattr(wandb, "init", served.init)
-    text = shorten(run_dir, 0.5)
+    text = truncate_metrics(run_dir, 0.5)
     assert log(run_dir, "wandb", stopped=True) == [served.url]
     half = len(served.rows)
     assert half > 0
     assert "ended_because" not in served.summary
     (run_dir / "metrics.csv").write_text(text)
-    for _ in range(2):  # the second time there is nothing to add
+    for _ in range(2):  # the second call has nothing to add
         log(run_dir, "wandb")
         with (run_dir / "metrics.csv").open(newline="") as file:
             expected = [int(row["iteration"]) for row in csv.DictReader(file)]
@@ -190,8 +190,8 @@ def test_a_resumed_run_continues_at_weights_and_biases(
     }
 
 
-def logged_to_mlflow(place: str) -> tuple[Run, Series]:
-    """Return the only run in the experiment, and its metrics."""
+def mlflow_run(place: str) -> tuple[Run, Series]:
+    """Return the only run of the experiment, and its metrics."""
     client = mlflow.MlflowClient()
     experiment = client.get_experiment_by_name("udrl")
     assert experiment is not None
@@ -203,15 +203,15 @@ def logged_to_mlflow(place: str) -> tuple[Run, Series]:
     }
 
 
-def test_mlflow_has_what_event_files_have_also_of_a_resumed_run(run_dir: Path) -> None:
-    text = shorten(run_dir, 0.5)
-    run, found = logged_to_mlflow(*log(run_dir, "mlflow", stopped=True))
+def test_mlflow_log_equals_the_event_files_after_resuming(run_dir: Path) -> None:
+    text = truncate_metrics(run_dir, 0.5)
+    run, found = mlflow_run(*log(run_dir, "mlflow", stopped=True))
     assert run.info.status == "KILLED"
     assert len(found["time/iterations"]) == len((run_dir / "metrics.csv").read_text().split()) - 1
     (run_dir / "metrics.csv").write_text(text)
     expected = event_files(run_dir)
-    for _ in range(2):  # the second time there is nothing to add
-        run, found = logged_to_mlflow(*log(run_dir, "mlflow"))
+    for _ in range(2):  # the second call has nothing to add
+        run, found = mlflow_run(*log(run_dir, "mlflow"))
         assert_same(found, expected)
         assert (run.info.status, run.info.run_name) == ("FINISHED", run_dir.name)
         assert run.data.tags["udrl.ended_because"] == read_status(run_dir).ended_because
@@ -220,7 +220,7 @@ def test_mlflow_has_what_event_files_have_also_of_a_resumed_run(run_dir: Path) -
     assert run.data.params["environment"] == "CartPole-v1"
 
 
-def test_a_log_that_fails_does_not_end_the_training(
+def test_failing_log_does_not_end_the_training(
     tmp_path: Path, cli: Callable[..., Cli], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
@@ -238,9 +238,7 @@ def test_a_log_that_fails_does_not_end_the_training(
     assert "mlflow: " not in err.partition("learning curve:")[2]
 
 
-def test_without_a_login_weights_and_biases_does_not_wait_for_one(
-    run_dir: Path, tmp_path: Path
-) -> None:
+def test_weights_and_biases_without_a_login_does_not_prompt(run_dir: Path, tmp_path: Path) -> None:
     script = (
         "import sys, pathlib, logging\n"
         "from udrl_inspect.inspection import read_status\n"
@@ -262,8 +260,8 @@ def test_without_a_login_weights_and_biases_does_not_wait_for_one(
     assert "No API key configured" in done.stderr
 
 
-class Stuck:
-    """A writer whose server does not answer."""
+class HangingWriter:
+    """A writer whose server does not respond."""
 
     place = ""
 
@@ -281,8 +279,8 @@ class Stuck:
     def close(self) -> None: ...
 
 
-def test_a_log_that_hangs_is_left_behind(run_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
-    writer = Stuck()
+def test_hanging_log_is_abandoned(run_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
+    writer = HangingWriter()
     hanging = RunLog(run_dir, "stuck", writer)
     hanging.show(read_status(run_dir))
     hanging.finish()
@@ -298,7 +296,7 @@ def test_a_log_that_hangs_is_left_behind(run_dir: Path, caplog: pytest.LogCaptur
     [("tensorboard", "tensorboard.compat.proto.event_pb2"), ("wandb", "wandb"),
      ("mlflow", "mlflow")],
 )  # fmt: skip
-def test_a_missing_extra_is_named(
+def test_missing_extra_is_reported(
     name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -306,7 +304,7 @@ def test_a_missing_extra_is_named(
         WRITERS[name](tmp_path)
 
 
-def test_logs_that_cannot_be_opened_are_refused_before_the_run(
+def test_log_that_cannot_be_opened_is_rejected_before_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = tmp_path / "run"

@@ -1,4 +1,4 @@
-"""Every kind of space, through the services and everything that follows."""
+"""Every kind of space with all services and commands."""
 
 import threading
 from collections.abc import Callable
@@ -35,14 +35,14 @@ def nested(**changes: Any) -> Config:
 
 
 @pytest.mark.parametrize("frame_stack", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_run_of_records_and_products_equals_the_reference(frame_stack: int, run: Runner) -> None:
+def test_run_with_composite_spaces_equals_the_reference(frame_stack: int, run: Runner) -> None:
     config = nested(frame_stack=frame_stack)
     expected = reference(config, 1500)
     for actors, envs in ((1, 16), (3, 2)):
         status = run(config, 1500, actors=actors, envs=envs)
         assert digests(status) == digests(expected)
         assert status.exact
-    # What can be told from what is seen is 1.5 a step better than chance; some is learned.
+    # The observation allows 1.5 a step more than chance; a part of that is learned.
     evaluations = [expected.evaluations[i].mean for i in sorted(expected.evaluations)]
     assert max(evaluations[1:]) > evaluations[0]
 
@@ -60,7 +60,7 @@ def agent(run_dir: Path) -> Agent:
     return load_agent(run_dir)
 
 
-def test_a_policy_takes_what_the_environment_shows(agent: Agent) -> None:
+def test_policy_accepts_the_environments_observations(agent: Agent) -> None:
     policy = agent.policy
     raw, plain = gym.make("kinds_of_spaces:Nested-v0"), policy.make_environment()
     seen, _ = raw.reset(seed=3)
@@ -71,11 +71,11 @@ def test_a_policy_takes_what_the_environment_shows(agent: Agent) -> None:
     action = policy.predict(shown, 5.0, 8)
     assert action.shape == policy.spec.action_space.shape
     plain.step(action)
-    # Its own numbers do where they are arranged alike.
+    # Numeric arrays are accepted if they are arranged alike.
     assert np.array_equal(shown["speed"], seen["speed"].reshape(-1).astype(np.float32))
 
 
-def test_one_that_is_watched_makes_the_same_episode(agent: Agent) -> None:
+def test_rollout_makes_the_same_episode(agent: Agent) -> None:
     (command,) = evaluation_commands(agent, episodes=1)
     with closing(EpisodeGenerator(agent.config, 3)) as generator:
         (episode,) = generate_episodes(generator, [command], agent.behavior)
@@ -92,7 +92,7 @@ def test_one_that_is_watched_makes_the_same_episode(agent: Agent) -> None:
     assert rollout.episode_return == episode.episode_return
 
 
-def test_episodes_go_out_as_a_dataset_and_begin_another_run(
+def test_episodes_are_exported_as_a_dataset_and_start_another_run(
     run_dir: Path, run: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")

@@ -1,4 +1,4 @@
-"""Every study from the command line, on a tiny budget; interrupted, and gone on with."""
+"""Every study from the command line, on a tiny budget, interrupted and resumed."""
 
 import csv
 import json
@@ -21,7 +21,7 @@ TINY = {
     "n_updates_per_iter": 2, "batch_size": 32, "hidden": [8, 8],
 }  # fmt: skip
 SETTINGS = [word for k, v in TINY.items() for word in ("--set", f"{k}={json.dumps(v)}")]
-#: Of a search, which draws the others.
+#: For a search, which draws the other settings.
 SEARCH = ["--set", "eval_every=1000", "--set", "eval_episodes=3"]
 STEPS = 2000
 
@@ -33,7 +33,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture
 def study(cli: Callable[..., Cli]) -> Callable[..., Path]:
-    """Conduct a study, one run at a time, and return its folder."""
+    """Run a study, one run at a time, and return its folder."""
 
     def conduct(name: str, *arguments: str, root: Path, timeout: float = 110) -> Path:
         settings = SEARCH if name == "search" else SETTINGS
@@ -51,7 +51,7 @@ def runs_of(root: Path, algorithm: str) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_a_comparison_is_interrupted_and_goes_on(
+def test_comparison_is_interrupted_and_resumed(
     cli: Callable[..., Cli], study: Callable[..., Path], tmp_path: Path
 ) -> None:
     whole = ("--seeds", "1-2", "--side-by-side", "1")
@@ -90,7 +90,7 @@ def test_a_comparison_is_interrupted_and_goes_on(
     assert len(rows(folder / "reached.csv")) == 6 * 3
 
 
-def test_a_run_of_a_study_is_the_run_of_its_settings(
+def test_run_of_a_study_equals_a_run_with_its_settings(
     study: Callable[..., Path], tmp_path: Path
 ) -> None:
     study("sparse", "--algorithm", "UDRL", "--seeds", "3", "--set", "lead=0", root=tmp_path)
@@ -102,7 +102,9 @@ def test_a_run_of_a_study_is_the_run_of_its_settings(
     assert int(final["env_steps"]) == expected.env_steps
 
 
-def test_the_store_of_an_unfinished_run_says_how_far_it_is(ended_run: Path, tmp_path: Path) -> None:
+def test_progress_of_an_unfinished_run_is_read_from_its_store(
+    ended_run: Path, tmp_path: Path
+) -> None:
     status = read_status(ended_run)
     job = Job(algorithm="UDRL", settings=flat(small()), max_env_steps=2 * status.env_steps)
     job.folder(tmp_path).mkdir(parents=True)
@@ -114,7 +116,7 @@ def test_the_store_of_an_unfinished_run_says_how_far_it_is(ended_run: Path, tmp_
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_all_studies_share_their_runs(
+def test_studies_share_their_runs(
     study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = ("--seeds", "1")
@@ -157,10 +159,10 @@ def test_all_studies_share_their_runs(
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_search_goes_on_with_more_configurations(
+def test_search_is_extended_with_more_configurations(
     study: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = Path("studies")  # relative to where the command runs, as the default is
+    here = Path("studies")  # relative to the working directory, like the default
     monkeypatch.chdir(tmp_path)
     arguments = ("--task", "lander", "--seeds", "1", "--algorithm", "A2C")
     folder = study("search", *arguments, "--configurations", "1", root=here, timeout=140)
@@ -177,7 +179,7 @@ def test_a_search_goes_on_with_more_configurations(
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_search_over_a_space_of_ones_own(study: Callable[..., Path], tmp_path: Path) -> None:
+def test_search_over_a_custom_space(study: Callable[..., Path], tmp_path: Path) -> None:
     space = tmp_path / "mine.toml"
     space.write_text(
         "[networks]\nhidden = [[8], [16]]\n[UDRL]\nbatch_size = [32]\nn_updates_per_iter = [2]\n"
@@ -194,11 +196,11 @@ def test_a_search_over_a_space_of_ones_own(study: Callable[..., Path], tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_failed_run_of_a_search_is_reported_in_one_line(
+def test_failed_run_of_a_search_is_reported_in_one_line(
     cli: Callable[..., Cli], tmp_path: Path
 ) -> None:
     space = tmp_path / "mine.toml"
-    # The warm-up alone is longer than the run.
+    # The warm-up exceeds the budget of the run.
     space.write_text("[UDRL]\nn_warm_up_episodes = [1000]\nbatch_size = [32, 33]\n")
     code, output, error = cli(
         "study", "search", "CartPole-v1", "--space", str(space), "--folder", str(tmp_path),
@@ -218,7 +220,7 @@ def test_a_failed_run_of_a_search_is_reported_in_one_line(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_take_cover(study: Callable[..., Path], tmp_path: Path) -> None:
+def test_take_cover_study(study: Callable[..., Path], tmp_path: Path) -> None:
     small = ("--set", "max_episode_steps=60", "--set", "convolutions=[4, 4, 4, 4]")
     folder = study("takecover", "--seeds", "1", *small, root=tmp_path, timeout=500)
     assert {r["algorithm"] for r in rows(folder / "evaluations.csv")} == {"UDRL", "DQN", "A2C"}

@@ -1,4 +1,4 @@
-"""TakeCover with all services: learning from pixels gives the same bits, whatever dies."""
+"""TakeCover with all services: bit-identical results when services are killed."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ from whole_run import Cli, arguments, assert_conserved, digests, kill_at, refere
 
 pytestmark = pytest.mark.timeout(300)
 
-# All that the preset sets: what is named here alone would not be what the command line runs.
+# All settings of the preset, so that these runs equal those of the command line.
 TAKE_COVER: dict[str, Any] = {
     "environment": "TakeCover-v0",
     "max_episode_steps": 80,
@@ -51,7 +51,7 @@ def settings(**changes: Any) -> Config:
     return build(Config, TAKE_COVER | changes)
 
 
-def test_the_preset_sets_nothing_else() -> None:
+def test_settings_cover_the_preset() -> None:
     assert preset("TakeCover-v0").keys() - {"max_env_steps"} <= TAKE_COVER.keys()
 
 
@@ -70,9 +70,7 @@ def test_services_equal_the_reference(run: Runner, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_kill_in_the_middle_of_an_episode(
-    run: Runner, cli: Callable[..., Cli], tmp_path: Path
-) -> None:
+def test_kill_during_an_episode(run: Runner, cli: Callable[..., Cli], tmp_path: Path) -> None:
     budget = 2 * BUDGET
     expected = run(settings(lead=1), budget)
     run_dir = tmp_path / "killed"
@@ -85,7 +83,7 @@ def test_kill_in_the_middle_of_an_episode(
 
 
 @pytest.mark.slow
-def test_what_is_left_to_the_machine_is_settled_for_good(run: Runner, tmp_path: Path) -> None:
+def test_automatic_arithmetic_is_resolved_once(run: Runner, tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     run(settings(), 700, run_dir=run_dir)
     written = (run_dir / "config.toml").read_text()

@@ -1,4 +1,4 @@
-"""The tutorial, command by command, as a reader follows it."""
+"""The commands of the tutorial give the printed output."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from udrl_inspect.inspection import read_status
 
 BLOCKS = Page("docs/tutorial.md").blocks
 
-#: What differs between machines in the output, and what stands for it.
+#: Parts of the output that differ between machines, and their placeholders.
 _MASKS = [
     (r"(Command returns|Higher commands|This agent does not) .*", "VERDICT"),
     (r"  obeyed$|, cut by its time limit$| \(time limit reached\)$", ""),
@@ -29,7 +29,7 @@ def commands(text: str) -> list[list[str]]:
 
 
 def masked(output: str) -> list[str]:
-    """Return the lines of an output without numbers and what depends on them."""
+    """Return the lines of an output with numbers and machine-dependent parts masked."""
     lines = []
     for line in output.splitlines():
         for pattern, mask in _MASKS:
@@ -38,8 +38,8 @@ def masked(output: str) -> list[str]:
     return [line for line in lines if line not in ("", "...")]
 
 
-def left_out(printed: list[str], page: list[str]) -> list[str]:
-    """Return the printed lines that the page does not show; all that it shows must be printed."""
+def omitted_lines(printed: list[str], page: list[str]) -> list[str]:
+    """Return the printed lines that the page omits; all lines of the page must be printed."""
     lines = iter(printed)
     missing = []
     for shown in page:
@@ -52,8 +52,8 @@ def left_out(printed: list[str], page: list[str]) -> list[str]:
     return [*missing, *lines]
 
 
-def follow(command: list[str], folder: Path) -> str:
-    """Run one command of the page, and return what it prints but for its progress."""
+def run_command(command: list[str], folder: Path) -> str:
+    """Run one command of the page; return its output without progress lines."""
     program = {"udrl": [sys.executable, "-m", "udrl_launch"], "python": [sys.executable]}
     done = subprocess.run(
         program[command[0]] + command[1:], cwd=folder, capture_output=True, text=True, timeout=200,
@@ -68,8 +68,8 @@ def obedience(run_dir: Path) -> dict[str, Any]:
     return report
 
 
-@pytest.mark.timeout(400)  # Two trainings: 26 s of one core.
-def test_the_page_runs_and_its_agents_are_as_it_says(tmp_path: Path) -> None:
+@pytest.mark.timeout(400)  # Two trainings, 26 s on one core.
+def test_tutorial_runs_and_has_the_printed_output(tmp_path: Path) -> None:
     printed = ""
     for language, title, text in BLOCKS:
         if title:
@@ -77,28 +77,28 @@ def test_the_page_runs_and_its_agents_are_as_it_says(tmp_path: Path) -> None:
         elif language == "sh":
             for command in commands(text):
                 if command[0] != "pip":
-                    printed = follow(command, tmp_path)
+                    printed = run_command(command, tmp_path)
         else:
-            differences = left_out(masked(printed), masked(text))
+            differences = omitted_lines(masked(printed), masked(text))
             assert not differences or "..." in text, f"the page lacks {differences}:\n{printed}"
 
     first, second = (tmp_path / "runs" / name for name in ("first", "second"))
     for run_dir in (first, second):
         evaluation = read_status(run_dir).final_evaluation
         assert evaluation is not None
-        assert evaluation.mean > 14  # of 16; random play obtains 5.4
+        assert evaluation.mean > 14  # of 16; random actions obtain 5.4
     ranges = [obedience(run_dir)["obeyed"] for run_dir in (first, second)]
     least, most = (obeyed["high"] - obeyed["low"] for obeyed in ranges)
     assert 2 < least < most
     assert most > 8
 
 
-def test_the_page_has_files_commands_and_output() -> None:
+def test_page_has_files_commands_and_output() -> None:
     assert [block.title for block in BLOCKS if block.title] == ["orchard.py", "act.py"]
     assert {block.language for block in BLOCKS} == {"", "python", "sh"}
 
 
-def test_an_output_that_the_page_does_not_show_would_be_found() -> None:
+def test_missing_output_is_detected() -> None:
     shown = (
         "ended:  spent 40 env steps\n...\n  5.2  21  6.20  obeyed\nCommand returns between 4 and 8."
     )

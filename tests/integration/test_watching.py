@@ -1,4 +1,4 @@
-"""Runs that are watched by TensorBoard and Prometheus, each read by the project's own tools."""
+"""Monitoring with TensorBoard and Prometheus, read by their own libraries."""
 
 import csv
 import re
@@ -19,7 +19,7 @@ from whole_run import SMALL, Cli, arguments, free_port, live_status, wait_for
 
 
 def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return (env steps, value) by tag, as TensorBoard reads them."""
+    """Return (env steps, value) by tag, as read by TensorBoard."""
     found = EventAccumulator(str(run_dir / FOLDER), size_guidance={"scalars": 0})
     found.Reload()
     return {
@@ -29,7 +29,7 @@ def read(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def hyperparameters(run_dir: Path) -> dict[str, object]:
-    """Return the hyperparameters that TensorBoard's HPARAMS page shows."""
+    """Return the hyperparameters of TensorBoard's HPARAMS page."""
     found = EventAccumulator(str(run_dir / FOLDER))
     found.Reload()
     content = found.SummaryMetadata(SESSION_START_INFO_TAG).plugin_data.content
@@ -42,21 +42,21 @@ def metrics(run_dir: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_event_files_equal_the_metrics(cli: Callable[..., Cli], tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     for budget in (3000, 4500):
         cli(
             *arguments(SMALL, budget, run_dir), "--resume", "--log", "tensorboard", "--in-process"
         ).status()
-        told, rows = read(run_dir), metrics(run_dir)
-        assert set(told) == {*TAGS, *EVALUATION_TAGS, *DERIVED_TAGS}
-        # Iterations may be complete in the same moment; between them there is no speed.
+        scalars, rows = read(run_dir), metrics(run_dir)
+        assert set(scalars) == {*TAGS, *EVALUATION_TAGS, *DERIVED_TAGS}
+        # Iterations may be complete at the same time; between them there is no speed.
         walls = [0.0, *(float(r["wall_s"]) for r in rows)]
         timed = [
             int(row["env_steps"]) for row, was in zip(rows, walls[:-1], strict=True)
             if float(row["wall_s"]) > was
         ]  # fmt: skip
-        assert [step for step, _ in told.pop("time/fps")] == timed
+        assert [step for step, _ in scalars.pop("time/fps")] == timed
         assert timed
         evaluated = SMALL["eval_episodes"]
         explored = [int(r["commands"]) - (evaluated if r["eval_mean"] else 0) for r in rows]
@@ -64,20 +64,20 @@ def test_event_files_say_what_the_metrics_say(cli: Callable[..., Cli], tmp_path:
         assert set(explored[1:]) == {SMALL["n_episodes_per_iter"]}
         totals = [0, *(int(r["env_steps"]) for r in rows)]
         lengths = [(b - a) / n for a, b, n in zip(totals, totals[1:], explored, strict=False)]
-        assert [value for _, value in told["rollout/ep_len_mean"]] == pytest.approx(lengths)
-        assert [step for step, _ in told.pop("rollout/ep_len_mean")] == totals[1:]
+        assert [value for _, value in scalars["rollout/ep_len_mean"]] == pytest.approx(lengths)
+        assert [step for step, _ in scalars.pop("rollout/ep_len_mean")] == totals[1:]
         assert hyperparameters(run_dir)["learning_rate"] == SMALL["learning_rate"]
         assert hyperparameters(run_dir)["hidden"] == "[16, 16]"
         assert hyperparameters(run_dir)["max_env_steps"] == budget
         last = read_status(run_dir).final_evaluation
         assert last is not None
         for tag in ("eval/mean_reward", "eval/ci95_low", "eval/ci95_high"):
-            assert told[tag].pop()[0] == last.env_steps
+            assert scalars[tag].pop()[0] == last.env_steps
         for tags, steps in ((TAGS, "env_steps"), (EVALUATION_TAGS, "eval_at_env_steps")):
             for tag, column in tags.items():
                 expected = [(int(r[steps]), float(r[column])) for r in rows if r[column]]
-                assert [step for step, _ in told[tag]] == [step for step, _ in expected]
-                for (_, value), (_, wanted) in zip(told[tag], expected, strict=True):
+                assert [step for step, _ in scalars[tag]] == [step for step, _ in expected]
+                for (_, value), (_, wanted) in zip(scalars[tag], expected, strict=True):
                     assert abs(value - wanted) <= 1e-6 * abs(wanted) + 1e-9
         assert len(list((run_dir / FOLDER).iterdir())) == 1
 
@@ -94,7 +94,7 @@ def scrape(port: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def test_prometheus_sees_a_run_while_it_goes_on(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_prometheus_scrapes_a_live_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
     port, run_dir = free_port(), tmp_path / "run"
     cli(*arguments(SMALL, 10_000_000, run_dir), "--metrics-port", str(port), "--actors", "1")
     wait_for(lambda: scrape(port).get("udrl_iteration", 0) > 2, "some iterations")
@@ -104,12 +104,12 @@ def test_prometheus_sees_a_run_while_it_goes_on(cli: Callable[..., Cli], tmp_pat
 
     other = cli("metrics", str(run_dir), "--port", "0").process
     assert other.stdout is not None
-    said = re.fullmatch(r"metrics: http://127\.0\.0\.1:(\d+)/metrics\n", other.stdout.readline())
-    assert said is not None
-    assert scrape(int(said[1]))["udrl_actors"] == 1
+    line = re.fullmatch(r"metrics: http://127\.0\.0\.1:(\d+)/metrics\n", other.stdout.readline())
+    assert line is not None
+    assert scrape(int(line[1]))["udrl_actors"] == 1
 
 
-def test_the_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
+def test_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) -> None:
     endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
     training = cli(*arguments(SMALL, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")
     wait_for(lambda: (s := live_status(run_dir)) and s.iteration > 0, "an iteration")
@@ -119,4 +119,4 @@ def test_the_exporter_outlives_the_run(cli: Callable[..., Cli], tmp_path: Path) 
     assert scrape(port)["udrl_up"] == 1
     training.process.terminate()
     training.finish()
-    wait_for(lambda: scrape(port).get("udrl_up") == 0, "nobody to answer")
+    wait_for(lambda: scrape(port).get("udrl_up") == 0, "the run to be unreachable")

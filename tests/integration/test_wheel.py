@@ -1,4 +1,4 @@
-"""The wheel holds all that is needed, outside the checkout."""
+"""The wheel is complete and works outside the checkout."""
 
 import os
 import subprocess
@@ -25,8 +25,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "site"
 
 
-def outside(site: Path, *command: str) -> str:
-    """Run Python where only the wheel's packages can be the ones imported."""
+def run_outside(site: Path, *command: str) -> str:
+    """Run Python with the wheel's packages only."""
     environment = os.environ | {"PYTHONPATH": str(site)}
     done = subprocess.run(
         [sys.executable, "-W", "error", *command],
@@ -41,9 +41,9 @@ def outside(site: Path, *command: str) -> str:
 
 
 def test_installed_wheel_trains(site: Path) -> None:
-    imported = outside(site, "-c", "import udrl, udrl_launch; print(udrl.__file__)")
+    imported = run_outside(site, "-c", "import udrl, udrl_launch; print(udrl.__file__)")
     assert Path(imported.strip()).is_relative_to(site)
-    trained = outside(
+    trained = run_outside(
         site, "-m", "udrl_launch", *arguments(TOY, 100, site.parent / "run"), "--in-process"
     )
     assert '"state":"ended"' in trained

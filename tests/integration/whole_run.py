@@ -1,4 +1,4 @@
-"""Whole runs for the tests: small configurations, and what to look at from outside."""
+"""Helpers for tests of whole runs: small configurations, waiting, status, kills."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from udrl.errors import UdrlError
 from udrl_inspect.inspection import status_of
 from udrl_proto.reports import Status
 
-#: Small enough for seconds, large enough for evaluations, evictions and dozens of versions.
+#: Takes seconds, but has evaluations, evictions and dozens of versions.
 SMALL: dict[str, Any] = {
     "environment": "CartPole-v1",
     "lead": 2,
@@ -62,7 +62,7 @@ LANDER: dict[str, Any] = SMALL | {
     "eval_every": 5000,
 }
 
-#: An agent for which obeying is trivial: it collects exactly what it is told to, of 0 to 4.
+#: An environment in which obedience is trivial: an agent obtains its desired return, from 0 to 4.
 OBEDIENT: dict[str, Any] = {
     "environment": "Obedience-v0", "environment_kwargs": {"steps": 4}, "hidden": [32, 32],
     "n_warm_up_episodes": 300, "replay_size": 400, "recent_size": 400, "last_few": 100,
@@ -98,7 +98,7 @@ def assert_conserved(status: Status) -> None:
 
 
 class Cli:
-    """The command ``udrl`` in a process of its own, and what it left behind."""
+    """The command ``udrl`` in its own process, and its output."""
 
     def __init__(self, *arguments: str, cwd: Path) -> None:
         self.process = subprocess.Popen(
@@ -140,7 +140,7 @@ def arguments(config: dict[str, Any], max_env_steps: int, run_dir: Path) -> list
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout: float = 40) -> Any:
-    """Return the first true value of a condition that nothing announces."""
+    """Poll a condition until it is true; return its value."""
     deadline = time.monotonic() + timeout
     pause = threading.Event()
     while not (value := condition()):
@@ -150,7 +150,7 @@ def wait_for(condition: Callable[[], Any], what: str, timeout: float = 40) -> An
 
 
 def live_status(run_dir: Path) -> Status | None:
-    """Return a run's status, or None while there is no run yet."""
+    """Return a run's status, or None while there is no run."""
     try:
         return status_of(run_dir)
     except UdrlError:
@@ -158,7 +158,7 @@ def live_status(run_dir: Path) -> Status | None:
 
 
 def children(pid: int) -> dict[str, int]:
-    """Return the services that a process started, by the name of their log, with their pids."""
+    """Return the pids of the services that a process started, by the names of their logs."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdecimal():
@@ -189,23 +189,23 @@ def free_port() -> int:
 
 
 def configured_router(endpoint: str, keys_dir: Path) -> zenoh.Session:
-    """Return a router with the configuration that ``zenohd`` is to be given, for this endpoint."""
+    """Return a router with the generated configuration of ``zenohd`` for this endpoint."""
     text = (Path(__file__).parents[2] / "deploy" / "zenohd.json5").read_text(encoding="utf-8")
     text = text.replace("tls/0.0.0.0:7447", endpoint)
     return zenoh.open(zenoh.Config.from_json5(text.replace("/etc/udrl", f"{keys_dir}/replay")))
 
 
 def kill_at(process: Cli, run_dir: Path, role: str, iteration: int) -> None:
-    """Kill a service when the run has come so far, and wait until it is replaced."""
+    """Kill a service at a given iteration, and wait for its replacement."""
 
-    def far_enough() -> bool:
+    def is_reached() -> bool:
         status = live_status(run_dir)
         return status is not None and status.iteration >= iteration
 
-    wait_for(far_enough, f"iteration {iteration}")
+    wait_for(is_reached, f"iteration {iteration}")
     pid = children(process.process.pid)[role]
     os.kill(pid, signal.SIGKILL)
-    wait_for(lambda: not is_running(pid), f"the end of {role}")
+    wait_for(lambda: not is_running(pid), f"{role} to exit")
     wait_for(
         lambda: (
             children(process.process.pid).get(role, pid) != pid

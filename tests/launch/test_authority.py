@@ -1,4 +1,4 @@
-"""``udrl keys create``: what it makes, and what it refuses."""
+"""``udrl keys create``."""
 
 import stat
 import sys
@@ -21,7 +21,7 @@ def certificate(folder: Path, role: str) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / role / "cert.pem").read_bytes())
 
 
-def test_command_makes_keys_for_each_role(tmp_path: Path) -> None:
+def test_command_creates_keys_for_each_role(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "keys"
     result = CliRunner().invoke(cli, ["keys", "create", str(folder), "--days", "10"])
     assert result.exit_code == 0, result.output
@@ -35,7 +35,7 @@ def test_command_makes_keys_for_each_role(tmp_path: Path) -> None:
         assert timedelta(days=9, hours=23) < left <= timedelta(days=10)
 
 
-def test_private_keys_are_for_their_owner_only_and_all_different(tmp_path: Path) -> None:
+def test_private_keys_are_owner_only_and_distinct(tmp_path: Path) -> None:
     authority.create(tmp_path / "keys")
     private = [*tmp_path.rglob("key.pem"), *tmp_path.rglob("ca.key")]
     assert len({path.read_bytes() for path in private}) == len(ROLES) + 1
@@ -45,7 +45,7 @@ def test_private_keys_are_for_their_owner_only_and_all_different(tmp_path: Path)
     assert [path.parent.name for path in tmp_path.rglob("ca.key")] == ["ca"]
 
 
-def test_only_the_replay_service_gets_a_servers_certificate(tmp_path: Path) -> None:
+def test_only_the_replay_service_gets_a_server_certificate(tmp_path: Path) -> None:
     authority.create(tmp_path, ["replay.example.org", "10.0.0.1", "fd00::1", "localhost"])
     for role in ROLES:
         found = certificate(tmp_path, role).extensions
@@ -64,13 +64,13 @@ def test_only_the_replay_service_gets_a_servers_certificate(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("host", ["", "a b", "tls/a:1", "a:1", "-a", "a..b", "ä", "a" * 64, "*.a"])
-def test_host_that_is_none_is_named_and_nothing_is_written(host: str, tmp_path: Path) -> None:
+def test_invalid_host_is_rejected_and_nothing_is_written(host: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--host .*: expected a host name or an IP address"):
         authority.create(tmp_path / "keys", [host])
     assert not (tmp_path / "keys").exists()
 
 
-def test_keys_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
+def test_existing_keys_are_not_overwritten(tmp_path: Path) -> None:
     authority.create(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
     with pytest.raises(ConfigError, match=r"is not empty.*never overwritten.*another folder"):
@@ -78,7 +78,7 @@ def test_keys_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
 
 
-def test_empty_folders_may_be_there_and_keys_may_be_wanted_once(tmp_path: Path) -> None:
+def test_empty_folders_may_exist_and_existing_keys_may_be_reused(tmp_path: Path) -> None:
     for role in ROLES:
         (tmp_path / role).mkdir()
     command = ["keys", "create", str(tmp_path), "--if-missing"]
@@ -91,7 +91,7 @@ def test_empty_folders_may_be_there_and_keys_may_be_wanted_once(tmp_path: Path) 
     assert "is not empty" in str(incomplete.exception)
 
 
-def test_keys_that_are_there_must_be_good_for_what_is_wanted(tmp_path: Path) -> None:
+def test_reused_keys_must_be_valid_for_the_hosts(tmp_path: Path) -> None:
     authority.create(tmp_path / "keys", ["10.0.0.1"])
     assert authority.has_keys(tmp_path / "keys", ["localhost", "10.0.0.1"])
     with pytest.raises(ConfigError, match=r"not valid for --host 10\.0\.0\.2; remove them"):
@@ -101,7 +101,7 @@ def test_keys_that_are_there_must_be_good_for_what_is_wanted(tmp_path: Path) -> 
         authority.has_keys(tmp_path / "old")
 
 
-def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "keys"):
         with pytest.raises(
@@ -110,7 +110,7 @@ def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
             authority.create(folder)
 
 
-def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "udrl_launch.authority")
     monkeypatch.delattr("udrl_launch.authority")
     monkeypatch.setitem(sys.modules, "cryptography", None)

@@ -1,4 +1,4 @@
-"""The command line as a whole."""
+"""The command line."""
 
 import os
 import pty
@@ -22,7 +22,7 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["trian", "CartPole-v1"], "no command 'trian'; did you mean 'train'? (see udrl --help)"),
         (["bord"], "no command 'bord'; did you mean 'board'? (see udrl --help)"),
@@ -43,12 +43,12 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
         ),
     ],
 )
-def test_errors_are_one_line_of_one_form(arguments: list[str], says: str) -> None:
+def test_error_is_one_line_with_the_remedy(arguments: list[str], message: str) -> None:
     ended = udrl(*arguments)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {says}\n")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {message}\n")
 
 
-def test_errors_of_services_have_the_same_form(tmp_path: Path) -> None:
+def test_error_of_a_service_has_the_same_form(tmp_path: Path) -> None:
     ended = udrl(
         "train", "CartPole-v1", "--run-dir", str(tmp_path / "run"), "--listen", "tcp/127.0.0.1"
     )
@@ -58,14 +58,14 @@ def test_errors_of_services_have_the_same_form(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["keys"]])
-def test_a_group_without_a_command_shows_its_help(arguments: list[str]) -> None:
+def test_group_without_a_subcommand_shows_its_help(arguments: list[str]) -> None:
     ended = udrl(*arguments)
     assert ended.stderr.startswith("Usage: ")
     assert "Commands:" in ended.stderr
 
 
 def in_a_terminal(columns: int, *arguments: str) -> str:
-    """Return what the command writes to a terminal."""
+    """Return the command's output in a terminal."""
     parent, child = pty.openpty()
     environment = os.environ | {"COLUMNS": str(columns), "TERM": "dumb"}
     with subprocess.Popen(
@@ -76,7 +76,7 @@ def in_a_terminal(columns: int, *arguments: str) -> str:
         while select.select([parent], [], [], 60)[0]:
             try:
                 text += os.read(parent, 65536)
-            except OSError:  # the command has ended
+            except OSError:  # the command has exited
                 break
         assert process.wait(60) == 0
     os.close(parent)
@@ -84,7 +84,7 @@ def in_a_terminal(columns: int, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("columns", [50, 80])
-def test_lines_end_between_words_in_a_terminal(columns: int) -> None:
+def test_lines_wrap_at_words_in_a_terminal(columns: int) -> None:
     words = " ".join(udrl("check", "CartPole-v1").stdout.split())
     lines = in_a_terminal(columns, "check", "CartPole-v1").splitlines()
     assert max(map(len, lines[:-1])) <= columns  # the last one is a command to copy
@@ -107,8 +107,8 @@ def test_runs_in_a_narrow_terminal() -> None:
     assert _narrow(unreadable, 50) == ["runs/broken", "  unreadable; changed 0:12 ago"]
 
 
-def test_end_does_not_wait_for_callbacks() -> None:
-    """Zenoh's threads outlive a session; an interpreter that ends under them hangs or aborts."""
+def test_exit_does_not_wait_for_callbacks() -> None:
+    """Zenoh's threads outlive a session; an interpreter that exits before them hangs or aborts."""
     program = """
 import sys, threading, click, zenoh
 from udrl_launch import cli
@@ -140,7 +140,7 @@ cli.main()
 
 
 def test_numpy_computes_in_one_thread() -> None:
-    """Its threads spin while they wait: two actors on two cores made a fifth of their env steps."""
+    """More threads spin while they wait: two actors on two cores reached a fifth of their speed."""
     program = """
 import os, sys, click
 from udrl_launch import cli
@@ -162,7 +162,7 @@ cli.main()
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"1\n", b"")
 
 
-def test_the_command_that_resumes_repeats_what_the_run_does_not_remember(tmp_path: Path) -> None:
+def test_resume_command_repeats_the_options_that_are_not_stored(tmp_path: Path) -> None:
     given = ["--run-dir", str(tmp_path / "run"), "--seed", "3", "--log", "tensorboard"]
     context = train.make_context("train", ["X-v0", *given, "--actors", "1", "--in-process"])
     with context:

@@ -1,4 +1,4 @@
-"""What options accept."""
+"""Values of options."""
 
 import click
 import pytest
@@ -21,7 +21,7 @@ from udrl_launch.subcommands.options import STEPS
         ("2.5E6", 2_500_000),
     ],
 )
-def test_steps_have_suffixes(text: str, steps: int) -> None:
+def test_step_counts_may_have_suffixes(text: str, steps: int) -> None:
     assert STEPS.convert(text, None, None) == steps
 
 
@@ -45,11 +45,11 @@ def test_steps_have_suffixes(text: str, steps: int) -> None:
         "9" * 30,
     ],
 )
-def test_other_steps_are_refused(text: str) -> None:
+def test_invalid_step_count_is_rejected(text: str) -> None:
     with pytest.raises(click.BadParameter, match="500K"):
         STEPS.convert(text, None, None)
 
 
 @given(st.integers(1, 2**53))
-def test_every_number_of_steps_is_read_as_it_is_written(steps: int) -> None:
+def test_step_count_round_trips(steps: int) -> None:
     assert STEPS.convert(str(steps), None, None) == steps

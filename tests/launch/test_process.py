@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-#: Frees 64 MB and allocates them again, a hundred times, in a thread as a service does.
+#: Frees and allocates 64 MB a hundred times, in a thread as services do.
 PROGRAM = """
 import resource, threading
 from udrl_launch.process import keep_freed_memory
@@ -32,7 +32,7 @@ thread.join()
 """
 
 
-def said_by(program: str) -> int:
+def number_printed_by(program: str) -> int:
     """Return the number that a program prints."""
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
@@ -42,9 +42,9 @@ def said_by(program: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is a setting of glibc")
 def test_freed_memory_is_kept() -> None:
-    assert said_by(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
+    assert number_printed_by(PROGRAM.replace("KEEP", "keep_freed_memory()")) < 100
     # The control: 64 MB are 16,384 pages.
-    assert said_by(PROGRAM.replace("KEEP", "")) > 1000
+    assert number_printed_by(PROGRAM.replace("KEEP", "")) > 1000
 
 
 SERVICE = """
@@ -74,28 +74,28 @@ def ended(body: str, *signals: int) -> tuple[int, str]:
         assert process.stdout.readline() == "up\n"
         for number in signals:
             process.send_signal(number)
-        _, said = process.communicate(timeout=30)
-    return process.returncode, said
+        _, log = process.communicate(timeout=30)
+    return process.returncode, log
 
 
-def test_service_has_the_main_thread_and_its_error_is_the_exit_code() -> None:
+def test_service_runs_in_the_main_thread_and_its_error_sets_the_exit_code() -> None:
     assert ended("pass") == (0, "")
-    code, said = ended("raise StoreError('the disk is gone')")
+    code, log = ended("raise StoreError('the disk is gone')")
     assert code == 8
-    assert said == "udrl: error: the disk is gone\n"
+    assert log == "udrl: error: the disk is gone\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_stops_a_service(number: signal.Signals) -> None:
-    code, said = ended("assert stop.wait(20)", number)
+    code, log = ended("assert stop.wait(20)", number)
     assert code == 128 + number
-    assert "stopped" in said
-    code, said = ended("assert stop.wait(20); raise Interrupted('in the middle')", number, number)
+    assert "stopped" in log
+    code, log = ended("assert stop.wait(20); raise Interrupted('in the middle')", number, number)
     assert code == 128 + number
-    assert "in the middle" in said
+    assert "in the middle" in log
 
 
-def test_other_signals_are_the_environments_own() -> None:
+def test_other_signals_are_left_to_the_environment() -> None:
     body = (
         "signal.signal(signal.SIGALRM, lambda *_: None); "
         "signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01); time.sleep(0.2); "
@@ -104,7 +104,7 @@ def test_other_signals_are_the_environments_own() -> None:
     assert ended(body) == (0, "")
 
 
-def test_forked_child_has_its_signals_for_itself() -> None:
+def test_forked_child_handles_its_own_signals() -> None:
     body = (
         "import multiprocessing as m; context = m.get_context('fork'); up = context.Event(); "
         "child = context.Process(target=lambda: (up.set(), time.sleep(30))); child.start(); "
@@ -114,14 +114,14 @@ def test_forked_child_has_its_signals_for_itself() -> None:
     assert ended(body) == (0, "")
 
 
-def test_service_that_does_not_listen_is_abandoned() -> None:
-    code, said = ended("time.sleep(20)", signal.SIGTERM)
+def test_unresponsive_service_is_abandoned() -> None:
+    code, log = ended("time.sleep(20)", signal.SIGTERM)
     assert code == 128 + signal.SIGTERM
-    assert "did not stop within 3 s; exiting" in said
+    assert "did not stop within 3 s; exiting" in log
 
 
 @pytest.mark.parametrize(("given", "found"), [(256, 4096), (4096, 4096), (16, 4096)])
-def test_as_many_files_may_be_open_as_the_system_allows(given: int, found: int) -> None:
+def test_limit_of_open_files_is_raised_to_the_maximum(given: int, found: int) -> None:
     program = (
         "from resource import RLIMIT_NOFILE, getrlimit, setrlimit\n"
         "from udrl_launch.process import allow_open_files\n"
@@ -129,4 +129,4 @@ def test_as_many_files_may_be_open_as_the_system_allows(given: int, found: int) 
         "allow_open_files()\n"
         "print(getrlimit(RLIMIT_NOFILE)[0])"
     )
-    assert said_by(program) == found
+    assert number_printed_by(program) == found

@@ -1,4 +1,4 @@
-"""Where settings come from: preset, then file, then options, then --set; the last word counts."""
+"""Precedence of settings: preset, file, options, ``--set``."""
 
 from pathlib import Path
 
@@ -10,26 +10,26 @@ from udrl_launch.settings import gather
 from udrl_launch.subcommands.train_command import warn_of_idle_environments
 
 
-def test_preset_named_like_the_environment_is_taken() -> None:
+def test_preset_of_the_environment_is_the_default() -> None:
     settings = gather("CartPole-v1", options={})
     assert settings.config.training.batch_size == preset("CartPole-v1")["batch_size"]
     assert settings.budget.max_env_steps == preset("CartPole-v1")["max_env_steps"]
 
 
-def test_another_preset_can_be_named() -> None:
+def test_another_preset_can_be_selected() -> None:
     settings = gather("LunarLander-v3", preset_name="CartPole-v1", options={})
     assert settings.config.environment == "LunarLander-v3"
     assert settings.config.buffer.replay_size == preset("CartPole-v1")["replay_size"]
 
 
-def test_without_a_preset_of_its_own_an_environment_gets_that_for_any() -> None:
+def test_environment_without_preset_gets_the_generic_one() -> None:
     settings = gather("Figure2-v0", options={})
     assert settings.automatic == AUTOMATIC.keys()
     assert settings.config.buffer.max_age == preset("any")["max_age"]
     assert gather("Figure2-v0", preset_name="none", options={}).automatic == frozenset()
 
 
-def test_a_setting_is_left_open_or_has_a_value() -> None:
+def test_setting_is_automatic_or_has_a_value() -> None:
     settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["warm_up_hold=4"])
     assert settings.automatic == AUTOMATIC.keys() - {"return_scale", "warm_up_hold"}
     assert settings.config.network.return_scale == 0.5
@@ -38,25 +38,25 @@ def test_a_setting_is_left_open_or_has_a_value() -> None:
     }
 
 
-def test_all_segments_go_without_a_baseline() -> None:
+def test_all_segments_exclude_a_baseline() -> None:
     settings = gather("Figure2-v0", options={"segments": "all"})
     assert settings.config.network.baseline == "none"
     assert "baseline" in settings.automatic
 
 
-def test_a_run_that_exists_keeps_what_was_chosen_for_it() -> None:
+def test_existing_run_keeps_its_automatic_settings() -> None:
     stored = {"return_scale": 0.5, "last_few": 4}
     settings = gather("Figure2-v0", stored=stored, options={}, assignments=["return_scale=auto"])
     assert settings.automatic == frozenset()
     assert settings.config.network.return_scale == 0.5
 
 
-def test_only_some_settings_can_be_left_open() -> None:
+def test_only_some_settings_can_be_automatic() -> None:
     with pytest.raises(ConfigError, match=r"batch_size = 'auto'"):
         gather("Figure2-v0", options={}, assignments=["batch_size=auto"])
 
 
-def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
+def test_each_source_overrides_the_previous_one(tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text("seed = 2\nlead = 2\nbatch_size = 2\nactors = 3\n")
     settings = gather(
@@ -75,7 +75,7 @@ def test_stored_settings_replace_the_preset() -> None:
     assert settings.config.network.hidden != tuple(preset("CartPole-v1")["hidden"])
 
 
-def test_file_of_another_environment_is_refused(tmp_path: Path) -> None:
+def test_file_of_another_environment_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text('environment = "Acrobot-v1"\n')
     with pytest.raises(ConfigError, match=r"'Acrobot-v1' in .*, but ENV is 'CartPole-v1'"):
@@ -83,7 +83,7 @@ def test_file_of_another_environment_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["actor", "max_steps", "envs"])
-def test_unknown_setting_is_refused(name: str) -> None:
+def test_unknown_setting_is_rejected(name: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown setting '{name}'"):
         gather("CartPole-v1", options={name: 1})
 
@@ -97,7 +97,7 @@ def test_unknown_setting_is_refused(name: str) -> None:
         ("training_threads=2", "device=cpu"),
     ],
 )
-def test_setting_that_has_no_effect_is_refused(idle: str, needed: str) -> None:
+def test_ineffective_setting_is_rejected(idle: str, needed: str) -> None:
     name = idle.partition("=")[0]
     without = ["device=cuda"] if name == "training_threads" else []
     with pytest.raises(
@@ -107,7 +107,7 @@ def test_setting_that_has_no_effect_is_refused(idle: str, needed: str) -> None:
     gather("Figure2-v0", preset_name="none", options={}, assignments=[idle, needed])
 
 
-def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:
+def test_ineffective_setting_of_a_file_is_accepted(tmp_path: Path) -> None:
     file = tmp_path / "config.toml"
     file.write_text("hold_steps = 9\n")
     assert gather("Figure2-v0", file=file, options={}).config.commands.hold_steps == 9
@@ -124,21 +124,19 @@ def test_settings_that_nobody_asked_for_may_be_idle(tmp_path: Path) -> None:
         ({"actors": 500, "envs_per_actor": 30}, 30),
     ],
 )
-def test_actors_have_environments_for_what_can_run_at_once(
+def test_actors_have_environments_for_all_concurrent_episodes(
     options: dict[str, int], expected: int
 ) -> None:
     assert gather("CartPole-v1", options=options).envs_per_actor == expected
 
 
 @pytest.mark.parametrize("environment", preset_names())
-def test_shipped_settings_are_not_warned_of(
-    environment: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_presets_cause_no_warning(environment: str, caplog: pytest.LogCaptureFixture) -> None:
     warn_of_idle_environments(gather("Figure2-v0", preset_name=environment, options={}))
     assert not caplog.records
 
 
-def test_environments_that_somebody_asked_for_in_vain_are_warned_of(
+def test_unused_environments_are_warned_of(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     warn_of_idle_environments(gather("CartPole-v1", options={"envs_per_actor": 16}))
@@ -148,7 +146,7 @@ def test_environments_that_somebody_asked_for_in_vain_are_warned_of(
 @pytest.mark.parametrize(
     ("given", "steps"), [("3M", 3_000_000), ("1e5", 100_000), (1e5, 100_000), (250, 250)]
 )
-def test_numbers_of_steps_can_be_abbreviated(given: object, steps: int) -> None:
+def test_step_counts_may_have_suffixes(given: object, steps: int) -> None:
     settings = gather("CartPole-v1", options={"max_env_steps": given, "eval_every": given})
     assert settings.budget.max_env_steps == steps
     assert settings.config.evaluation.eval_every == steps
@@ -157,6 +155,6 @@ def test_numbers_of_steps_can_be_abbreviated(given: object, steps: int) -> None:
 
 
 @pytest.mark.parametrize("given", ["many", 1.5, "0.1"])
-def test_other_numbers_of_steps_are_refused(given: object) -> None:
+def test_invalid_step_count_is_rejected(given: object) -> None:
     with pytest.raises(ConfigError, match=f"max_env_steps = '?{given}"):
         gather("CartPole-v1", options={"max_env_steps": given})

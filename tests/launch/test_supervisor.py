@@ -1,4 +1,4 @@
-"""Children are started again when they die, unless that would only repeat."""
+"""The supervisor restarts children that die, unless the error would repeat."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ def supervisor(tmp_path: Path) -> Iterator[Supervisor]:
 
 
 def start(one: Supervisor, name: str, code: str) -> None:
-    """Start Python code as a child; what else it is given are arguments that it ignores."""
+    """Start Python code as a child; it ignores its other arguments."""
     one.start(name, prefix=(sys.executable, "-c", code))
 
 
@@ -41,13 +41,13 @@ def pid(one: Supervisor) -> int:
     return process.pid
 
 
-def test_child_that_ends_well_is_done(supervisor: Supervisor) -> None:
+def test_child_that_exits_normally_is_done(supervisor: Supervisor) -> None:
     start(supervisor, "child", "print('bye')")
     check_until(supervisor, lambda: supervisor.done)
     assert supervisor.children[0].log_tail() == "bye"
 
 
-def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
+def test_killed_child_is_restarted(supervisor: Supervisor) -> None:
     start(supervisor, "child", WAIT)
     first = pid(supervisor)
     os.kill(first, signal.SIGKILL)
@@ -56,43 +56,43 @@ def test_killed_child_is_started_again(supervisor: Supervisor) -> None:
 
 
 @pytest.mark.parametrize("code", sorted(module.FINAL_CODES))
-def test_error_that_would_be_repeated_is_final(supervisor: Supervisor, code: int) -> None:
+def test_permanent_error_is_not_retried(supervisor: Supervisor, code: int) -> None:
     start(supervisor, "child", f"print('because'); raise SystemExit({code})")
     with pytest.raises(RunFailed, match=f"child ended with code {code}:\nbecause") as failure:
         check_until(supervisor, lambda: False)
     assert failure.value.exit_code == code
 
 
-def test_child_that_dies_without_getting_on_is_given_up(supervisor: Supervisor) -> None:
+def test_child_that_dies_without_progress_is_given_up(supervisor: Supervisor) -> None:
     start(supervisor, "child", "print('why'); raise SystemExit(1)")
-    says = "child ended with code 1 6 times without progress:\nwhy"
-    with pytest.raises(RunFailed, match=says):
+    message = "child ended with code 1 6 times without progress:\nwhy"
+    with pytest.raises(RunFailed, match=message):
         check_until(supervisor, lambda: False)
 
 
-def test_child_that_gets_on_is_started_again_for_ever(supervisor: Supervisor) -> None:
+def test_child_that_makes_progress_is_always_restarted(supervisor: Supervisor) -> None:
     supervisor.start("actor-1", "actor", prefix=(sys.executable, "-c", "raise SystemExit(1)"))
     child, started = supervisor.children[0], set[int]()
 
-    def often() -> bool:
+    def has_restarted_often() -> bool:
         assert child.process is not None
         started.add(child.process.pid)
         supervisor.work["actor"] = len(started) // 4
         return len(started) >= 20
 
-    check_until(supervisor, often)
+    check_until(supervisor, has_restarted_often)
 
 
-def test_signal_is_called_by_its_name_and_what_it_usually_means(supervisor: Supervisor) -> None:
+def test_signal_is_reported_with_its_name_and_usual_cause(supervisor: Supervisor) -> None:
     start(supervisor, "child", "import os; os.kill(os.getpid(), 9)")
-    says = r"child ended by SIGKILL \(killed, or out of memory\) 6 times"
-    with pytest.raises(RunFailed, match=says):
+    message = r"child ended by SIGKILL \(killed, or out of memory\) 6 times"
+    with pytest.raises(RunFailed, match=message):
         check_until(supervisor, lambda: False)
     assert module.how_it_ended(-11) == "ended by SIGSEGV (a crash in native code)"
     assert module.how_it_ended(-40) == "ended by signal 40"
 
 
-def test_log_that_somebody_removed_harms_nothing(supervisor: Supervisor) -> None:
+def test_removed_log_is_tolerated(supervisor: Supervisor) -> None:
     start(supervisor, "child", WAIT)
     (log_file,) = (child.log_file for child in supervisor.children)
     log_file.unlink()
@@ -100,9 +100,7 @@ def test_log_that_somebody_removed_harms_nothing(supervisor: Supervisor) -> None
     assert supervisor.children[0].log_tail() == f"{log_file} is missing"
 
 
-def test_log_without_end_is_shortened(
-    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_log_is_shortened(supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_LONGEST_LOG", 4000)
     chatty = "n = 0\nwhile n < 20_000: n += 1; print('line', n, flush=True)"
     start(supervisor, "child", chatty)
@@ -114,7 +112,7 @@ def test_log_without_end_is_shortened(
     assert supervisor.children[0].log_tail().splitlines()[-1] == "line 20000"
 
 
-def test_end_kills_a_child_that_does_not_listen(
+def test_end_kills_an_unresponsive_child(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "END_S", 0.2)
@@ -132,7 +130,7 @@ def test_end_kills_a_child_that_does_not_listen(
     assert process.returncode == -signal.SIGKILL
 
 
-def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) -> None:
+def test_no_child_is_restarted_after_the_first_is_done(supervisor: Supervisor) -> None:
     start(supervisor, "first", "pass")
     check_until(supervisor, lambda: supervisor.children[0].done)
     start(supervisor, "other", "raise SystemExit(1)")
@@ -140,7 +138,7 @@ def test_nobody_is_started_again_when_the_first_is_done(supervisor: Supervisor) 
     assert supervisor.children[1].starts == 1
 
 
-def test_who_does_not_end_after_the_first_is_not_waited_for(
+def test_remaining_children_are_ended_after_a_grace_period(
     supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "END_S", 0.2)
@@ -154,7 +152,7 @@ def test_who_does_not_end_after_the_first_is_not_waited_for(
     assert other.returncode == -signal.SIGTERM
 
 
-def test_a_killed_first_child_is_started_again(supervisor: Supervisor) -> None:
+def test_killed_first_child_is_restarted(supervisor: Supervisor) -> None:
     start(supervisor, "first", WAIT)
     start(supervisor, "other", "pass")
     check_until(supervisor, lambda: supervisor.children[1].done)

@@ -1,4 +1,4 @@
-"""``udrl train``: starting and stopping."""
+"""Starting and stopping ``udrl train``."""
 
 import threading
 from pathlib import Path
@@ -13,28 +13,28 @@ from udrl_replay.store import Store
 TOY = {"n_warm_up_episodes": 5, "max_return": 2.0}
 
 
-class Silent:
-    """Services that never answer."""
+class UnresponsiveServices:
+    """Services that never reply."""
 
     done = False
     ended = False
 
     def __init__(self, run_dir: Path, store: Store, *_: object, **__: object) -> None:
-        """Start nothing, and leave the run to others."""
+        """Start no process."""
         store.close()
 
     def check(self) -> None:
-        """Find nothing wrong."""
+        """Report no error."""
 
     def end(self) -> None:
-        """Note that they were ended."""
-        Silent.ended = True
+        """Record the call."""
+        UnresponsiveServices.ended = True
 
 
-def test_a_stop_while_connecting_says_how_to_resume(
+def test_stop_while_connecting_prints_how_to_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training_run, "Threads", Silent)
+    monkeypatch.setattr(training_run, "Threads", UnresponsiveServices)
     stop = threading.Event()
     timer = threading.Timer(0.3, stop.set)
     timer.start()
@@ -42,4 +42,4 @@ def test_a_stop_while_connecting_says_how_to_resume(
     command = f"udrl train Figure2-v0 --run-dir {tmp_path / 'run'} --resume"
     with pytest.raises(Interrupted, match=f"^stopped; resume with: {command}$"):
         training_run.train(settings, tmp_path / "run", stop, in_process=True)
-    assert Silent.ended
+    assert UnresponsiveServices.ended

@@ -1,4 +1,4 @@
-"""The learner service against a scripted replay service."""
+"""The learner service with a scripted replay service."""
 
 import threading
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def weights_after(*buffers: list[int]) -> bytes:
     return encode_weights(state.weights)
 
 
-#: The buffer that each version is trained on; then the run has ended.
+#: The buffer for each version; then the run has ended.
 BUFFERS = {1: [1, 2], 2: [2, 3], 3: [3, 4, 2]}
 
 
@@ -91,7 +91,7 @@ def replay() -> Scripted:
         return ChangesReply(ids=tuple(BUFFERS[request.version]))
 
     def episodes(request: EpisodesRequest) -> EpisodesReply:
-        # One a page: the learner must go on asking.
+        # One per page, so that the learner has to request several pages.
         return EpisodesReply(episodes=(encode_episode(episode(request.ids[0]), "a"),))
 
     scripted.answers(verbs.JOIN, lambda _: JoinReply())
@@ -112,32 +112,32 @@ def delivered(replay: Scripted) -> list[tuple[int, bytes]]:
     return [(message.version, message.weights) for message in versions]
 
 
-def test_versions_are_those_of_training_on_each_buffer(
-    replay: Scripted, run: Callable[[], None]
-) -> None:
+def test_versions_equal_training_on_each_buffer(replay: Scripted, run: Callable[[], None]) -> None:
     run()
     buffers = list(BUFFERS.values())
     assert delivered(replay) == [(v, weights_after(*buffers[:v])) for v in (1, 2, 3)]
 
 
-def test_only_episodes_that_are_new_are_fetched(replay: Scripted, run: Callable[[], None]) -> None:
+def test_only_new_episodes_are_fetched(replay: Scripted, run: Callable[[], None]) -> None:
     run()
     first = [request.ids[0] for request in replay.requests(verbs.EPISODES)]
     assert first == [1, 2, 3, 4]
 
 
-def test_next_buffer_is_asked_for_while_a_version_is_trained(
+def test_next_buffer_is_requested_during_training(
     replay: Scripted, run: Callable[[], None]
 ) -> None:
-    asked = threading.Event()
+    is_requested = threading.Event()
 
     def changes(request: ChangesRequest) -> ChangesReply:
         if request.version == 2:
-            asked.set()
+            is_requested.set()
         return ChangesReply(ids=(1, 2)) if request.version == 1 else ChangesReply(ended=True)
 
     def version(message: VersionMessage) -> VersionReply:
-        assert asked.wait(10.0), "version 1 came before the next buffer was asked for"
+        assert is_requested.wait(10.0), (
+            "version 1 was delivered before the next buffer was requested"
+        )
         return VersionReply(result="accepted")
 
     replay.answers(verbs.CHANGES, changes)
@@ -149,10 +149,10 @@ def test_next_buffer_is_asked_for_while_a_version_is_trained(
 @pytest.mark.parametrize(
     "verb", [verbs.CHANGES, verbs.EPISODES, verbs.VERSION], ids=lambda v: v.name
 )
-def test_learner_that_is_out_of_step_starts_from_the_state(
+def test_rewound_learner_restarts_from_the_state(
     verb: verbs.Verb[Any, Any], replay: Scripted, run: Callable[[], None]
 ) -> None:
-    """What it trains in the end is the same."""
+    """The trained versions are the same."""
     code = "unknown_episode" if verb is verbs.EPISODES else "rewind"
     answers: dict[str, Callable[[Any], Message]] = {
         "changes": lambda r: (
@@ -179,7 +179,7 @@ def test_learner_that_is_out_of_step_starts_from_the_state(
 
 
 class NoPause(threading.Event):
-    """Notes for how long somebody would have waited."""
+    """Records the durations of its waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ class NoPause(threading.Event):
         return self.is_set()
 
 
-def test_learner_that_is_sent_back_without_end_gives_up(replay: Scripted) -> None:
+def test_learner_gives_up_after_repeated_rewinds(replay: Scripted) -> None:
     never = NoPause()
     replay.answers(verbs.CHANGES, lambda _: Problem(code="rewind", message="version 7 is next"))
     with pytest.raises(Refused, match=r"7 times from weights version 0 .*: version 7 is next; the"):
@@ -199,8 +199,8 @@ def test_learner_that_is_sent_back_without_end_gives_up(replay: Scripted) -> Non
     assert never.waits == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
 
 
-def test_learner_that_is_sent_back_while_another_gets_on_goes_on(replay: Scripted) -> None:
-    """It is slower each time, so that it delivers nothing."""
+def test_rewound_learner_continues_while_another_makes_progress(replay: Scripted) -> None:
+    """It is always slower, and therefore delivers nothing."""
     there, state = 0, untrained(CONFIG, SPEC)
     states: list[StateReply] = [StateReply(version=0)]
     experience = Experience(CONFIG, SPEC)
@@ -224,7 +224,7 @@ def test_learner_that_is_sent_back_while_another_gets_on_goes_on(replay: Scripte
     assert there == 20
 
 
-def test_refusal_that_starting_over_does_not_mend_is_raised(
+def test_refusal_that_persists_after_a_rewind_is_raised(
     replay: Scripted, run: Callable[[], None]
 ) -> None:
     replay.answers(verbs.VERSION, lambda _: Problem(code="unequal_version", message="differs"))
@@ -232,10 +232,10 @@ def test_refusal_that_starting_over_does_not_mend_is_raised(
         run()
 
 
-def test_delivery_that_fails_is_noticed_while_the_next_buffer_is_awaited(
+def test_failed_delivery_is_noticed_while_the_next_buffer_is_awaited(
     replay: Scripted, run: Callable[[], None]
 ) -> None:
-    """The replay service waits for the version, and would never have the next buffer."""
+    """The replay service has no next buffer until it gets the version."""
 
     def changes(request: ChangesRequest) -> ChangesReply:
         if request.version == 1:

@@ -1,4 +1,4 @@
-"""Sessions of a router and of a client, on loopback."""
+"""A router and a client on loopback."""
 
 import socket
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from udrl_proto import session as sessions
 
 @pytest.fixture
 def endpoint() -> str:
-    """An endpoint that nobody listens on."""
+    """An endpoint that no process listens on."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"

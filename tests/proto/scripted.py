@@ -1,4 +1,4 @@
-"""A replay service that answers from a script, without a network."""
+"""A replay service that replies from a script, without a network."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,27 +12,27 @@ from udrl_proto.verbs import Verb
 
 
 class Scripted:
-    """Answers what it was told to answer, and remembers what it was asked.
+    """Replies as scripted, and records the requests.
 
     Args:
-        run_id: of the run that it pretends to serve.
+        run_id: id of the run that it serves.
 
     Attributes:
-        transport: reaches it.
-        asked: name of the verb and request of each question, in their order.
+        transport: connects to it.
+        received: verb and message of each request, in order.
     """
 
     def __init__(self, run_id: str) -> None:
         self._run_id = run_id
         self.transport = MemoryTransport(Exchange())
-        self.asked: list[tuple[str, Any]] = []
+        self.received: list[tuple[str, Any]] = []
 
     def answers(self, verb: Verb[Any, Any], script: Callable[[Any], Message]) -> None:
-        """Answer a verb's questions by a function of the request."""
+        """Reply to a verb's requests by a function of the request."""
 
         def receive(query: Query) -> None:
             request = decode(query.data, verb.request, verb.limit)
-            self.asked.append((verb.name, request))
+            self.received.append((verb.name, request))
             answer = script(request)
             query.reply(Answer(encode(answer), is_problem=isinstance(answer, Problem)))
 
@@ -43,5 +43,5 @@ class Scripted:
         self.transport.publish(key_expressions.key(self._run_id, name), encode(message))
 
     def requests(self, verb: Verb[Any, Any]) -> list[Any]:
-        """Return the questions of a verb."""
-        return [request for name, request in self.asked if name == verb.name]
+        """Return the requests of a verb."""
+        return [request for name, request in self.received if name == verb.name]

@@ -1,4 +1,4 @@
-"""An actor written from ``proto/README.md`` alone: nothing of this project is imported."""
+"""An actor written from ``proto/README.md`` alone, without any import of udrl."""
 
 import hashlib
 import math
@@ -49,7 +49,7 @@ def numbers(key: bytes, n: int) -> list[float]:
     return [(word >> 11) * 2.0**-53 for word in philox(key, n)]
 
 
-# Inference and the choice of an action.
+# Inference and action selection.
 
 
 class Network:
@@ -88,8 +88,10 @@ def leaves(spec: dict[str, Any]) -> list[tuple[list[Any], dict[str, Any]]]:
     return [(list(leaf["path"]), leaf["space"]) for leaf in space["leaves"]]
 
 
-def seen(observations: list[list[npt.NDArray[Any]]], stack: int) -> list[npt.NDArray[Any]]:
-    """Return the most recent of each leaf, oldest first; the first stands for those before it."""
+def stack_observations(
+    observations: list[list[npt.NDArray[Any]]], stack: int
+) -> list[npt.NDArray[Any]]:
+    """Return the most recent of each leaf, oldest first; the first fills the stack."""
     recent = [observations[max(len(observations) - 1 - k, 0)] for k in reversed(range(stack))]
     return [np.concatenate(list(map(np.atleast_1d, one))) for one in zip(*recent, strict=True)]
 
@@ -104,8 +106,10 @@ def choose(row: list[float], u: float, temperature: float) -> int:
     return min(sum(c <= u * total for c in cumulative), len(row) - 1)
 
 
-def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.NDArray[Any]]:
-    """Return the leaves of an observation of an environment as its space says."""
+def convert_observation(
+    observation: Any, space: Any, spec: dict[str, Any]
+) -> list[npt.NDArray[Any]]:
+    """Convert an environment's observation to leaves of the declared dtypes and shapes."""
     found = []
     for path, leaf in leaves(spec):
         value, of = observation, space
@@ -123,8 +127,10 @@ def as_promised(observation: Any, space: Any, spec: dict[str, Any]) -> list[npt.
     return found
 
 
-def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDArray[Any]:
-    """Return an episode's observations as they are sent."""
+def encode_observations(
+    steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]
+) -> npt.NDArray[Any]:
+    """Return an episode's observations in wire format."""
     if spec["observation_space"]["kind"] != "record":
         return np.array([one for (one,) in steps])
     rows = [b"".join(leaf.tobytes() for leaf in step) for step in steps]
@@ -132,7 +138,7 @@ def packed(steps: list[list[npt.NDArray[Any]]], spec: dict[str, Any]) -> npt.NDA
 
 
 def components(spec: dict[str, Any]) -> list[int]:
-    """Return how many values there are of each component of an action."""
+    """Return the number of values of each component of an action."""
     space = spec["action_space"]
     return list(space["ns"]) if space["kind"] == "product" else [space["n"]]
 
@@ -141,18 +147,18 @@ def is_box(space: Any) -> bool:
     return isinstance(space, gym.spaces.Box)
 
 
-def all_within(space: Any) -> list[Any]:
+def nested_spaces(space: Any) -> list[Any]:
     """Return the spaces in dictionaries and tuples."""
     if isinstance(space, gym.spaces.Dict):
-        return [leaf for inner in space.spaces.values() for leaf in all_within(inner)]
+        return [leaf for inner in space.spaces.values() for leaf in nested_spaces(inner)]
     if isinstance(space, gym.spaces.Tuple):
-        return [leaf for inner in space.spaces for leaf in all_within(inner)]
+        return [leaf for inner in space.spaces for leaf in nested_spaces(inner)]
     return [space]
 
 
-def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
-    """Return an action as its environment takes it; the indices are used up."""
-    dimensions = sum(math.prod(one.shape) for one in all_within(space) if is_box(one))
+def convert_action(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
+    """Convert action indices to an action of the environment's space; consumes the indices."""
+    dimensions = sum(math.prod(one.shape) for one in nested_spaces(space) if is_box(one))
     m = config["action_bins"] or (11 if dimensions <= 2 else 7)
 
     def one(inner: Any) -> Any:
@@ -179,7 +185,7 @@ def as_declared(indices: list[int], space: Any, config: dict[str, Any]) -> Any:
 def run_episode(
     command: dict[str, Any], hello: dict[str, Any], network: Network | None
 ) -> dict[str, Any]:
-    """Carry out a command and return the arrays and flags of its episode."""
+    """Run a command; return the arrays and flags of its episode."""
     config, spec = hello["config"], hello["environment"]
     ns = components(spec)
     limited = {"max_episode_steps": command["max_steps"]} | config["environment_kwargs"]
@@ -197,7 +203,7 @@ def run_episode(
     while not (terminated or truncated):
         if command["cap"] is not None:
             desired = min(desired, command["cap"])
-        observations.append(as_promised(observation, env.observation_space, spec))
+        observations.append(convert_observation(observation, env.observation_space, spec))
         t = len(actions)
         since = t - command["random_from"]
         if command["random_rate"] and t >= held_until and begins[t] < command["random_rate"]:
@@ -206,7 +212,7 @@ def run_episode(
             held_until = t + command["random_hold"] * multiple
         row: list[float] = []
         if network is not None:
-            stacked = seen(observations, config["frame_stack"])
+            stacked = stack_observations(observations, config["frame_stack"])
             found, state = network.logits(stacked, [desired, horizon], state)
             row = found.tolist()
         decides = t
@@ -221,7 +227,7 @@ def run_episode(
             first += n
             action.append(choose(own, number, command["temperature"]) if own else int(number * n))
         actions.append(action)
-        taken = as_declared(list(action), env.action_space, config)
+        taken = convert_action(list(action), env.action_space, config)
         observation, reward, terminated, truncated, _ = env.step(taken)
         rewards.append(np.float32(reward))
         desired -= float(rewards[-1])
@@ -229,7 +235,7 @@ def run_episode(
     env.close()
     done = np.array(actions, "|u1" if max(ns) <= 256 else "<i4")
     return {
-        "observations": packed(observations, spec),
+        "observations": encode_observations(observations, spec),
         "actions": done if spec["action_space"]["kind"] == "product" else done[:, 0],
         "rewards": np.array(rewards, "<f4"),
         "terminated": terminated,
@@ -269,7 +275,7 @@ def probe_weights(graph: bytes) -> Weights:
 def probe_rows(
     hello: dict[str, Any], state_size: int
 ) -> tuple[list[npt.NDArray[Any]], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return what the network sees in 16 rows, leaf by leaf, their commands and states."""
+    """Return the network inputs of 16 rows: observations by leaf, commands, states."""
     stack, sizes = hello["config"]["frame_stack"], []
     for _, space in leaves(hello["environment"]):
         names = ("size", "channels", "height", "width")
@@ -344,11 +350,11 @@ def environment_digest(hello: dict[str, Any]) -> str:
     return episode_digest(0, run_episode(command, hello, None)).hex()[:16]
 
 
-# The life of an actor.
+# The actor's main loop.
 
 
 class Problem(Exception):
-    """The answer is no; the argument is its code."""
+    """A problem reply; the argument is its code."""
 
 
 def ask(session: zenoh.Session, key: str, request: dict[str, Any]) -> dict[str, Any]:
@@ -371,7 +377,7 @@ def ask(session: zenoh.Session, key: str, request: dict[str, Any]) -> dict[str, 
 
 
 def act(session: zenoh.Session) -> int:
-    """Serve the only run on the router until it has ended; return the episodes delivered."""
+    """Serve the only run on the router until it has ended; return the delivered episodes."""
     (reply,) = session.get("udrl/*/*/hello", payload=b"\x80", timeout=3.0)
     assert reply.ok is not None
     run = str(reply.ok.key_expr).removesuffix("/hello")

@@ -1,4 +1,4 @@
-"""Any message, drawn from the types themselves: a new field is covered as soon as it exists."""
+"""Hypothesis strategies for messages, derived from their types, so that new fields are covered."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -15,8 +15,8 @@ from udrl_proto.messages import Message
 
 MESSAGES = sorted(Message.__subclasses__(), key=lambda kind: kind.__name__)
 
-#: Of an environment: numbers and texts in lists and tables. Drawn from its type, it would take
-#: minutes: a type of several levels names each level several times.
+#: Keyword arguments of environments: nested numbers and texts. Derived from their recursive type,
+#: the strategy would take minutes to draw.
 _PLAIN: st.SearchStrategy[Any] = st.one_of(
     st.booleans(),
     st.integers(-(2**63), 2**63 - 1),
@@ -39,7 +39,7 @@ def messages(kind: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
 
 
 def setting_fields(kind: type[msgspec.Struct]) -> Iterator[inspect.Field]:
-    """Yield the fields of all settings of a kind, those in groups among them."""
+    """Yield the fields of all settings of a kind, including those in groups."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     for field in info.fields:
@@ -51,8 +51,8 @@ def setting_fields(kind: type[msgspec.Struct]) -> Iterator[inspect.Field]:
 
 
 def configs() -> st.SearchStrategy[Config]:
-    """Return a strategy for all settings of a run."""
-    return _fields(setting_fields(Config)).map(lambda given: build(Config, _possible(given)))
+    """Return a strategy for valid configurations."""
+    return _fields(setting_fields(Config)).map(lambda given: build(Config, _consistent(given)))
 
 
 def _fields(fields: Iterable[inspect.Field]) -> st.SearchStrategy[dict[str, Any]]:
@@ -109,8 +109,8 @@ def _any(node: inspect.Type) -> st.SearchStrategy[Any]:
     raise NotImplementedError(node)
 
 
-def _possible(values: dict[str, Any]) -> dict[str, Any]:
-    """Return settings of a run that can be had together."""
+def _consistent(values: dict[str, Any]) -> dict[str, Any]:
+    """Make a combination of settings consistent."""
     last_few = min(values.get("last_few", 75), 1_000_000)
     values |= {"last_few": last_few, "replay_size": max(values.get("replay_size", 500), last_few)}
     if values.get("segments") == "all":

@@ -1,4 +1,4 @@
-"""Who has no key gets in nowhere, and who has one does what its role may, and nothing else."""
+"""Access control: no access without a key, and with a key only what the role permits."""
 
 import json
 import queue
@@ -26,7 +26,7 @@ from whole_run import configured_router, wait_for
 
 DEADLINE_S = 10.0
 
-#: Written out here once more, so that no slip in the table goes unseen.
+#: Repeated here on purpose: a mistake in the table of the code must not go unnoticed.
 MAY_ASK = {
     "learner": {"hello", "join", "changes", "episodes", "version", "state"},
     "actor": {"hello", "join", "commands", "episode", "failure", "weights"},
@@ -43,24 +43,24 @@ def secure_endpoint(endpoint: str) -> str:
 
 
 class Replay:
-    """Stands for the replay service: answers every verb."""
+    """A stand-in for the replay service: replies to every verb."""
 
     def __init__(self, session: zenoh.Session, *, hosts_router: bool) -> None:
         self.session = session
         self.hosts_router = hosts_router
-        self.asked: list[str] = []
+        self.received: list[str] = []
         self.tokens: queue.Queue[str] = queue.Queue()
         for verb in verbs.BY_NAME:
             key = key_expressions.key("run", verb)
             self.session.declare_queryable(key, partial(self._answer, key), complete=True)
-        self.heard = Heard(session, "**")
+        self.heard = RecordingSubscriber(session, "**")
         self.session.liveliness().declare_subscriber(
             key_expressions.alive("run", "*", "*"), self._note
         )
 
     def _answer(self, key: str, query: zenoh.Query) -> None:
         with query:
-            self.asked.append(key)
+            self.received.append(key)
             query.reply(key, b"replay")
 
     def _note(self, token: zenoh.Sample) -> None:
@@ -83,7 +83,7 @@ def replay(request: pytest.FixtureRequest, endpoint: str, keys_dir: Path) -> Ite
 
 @pytest.fixture
 def connect(replay: Replay, secure_endpoint: str, keys_dir: Path) -> Iterator[Connect]:
-    """Connect with a role's key."""
+    """Connect with the key of a role."""
     with ExitStack() as stack:
 
         def client(role: str) -> zenoh.Session:
@@ -95,7 +95,7 @@ def connect(replay: Replay, secure_endpoint: str, keys_dir: Path) -> Iterator[Co
 
 
 def ask(session: zenoh.Session, verb: str) -> list[str]:
-    """Return who answers a query, of all that could."""
+    """Return all replies to a request."""
     replies = session.get(
         key_expressions.key("run", verb),
         timeout=DEADLINE_S,
@@ -105,8 +105,8 @@ def ask(session: zenoh.Session, verb: str) -> list[str]:
     return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
 
 
-class Heard:
-    """What a subscriber was sent; one that waits for a certain message is woken by it."""
+class RecordingSubscriber:
+    """Messages of a subscriber; ``wait_for`` waits for one of them."""
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self.messages: list[tuple[str, str]] = []
@@ -121,17 +121,17 @@ class Heard:
 
     def wait_for(self, text: str) -> None:
         with self._changed:
-            there = self._changed.wait_for(
+            visible_tokens = self._changed.wait_for(
                 lambda: any(text == message for _, message in self.messages), DEADLINE_S
             )
-        assert there, f"{text!r} did not come; there is {self.messages}"
+        assert visible_tokens, f"{text!r} not received; received: {self.messages}"
 
 
-# Getting in.
+# Connecting.
 
 
-def raw(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
-    """Return settings that no program of ours would use."""
+def raw_config(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
+    """Return a raw Zenoh configuration."""
     config = zenoh.Config()
     given = {f"transport/link/tls/{name}": str(value) for name, value in tls.items()}
     for name, value in {
@@ -147,11 +147,11 @@ def raw(endpoint: str, mode: str = "client", **tls: Any) -> zenoh.Config:
     return config
 
 
-def test_without_a_certificate_nobody_gets_in(
+def test_connection_without_certificate_is_refused(
     replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
 ) -> None:
     with pytest.raises(zenoh.ZError):
-        zenoh.open(raw(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
+        zenoh.open(raw_config(secure_endpoint, root_ca_certificate=keys_dir / "actor" / "ca.pem"))
     with pytest.raises(Unreachable, match="no reply from"):
         sessions.connect(secure_endpoint.replace("tls", "tcp"), patience_s=0.1)
     assert ask(connect("actor"), verbs.HELLO.name) == ["replay"]
@@ -163,7 +163,7 @@ def test_key_of_another_authority_is_refused_by_both_sides(
     foreign = load(foreign_keys_dir, "actor")
     with pytest.raises(ConfigError, match=r"not trusted.*same `udrl keys create`"):
         sessions.connect(secure_endpoint, DEADLINE_S, credentials=foreign)
-    # One that would trust this server is not trusted by it.
+    # A client that trusts this server is still not trusted by it.
     foreign = foreign._replace(ca=keys_dir / "actor" / "ca.pem")
     with pytest.raises(ConfigError, match=r"does not trust .*cert\.pem .*same `udrl keys create`"):
         sessions.connect(secure_endpoint, DEADLINE_S, credentials=foreign)
@@ -190,7 +190,9 @@ def test_server_of_another_name_is_refused(secure_endpoint: str, keys_dir: Path)
         sessions.connect(other, DEADLINE_S, credentials=load(keys_dir, "actor"))
 
 
-def test_nobody_at_a_secure_endpoint_is_said_in_time(secure_endpoint: str, keys_dir: Path) -> None:
+def test_connecting_to_a_secure_endpoint_without_router_times_out(
+    secure_endpoint: str, keys_dir: Path
+) -> None:
     with pytest.raises(Unreachable, match="no reply from"):
         sessions.connect(secure_endpoint, 0.1, credentials=load(keys_dir, "actor"))
 
@@ -202,36 +204,38 @@ def test_link_is_closed_when_the_keys_expire(secure_endpoint: str, tmp_path: Pat
         sessions.connect(secure_endpoint, 3, credentials=load(tmp_path, "actor")) as client,
     ):
         assert list(client.info.routers_zid())
-        wait_for(lambda: not list(client.info.routers_zid()), "the end of the link")
+        wait_for(lambda: not list(client.info.routers_zid()), "the link to close")
     with pytest.raises(ConfigError, match="expired"):
         load(tmp_path, "actor")
 
 
-# Asking and answering.
+# Requests and replies.
 
 
 @pytest.mark.parametrize("role", MAY_ASK)
-def test_role_gets_answers_to_its_own_verbs_only(
+def test_role_gets_replies_to_its_own_verbs_only(
     role: str, replay: Replay, connect: Connect
 ) -> None:
     client = connect(role)
     assert {verb for verb in verbs.BY_NAME if ask(client, verb)} == MAY_ASK[role]
-    assert replay.asked == [
+    assert replay.received == [
         key_expressions.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
     ]
 
 
 @pytest.mark.parametrize("expression", ["udrl/**", "udrl/1/run/*", "**", "udrl/*/*/st*"])
-def test_wildcards_open_nothing(expression: str, replay: Replay, connect: Connect) -> None:
+def test_wildcards_grant_no_additional_access(
+    expression: str, replay: Replay, connect: Connect
+) -> None:
     client = connect("actor")
     expression = expression.replace("st*", "st$*")
     assert list(client.get(expression, timeout=DEADLINE_S, target=zenoh.QueryTarget.ALL)) == []
     assert len(list(client.get(key_expressions.every_hello(), timeout=DEADLINE_S))) == 1
-    assert replay.asked == [key_expressions.key("run", verbs.HELLO.name)]
+    assert replay.received == [key_expressions.key("run", verbs.HELLO.name)]
 
 
-def pose_as_replay(thief: zenoh.Session) -> list[str]:
-    """Answer every verb; return where the questions will be noted."""
+def impersonate_replay(thief: zenoh.Session) -> list[str]:
+    """Declare every verb; return the list that receives the intercepted requests."""
     stolen: list[str] = []
 
     def answer(query: zenoh.Query) -> None:
@@ -241,22 +245,22 @@ def pose_as_replay(thief: zenoh.Session) -> list[str]:
 
     for expression in [*(key_expressions.key("run", verb.name) for verb in verbs.VERBS), "udrl/**"]:
         thief.declare_queryable(expression, answer, complete=True)
-    # What was declared before this token is known to the router when the token is.
+    # The router processes declarations in order: once this token is visible, so are the queryables.
     thief.liveliness().declare_token(key_expressions.alive("run", "actor", "thief"))
     return stolen
 
 
-def test_nobody_answers_in_the_replay_services_place(replay: Replay, connect: Connect) -> None:
-    stolen = pose_as_replay(connect("actor"))
+def test_actor_cannot_impersonate_the_replay_service(replay: Replay, connect: Connect) -> None:
+    stolen = impersonate_replay(connect("actor"))
     assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", "actor", "thief")
-    for role, asked in MAY_ASK.items():
+    for role, allowed in MAY_ASK.items():
         victim = connect(role)
-        for verb in asked:
+        for verb in allowed:
             assert ask(victim, verb) == ["replay"]
     assert stolen == []
 
 
-def test_peer_with_an_actors_key_may_no_more_than_a_client(
+def test_peer_with_an_actors_key_has_the_rights_of_a_client(
     replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
 ) -> None:
     own = load(keys_dir, "actor")
@@ -265,10 +269,10 @@ def test_peer_with_an_actors_key_may_no_more_than_a_client(
         "connect_certificate": own.certificate,
         "connect_private_key": own.key,
     }
-    config = raw(secure_endpoint, mode="peer", **tls)
+    config = raw_config(secure_endpoint, mode="peer", **tls)
     config.insert_json5("transport/link/tls/enable_mtls", "true")
     with zenoh.open(config) as thief:
-        stolen = pose_as_replay(thief)
+        stolen = impersonate_replay(thief)
         assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive(
             "run", "actor", "thief"
         )
@@ -276,53 +280,58 @@ def test_peer_with_an_actors_key_may_no_more_than_a_client(
         assert stolen == []
 
 
-def test_without_keys_a_thief_would_succeed(endpoint: str) -> None:
-    """The control: what the tests above see refused is possible where nobody is asked."""
+def test_impersonation_succeeds_without_access_control(endpoint: str) -> None:
+    """The control for the tests above: without access control, the same attack works."""
     replay = Replay(sessions.listen(endpoint), hosts_router=True)
     with (
         replay.session,
         sessions.connect(endpoint, DEADLINE_S) as thief,
         sessions.connect(endpoint, DEADLINE_S) as victim,
     ):
-        stolen = pose_as_replay(thief)
+        stolen = impersonate_replay(thief)
         replay.tokens.get(timeout=DEADLINE_S)
         assert "thief" in ask(victim, verbs.STATE.name)
         assert stolen
 
 
-# Publishing and being here.
+# Publications and presence.
 
 
 @pytest.mark.parametrize("mallory", ["actor", "observer", "replay"])
-def test_only_the_learner_publishes_weights(mallory: str, replay: Replay, connect: Connect) -> None:
+def test_only_the_learner_can_publish_weights(
+    mallory: str, replay: Replay, connect: Connect
+) -> None:
     listener, thief = connect("actor"), connect(mallory)
-    heard = Heard(listener, key_expressions.key("run", key_expressions.NEW_WEIGHTS))
-    ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
+    heard = RecordingSubscriber(listener, key_expressions.key("run", key_expressions.NEW_WEIGHTS))
+    ask(listener, verbs.HELLO.name)  # once this returns, the router knows the subscription
     for name in (key_expressions.NEW_WEIGHTS, key_expressions.PROGRESS, verbs.EPISODE.name):
         thief.put(key_expressions.key("run", name), b"false")
     thief.delete(key_expressions.key("run", key_expressions.NEW_WEIGHTS))
-    ask(thief, verbs.HELLO.name)  # when this ends the router has seen what was sent before
+    ask(thief, verbs.HELLO.name)  # once this returns, the router has seen the earlier publications
     connect("learner").put(key_expressions.key("run", key_expressions.NEW_WEIGHTS), b"true")
     heard.wait_for("true")
     expected = [(key_expressions.key("run", key_expressions.NEW_WEIGHTS), "true")]
     assert heard.messages == expected
-    # Nothing of this is for the replay service, which hears all that passes in its own session.
+    # The replay service subscribes to none of these; ``heard`` sees everything in its own session.
     if replay.hosts_router:
         replay.heard.wait_for("true")
     assert replay.heard.messages == (expected if replay.hosts_router else [])
 
 
-def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> None:
+def test_each_role_receives_its_own_publications(replay: Replay, connect: Connect) -> None:
     progress, weights = (
         key_expressions.key("run", name)
         for name in (key_expressions.PROGRESS, key_expressions.NEW_WEIGHTS)
     )
     everything = ("udrl/**", progress, weights)
     learner, actor = connect("learner"), connect("actor")
-    of_learner, of_actor = Heard(learner, *everything), Heard(actor, *everything)
-    of_observer = Heard(connect("observer"), *everything)
+    of_learner, of_actor = (
+        RecordingSubscriber(learner, *everything),
+        RecordingSubscriber(actor, *everything),
+    )
+    of_observer = RecordingSubscriber(connect("observer"), *everything)
     for client in (learner, actor):
-        ask(client, verbs.HELLO.name)  # when this ends the router knows the subscriptions
+        ask(client, verbs.HELLO.name)  # once this returns, the router knows the subscriptions
     connect("learner").put(weights, b"weights")
     replay.session.put(progress, b"progress")
     of_actor.wait_for("weights")
@@ -334,8 +343,8 @@ def test_each_role_hears_what_is_for_it(replay: Replay, connect: Connect) -> Non
 
 def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> None:
     learner, listener = connect("learner"), connect("learner")
-    heard = Heard(listener, key_expressions.key("run", key_expressions.PROGRESS))
-    ask(listener, verbs.HELLO.name)  # when this ends the router knows the subscription
+    heard = RecordingSubscriber(listener, key_expressions.key("run", key_expressions.PROGRESS))
+    ask(listener, verbs.HELLO.name)  # once this returns, the router knows the subscription
     learner.put(key_expressions.key("run", key_expressions.PROGRESS), b"false")
     ask(learner, verbs.HELLO.name)
     replay.session.put(key_expressions.key("run", key_expressions.PROGRESS), b"true")
@@ -343,14 +352,14 @@ def test_learner_cannot_publish_progress(replay: Replay, connect: Connect) -> No
     assert heard.messages == [(key_expressions.key("run", key_expressions.PROGRESS), "true")]
 
 
-def there(client: zenoh.Session, role: str) -> list[str]:
-    """Return the tokens of a role that a client is told of."""
+def visible_tokens(client: zenoh.Session, role: str) -> list[str]:
+    """Return the tokens of a role that a client can see."""
     replies = client.liveliness().get(key_expressions.alive("run", role, "t$*"), timeout=DEADLINE_S)
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
 @pytest.mark.parametrize(("role", "other"), [("actor", "learner"), ("learner", "actor")])
-def test_role_is_here_under_its_own_name_only(
+def test_role_declares_presence_under_its_own_name_only(
     role: str, other: str, replay: Replay, connect: Connect
 ) -> None:
     client = connect(role)
@@ -360,14 +369,14 @@ def test_role_is_here_under_its_own_name_only(
         declare(key_expressions.alive("run", role, "two")),
     )
     assert replay.tokens.get(timeout=DEADLINE_S) == key_expressions.alive("run", role, "two")
-    assert there(connect(role), role) == [key_expressions.alive("run", role, "two")]
-    # Nor does it see who of another role is here.
-    assert there(connect(other), role) == []
+    assert visible_tokens(connect(role), role) == [key_expressions.alive("run", role, "two")]
+    # Nor can it see the tokens of another role.
+    assert visible_tokens(connect(other), role) == []
     assert list(connect(other).liveliness().get("udrl/**", timeout=DEADLINE_S)) == []
     assert replay.tokens.empty()
 
 
-# The table.
+# The table of rights.
 
 
 def test_table_of_rights_is_documented() -> None:
@@ -375,8 +384,8 @@ def test_table_of_rights_is_documented() -> None:
     for line in section("docs/protocol.md", "## Permissions").splitlines():
         if line.startswith("| `"):
             cells = [re.findall(r"`([^`]+)`", cell) for cell in line.strip("|").split("|")]
-            (role,), asks, hears, says, tokens = cells
-            found[role] = set(asks), set(hears), set(says), tokens
+            (role,), asks, hears, publishes, tokens = cells
+            found[role] = set(asks), set(hears), set(publishes), tokens
     assert found == {
         role: (
             set(verbs.asked_by(role)),
@@ -388,12 +397,12 @@ def test_table_of_rights_is_documented() -> None:
     }
 
 
-def test_every_verb_is_somebodys() -> None:
+def test_every_verb_belongs_to_a_role() -> None:
     assert {verb for role in RIGHTS for verb in verbs.asked_by(role)} == set(verbs.BY_NAME)
     assert set(ROLES) == set(MAY_ASK)
 
 
-def test_configuration_of_a_router_is_current() -> None:
+def test_router_configuration_is_current() -> None:
     path = ROOT / "deploy" / "make_zenohd.py"
     make_zenohd = runpy.run_path(str(path))
     written = (ROOT / "deploy" / "zenohd.json5").read_text(encoding="utf-8")

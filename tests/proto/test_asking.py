@@ -1,4 +1,4 @@
-"""Asking until there is an answer, and answering: at least once, never for ever."""
+"""Requests and replies: at-least-once delivery, with deadlines."""
 
 import dataclasses
 import logging
@@ -40,7 +40,7 @@ Ask = Callable[..., Future[StateReply]]
 
 @pytest.fixture
 def inbox(router: zenoh.Session) -> Questions:
-    """Questions that arrive at a service on the router."""
+    """Requests that arrive at a service on the router."""
     questions: Questions = Inbox(100, 1000)
     serve(ZenohTransport(router), RUN, questions, [STATE])
     return questions
@@ -53,7 +53,7 @@ def asker(client: zenoh.Session) -> Asker:
 
 @pytest.fixture
 def ask(asker: Asker) -> Iterator[Ask]:
-    """Asks from another thread."""
+    """Sends a request from another thread."""
     with ThreadPoolExecutor(1) as thread:
 
         def submit(request: Any = REQUEST, limit: int = SMALL) -> Future[StateReply]:
@@ -70,7 +70,7 @@ def first(inbox: Inbox[Any]) -> Any:
 
 
 def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
-    """Treat the first query with the first function, and so on."""
+    """Reply to each query with the next function."""
     remaining = iter(answers)
     session.declare_queryable(
         key_expressions.key(RUN, "state"), lambda query: next(remaining)(query)
@@ -82,7 +82,7 @@ def answer(query: zenoh.Query) -> None:
         query.reply(key_expressions.key(RUN, "state"), encode(ANSWER))
 
 
-def test_answer_is_returned(inbox: Questions, ask: Ask) -> None:
+def test_reply_is_returned(inbox: Questions, ask: Ask) -> None:
     future = ask()
     question = first(inbox)
     assert (question.verb, question.request) == (STATE, REQUEST)
@@ -90,7 +90,7 @@ def test_answer_is_returned(inbox: Questions, ask: Ask) -> None:
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_request_may_be_encoded_already(inbox: Questions, ask: Ask) -> None:
+def test_request_may_be_encoded_in_advance(inbox: Questions, ask: Ask) -> None:
     future = ask(encode(REQUEST))
     question = first(inbox)
     assert question.request == REQUEST
@@ -106,12 +106,12 @@ def test_problem_is_raised_with_its_code(inbox: Questions, ask: Ask) -> None:
     assert caught.value.code == "rewind"
 
 
-def test_question_without_an_answer_is_asked_again(router: zenoh.Session, asker: Asker) -> None:
+def test_unanswered_request_is_retried(router: zenoh.Session, asker: Asker) -> None:
     answer_each(router, zenoh.Query.drop, zenoh.Query.drop, answer)
     assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
 
-def test_question_that_hangs_is_asked_again(
+def test_timed_out_request_is_retried(
     router: zenoh.Session, asker: Asker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(asking, "ATTEMPT_S", 0.1)
@@ -121,11 +121,11 @@ def test_question_that_hangs_is_asked_again(
     hanging.pop().drop()
 
 
-def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     attempts: list[float] = []
 
-    class Slow:
+    class SilentTransport:
         def ask(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
             nonlocal now
             now += timeout_s
@@ -137,13 +137,13 @@ def test_what_answers_slowly_is_asked_less_often(monkeypatch: pytest.MonkeyPatch
             return False
 
     monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
-    asker = Asker(cast(Transport, Slow()), RUN, "learner l", NoPause(), patience_s=100.0)
+    asker = Asker(cast(Transport, SilentTransport()), RUN, "learner l", NoPause(), patience_s=100.0)
     with pytest.raises(Unreachable):
         asker.ask(verbs.STATE, REQUEST)
     assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]
 
 
-def test_error_that_is_not_ours_is_no_answer(router: zenoh.Session, asker: Asker) -> None:
+def test_foreign_error_reply_is_ignored(router: zenoh.Session, asker: Asker) -> None:
     answer_each(router, lambda query: query.reply_err(b"router is busy"), answer)
     assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
@@ -160,13 +160,13 @@ def test_service_that_starts_later_is_found(
     assert asker.ask(verbs.STATE, REQUEST) == ANSWER
 
 
-def test_patience_ends(client: zenoh.Session) -> None:
+def test_request_without_reply_raises_unreachable(client: zenoh.Session) -> None:
     asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable, match=r"^learner l got no reply to 'state' from .* of run in"):
         asker.ask(verbs.STATE, REQUEST)
 
 
-def test_long_wait_says_who_waits_for_what(
+def test_long_wait_is_logged_with_service_and_verb(
     client: zenoh.Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     class NoPause(threading.Event):
@@ -174,7 +174,9 @@ def test_long_wait_says_who_waits_for_what(
             return False
 
     seconds = iter(range(100))
-    clock = SimpleNamespace(monotonic=lambda: next(seconds))  # every look at it takes a second
+    clock = SimpleNamespace(
+        monotonic=lambda: next(seconds)
+    )  # every reading advances the clock by a second
     monkeypatch.setattr(asking, "time", clock)
     asker = Asker(ZenohTransport(client), RUN, "learner l", NoPause(), patience_s=5.0)
     with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
@@ -185,7 +187,7 @@ def test_long_wait_says_who_waits_for_what(
     ]
 
 
-def test_asking_can_be_stopped(client: zenoh.Session) -> None:
+def test_request_can_be_interrupted(client: zenoh.Session) -> None:
     stop = threading.Event()
     asker = Asker(ZenohTransport(client), RUN, "learner l", stop)
     with ThreadPoolExecutor(1) as thread:
@@ -195,21 +197,21 @@ def test_asking_can_be_stopped(client: zenoh.Session) -> None:
             future.result(WAIT_S)
 
 
-def test_answer_of_another_kind_is_refused(inbox: Questions, ask: Ask) -> None:
+def test_reply_of_another_type_is_rejected(inbox: Questions, ask: Ask) -> None:
     future = ask()
     first(inbox).answer(Acknowledged())
     with pytest.raises(InvalidMessage, match=r"StateReply: .* `version`"):
         future.result(WAIT_S)
 
 
-def test_answer_beyond_its_limit_is_refused(inbox: Questions, ask: Ask) -> None:
+def test_reply_above_its_size_limit_is_rejected(inbox: Questions, ask: Ask) -> None:
     future = ask(limit=10)
     first(inbox).answer(ANSWER)
     with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
         future.result(WAIT_S)
 
 
-# The service's side.
+# The service.
 
 
 @pytest.mark.parametrize(
@@ -220,7 +222,7 @@ def test_answer_beyond_its_limit_is_refused(inbox: Questions, ask: Ask) -> None:
         (bytes(101), "101 bytes, at most 100"),
     ],
 )
-def test_invalid_request_reaches_the_service_as_the_error_it_is(
+def test_invalid_request_reaches_the_service_as_an_error(
     payload: bytes, complaint: str, inbox: Questions, ask: Ask
 ) -> None:
     future = ask(payload)
@@ -232,7 +234,7 @@ def test_invalid_request_reaches_the_service_as_the_error_it_is(
         future.result(WAIT_S)
 
 
-def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) -> None:
+def test_request_is_prepared_before_it_is_queued(router: zenoh.Session, ask: Ask) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)
     prepare = {"state": lambda request: request.learner.upper()}
     serve(ZenohTransport(router), RUN, inbox, [STATE], prepare)
@@ -243,7 +245,7 @@ def test_request_is_prepared_before_it_waits(router: zenoh.Session, ask: Ask) ->
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session, ask: Ask) -> None:
+def test_request_to_a_full_inbox_is_retried(router: zenoh.Session, ask: Ask) -> None:
     class FullAtFirst(Inbox[Any]):
         refused = 0
 
@@ -261,7 +263,7 @@ def test_question_that_finds_the_inbox_full_is_asked_again(router: zenoh.Session
     assert inbox.refused == 1
 
 
-def test_answer_to_somebody_who_is_gone_is_forgotten(
+def test_reply_to_a_closed_client_is_discarded(
     inbox: Questions, router: zenoh.Session, endpoint: str
 ) -> None:
     with connect(endpoint, patience_s=5.0) as client:
@@ -271,7 +273,7 @@ def test_answer_to_somebody_who_is_gone_is_forgotten(
     assert inbox.take(1, 1, 0.0) == []
 
 
-def test_service_that_undeclares_its_verbs_is_not_asked(
+def test_undeclared_service_receives_no_requests(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
     inbox: Inbox[Any] = Inbox(100, 1000)

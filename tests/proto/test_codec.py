@@ -1,4 +1,4 @@
-"""Messages survive the wire; nothing else gets in, and nobody pays for trying."""
+"""Encoding and decoding of messages, and the cost of rejecting invalid ones."""
 
 import time
 import tracemalloc
@@ -46,7 +46,7 @@ from udrl_proto.messages import (
 kinds = pytest.mark.parametrize("kind", MESSAGES, ids=lambda kind: kind.__name__)
 any_kind = st.sampled_from(MESSAGES)
 any_message = any_kind.flatmap(messages)
-#: Anything that MessagePack can say, and more than a message may.
+#: Any MessagePack value, including types that no message has.
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
     | st.binary() | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary()),
@@ -55,7 +55,7 @@ plain = st.recursive(
 
 
 def assert_message_or_invalid(data: bytes, kind: type[Message]) -> None:
-    """Decoding gives a message that says the same again, or InvalidMessage."""
+    """Assert that data decodes to a message that encodes to itself, or raises InvalidMessage."""
     try:
         message = decode(data, kind)
     except InvalidMessage:
@@ -65,23 +65,23 @@ def assert_message_or_invalid(data: bytes, kind: type[Message]) -> None:
 
 @kinds
 @given(st.data())
-def test_every_message_survives_the_wire(kind: type[Message], data: st.DataObject) -> None:
+def test_message_round_trips(kind: type[Message], data: st.DataObject) -> None:
     message = data.draw(messages(kind))
     assert decode(encode(message), kind) == message
 
 
 @given(st.binary(max_size=200), any_kind)
-def test_arbitrary_bytes_are_refused(data: bytes, kind: type[Message]) -> None:
+def test_arbitrary_bytes_are_rejected(data: bytes, kind: type[Message]) -> None:
     assert_message_or_invalid(data, kind)
 
 
 @given(plain, any_kind)
-def test_arbitrary_values_are_refused(value: Any, kind: type[Message]) -> None:
+def test_arbitrary_values_are_rejected(value: Any, kind: type[Message]) -> None:
     assert_message_or_invalid(msgpack.packb(value), kind)
 
 
 @given(any_message, st.data())
-def test_truncated_message_is_refused(message: Message, data: st.DataObject) -> None:
+def test_truncated_message_is_rejected(message: Message, data: st.DataObject) -> None:
     encoded = encode(message)
     length = data.draw(st.integers(0, len(encoded) - 1))
     with pytest.raises(InvalidMessage):
@@ -89,7 +89,9 @@ def test_truncated_message_is_refused(message: Message, data: st.DataObject) -> 
 
 
 @given(any_message, st.data())
-def test_changed_message_is_another_one_or_refused(message: Message, data: st.DataObject) -> None:
+def test_changed_message_decodes_to_another_one_or_is_rejected(
+    message: Message, data: st.DataObject
+) -> None:
     encoded = bytearray(encode(message))
     where = data.draw(st.integers(0, len(encoded) - 1))
     encoded[where] = data.draw(st.integers(0, 255))
@@ -97,7 +99,7 @@ def test_changed_message_is_another_one_or_refused(message: Message, data: st.Da
 
 
 @given(any_message, st.data())
-def test_message_with_a_changed_value_is_another_one_or_refused(
+def test_message_with_a_changed_value_decodes_to_another_one_or_is_rejected(
     message: Message, data: st.DataObject
 ) -> None:
     fields = msgpack.unpackb(encode(message)) or {"none": 0}
@@ -106,7 +108,7 @@ def test_message_with_a_changed_value_is_another_one_or_refused(
 
 
 @given(any_message, any_kind)
-def test_message_of_another_kind_is_another_one_or_refused(
+def test_message_of_another_type_decodes_to_another_one_or_is_rejected(
     message: Message, kind: type[Message]
 ) -> None:
     assert_message_or_invalid(encode(message), kind)
@@ -152,7 +154,7 @@ def packed(**fields: Any) -> bytes:
         (b"\x81\xa7version\xd6\xff\x00\x00\x00\x00", WeightsRequest, "max_ext_len"),  # a timestamp
     ],
 )
-def test_refusal_says_what_is_wrong(data: bytes, kind: type[Message], complaint: str) -> None:
+def test_error_describes_the_fault(data: bytes, kind: type[Message], complaint: str) -> None:
     with pytest.raises(InvalidMessage, match=rf"^{kind.__name__}: ") as caught:
         decode(data, kind)
     assert complaint in str(caught.value)
@@ -170,7 +172,7 @@ def test_refusal_says_what_is_wrong(data: bytes, kind: type[Message], complaint:
         ({"hidden": [[8]]}, r"Expected `int \| str`, got `array`"),
     ],
 )
-def test_specification_with_an_impossible_configuration_is_refused(
+def test_hello_with_an_invalid_configuration_is_rejected(
     setting: dict[str, Any], complaint: str | None
 ) -> None:
     environment = {
@@ -205,7 +207,7 @@ def test_specification_with_an_impossible_configuration_is_refused(
     ],
     ids=lambda data: data[:6].hex(),
 )
-def test_declared_size_costs_nothing_before_the_bytes_are_there(data: bytes) -> None:
+def test_declared_size_allocates_nothing_in_advance(data: bytes) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(InvalidMessage):
@@ -225,14 +227,14 @@ def test_declared_size_costs_nothing_before_the_bytes_are_there(data: bytes) -> 
     ],
     ids=["deep", "many", "long"],
 )
-def test_worst_message_of_a_megabyte_is_refused_within_a_second(data: bytes) -> None:
+def test_expensive_message_of_a_megabyte_is_rejected_within_a_second(data: bytes) -> None:
     began = time.process_time()
     with pytest.raises(InvalidMessage):
         decode(data[:SMALL], HelloRequest)
     assert time.process_time() - began < 1.0
 
 
-def test_size_is_checked_before_anything_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_is_checked_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     def unpackb(*args: Any, **kwargs: Any) -> Any:
         pytest.fail("decoded")
 
@@ -241,7 +243,7 @@ def test_size_is_checked_before_anything_is_decoded(monkeypatch: pytest.MonkeyPa
         decode(bytes(11), Weights, limit=10)
 
 
-def test_bytes_in_a_message_may_fill_its_limit() -> None:
+def test_bytes_of_a_message_may_fill_its_limit() -> None:
     message = Weights(version=1, weights=bytes(2 * SMALL))
     data = encode(message)
     assert decode(data, Weights, len(data)) == message
@@ -249,12 +251,12 @@ def test_bytes_in_a_message_may_fill_its_limit() -> None:
         decode(data, Weights, len(data) - 1)
 
 
-def test_text_that_is_not_unicode_is_sent_with_the_rest_of_the_message() -> None:
+def test_invalid_unicode_is_replaced_when_encoded() -> None:
     problem = decode(encode(Problem(code="invalid", message="file \udcff is odd")), Problem)
     assert problem.message == "file ? is odd"
 
 
-def test_loss_may_be_not_a_number_so_that_divergence_can_be_told() -> None:
+def test_loss_may_be_nan_to_report_divergence() -> None:
     message = VersionMessage(
         learner="l", version=1, weights=b"", optimizer=b"", loss=float("nan"), train_s=0.0
     )
@@ -268,7 +270,7 @@ shapes = arrays.array_shapes(min_dims=0, max_dims=4, max_side=5)
 
 
 @given(arrays.arrays(dtypes, shapes))
-def test_array_survives_the_wire(array: np.typing.NDArray[Any]) -> None:
+def test_array_round_trips(array: np.typing.NDArray[Any]) -> None:
     decoded = decode_array(decode(encode(encode_array(array)), Array))
     assert decoded.dtype == array.dtype
     assert decoded.shape == array.shape
@@ -280,19 +282,19 @@ def test_array_survives_the_wire(array: np.typing.NDArray[Any]) -> None:
     [lambda a: a.astype(">f4"), lambda a: a.T.copy().T, lambda a: np.repeat(a, 2, 1)[:, ::2]],
     ids=["big-endian", "column-major", "strided"],
 )
-def test_array_is_sent_little_endian_in_rows(arrange: Callable[[Any], Any]) -> None:
+def test_array_is_encoded_little_endian_and_row_major(arrange: Callable[[Any], Any]) -> None:
     rows = np.arange(6, dtype="<f4").reshape(2, 3)
     assert encode_array(arrange(rows)) == Array(dtype="<f4", shape=(2, 3), data=rows.tobytes())
 
 
-def test_decoded_array_cannot_be_changed() -> None:
+def test_decoded_array_is_read_only() -> None:
     assert not decode_array(encode_array(np.zeros(3, np.float32))).flags.writeable
 
 
 @pytest.mark.parametrize(
     "shape", [(), (2,), (4, 1), (3, 2), (2**62,), (2**62, 4), (2**62,) * 4, (2**32, 2**32)]
 )
-def test_array_whose_bytes_do_not_fill_its_shape_is_refused(shape: tuple[int, ...]) -> None:
+def test_array_whose_bytes_do_not_match_its_shape_is_rejected(shape: tuple[int, ...]) -> None:
     message = decode(packed(dtype="<f4", shape=shape, data=bytes(12)), Array)
     with pytest.raises(InvalidMessage, match="12 bytes for <f4"):
         decode_array(message)
@@ -313,7 +315,7 @@ def test_array_whose_bytes_do_not_fill_its_shape_is_refused(shape: tuple[int, ..
         ({"data": [0]}, "Expected `bytes`"),
     ],
 )
-def test_impossible_array_is_refused(fields: dict[str, Any], complaint: str) -> None:
+def test_invalid_array_is_rejected(fields: dict[str, Any], complaint: str) -> None:
     with pytest.raises(InvalidMessage, match=r"^Array: ") as caught:
         decode(packed(**{"dtype": "<f4", "shape": [1], "data": bytes(4), **fields}), Array)
     assert complaint in str(caught.value)
@@ -323,7 +325,7 @@ def test_impossible_array_is_refused(fields: dict[str, Any], complaint: str) -> 
     length=st.integers(1, 5), size=st.integers(1, 3), flags=st.tuples(st.booleans(), st.booleans())
 )
 @example(length=1000, size=8, flags=(True, False))
-def test_episode_survives_the_wire(length: int, size: int, flags: tuple[bool, bool]) -> None:
+def test_episode_round_trips(length: int, size: int, flags: tuple[bool, bool]) -> None:
     numbers = np.arange(length * size, dtype=np.float32)
     episode = Episode(
         7,
@@ -338,6 +340,6 @@ def test_episode_survives_the_wire(length: int, size: int, flags: tuple[bool, bo
     assert episode_digest(decode_episode(message, Vector(size=size))) == episode_digest(episode)
 
 
-def test_every_message_type_refuses_what_it_does_not_know() -> None:
+def test_every_message_type_rejects_unknown_fields() -> None:
     for kind in MESSAGES:
         assert msgspec.inspect.type_info(kind).forbid_unknown_fields  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Keys that do not fit are named, with the remedy, before anybody is talked to."""
+"""Invalid keys are reported with the remedy before a connection is opened."""
 
 import json
 import os
@@ -19,12 +19,12 @@ from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
 
 @pytest.fixture
 def folder(keys_dir: Path, tmp_path: Path) -> Path:
-    """The actor's own folder, a copy."""
+    """A copy of the actor's own folder."""
     return shutil.copytree(keys_dir / "actor", tmp_path / "mine")
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_whole_folder_and_own_folder_are_the_same(role: str, keys_dir: Path) -> None:
+def test_shared_folder_and_own_folder_give_the_same_credentials(role: str, keys_dir: Path) -> None:
     assert load(keys_dir, role) == load(keys_dir / role, role)
 
 
@@ -33,16 +33,16 @@ def test_copied_folder_may_have_any_name(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
-def test_missing_file_is_named(name: str, folder: Path) -> None:
+def test_missing_file_is_reported(name: str, folder: Path) -> None:
     (folder / name).unlink()
     with pytest.raises(ConfigError, match=rf"{name}: No such file.*`udrl keys create`.*actor$"):
         load(folder, "actor")
 
 
 @pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
-def test_unreadable_file_is_named(name: str, folder: Path) -> None:
+def test_unreadable_file_is_reported(name: str, folder: Path) -> None:
     (folder / name).unlink()
-    (folder / name).mkdir()  # no mode keeps root from reading
+    (folder / name).mkdir()  # root can read files of any mode
     with pytest.raises(ConfigError, match=rf"{name}: Is a directory.*`udrl keys create`"):
         load(folder, "actor")
 
@@ -54,25 +54,25 @@ def test_unreadable_file_is_named(name: str, folder: Path) -> None:
     ("name", "kind"),
     [(CA, "a certificate"), (CERTIFICATE, "a certificate"), (KEY, "a private key")],
 )
-def test_damaged_file_is_named(name: str, kind: str, content: bytes, folder: Path) -> None:
+def test_damaged_file_is_reported(name: str, kind: str, content: bytes, folder: Path) -> None:
     (folder / name).write_bytes(content)
     with pytest.raises(ConfigError, match=rf"{name}: not {kind} in PEM.*copy it again"):
         load(folder, "actor")
 
 
-def test_key_of_another_certificate_is_named(folder: Path, keys_dir: Path) -> None:
+def test_key_of_another_certificate_is_reported(folder: Path, keys_dir: Path) -> None:
     shutil.copy(keys_dir / "learner" / KEY, folder)
     with pytest.raises(ConfigError, match=r"key\.pem is not the key of .*cert\.pem; copy both"):
         load(folder, "actor")
 
 
-def test_certificate_of_another_authority_is_named(folder: Path, foreign_keys_dir: Path) -> None:
+def test_certificate_of_another_authority_is_reported(folder: Path, foreign_keys_dir: Path) -> None:
     shutil.copy(foreign_keys_dir / "actor" / CA, folder)
     with pytest.raises(ConfigError, match=r"cert\.pem was not issued by .*ca\.pem; copy both"):
         load(folder, "actor")
 
 
-def test_certificate_of_another_role_is_named(folder: Path) -> None:
+def test_certificate_of_another_role_is_reported(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"for the role 'actor', expected 'learner'.*folder"):
         load(folder, "learner")
 
@@ -88,21 +88,21 @@ def _from_tomorrow(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (_until_a_minute_ago, "expired at 20.*UTC; create new keys"),
         (_from_tomorrow, "valid from 20.*clock here says 20.*correct the clock"),
     ],
 )
-def test_certificate_that_is_not_valid_now_is_named(
-    make: Callable[[Path], None], said: str, tmp_path: Path
+def test_certificate_outside_its_validity_period_is_reported(
+    make: Callable[[Path], None], message: str, tmp_path: Path
 ) -> None:
     make(tmp_path)
-    with pytest.raises(ConfigError, match=rf"ca\.pem.*{said}"):
+    with pytest.raises(ConfigError, match=rf"ca\.pem.*{message}"):
         load(tmp_path, "actor")
 
 
-def test_key_that_others_can_read_is_warned_of(
+def test_key_readable_by_others_is_warned_of(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     load(folder, "actor")
@@ -114,7 +114,7 @@ def test_key_that_others_can_read_is_warned_of(
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can own the file")
 @pytest.mark.parametrize(("mode", "warnings"), [(0o640, 0), (0o644, 1), (0o660, 1)])
-def test_key_that_root_gives_by_way_of_a_group_is_not(
+def test_key_owned_by_root_may_be_group_readable(
     mode: int,
     warnings: int,
     folder: Path,
@@ -127,7 +127,7 @@ def test_key_that_root_gives_by_way_of_a_group_is_not(
     assert len(caplog.messages) == warnings
 
 
-def test_settings_hold_paths_only(folder: Path) -> None:
+def test_settings_contain_paths_and_no_secrets(folder: Path) -> None:
     config = zenoh.Config()
     for name, value in load(folder, "actor").settings().items():
         config.insert_json5(name, json.dumps(value))
@@ -135,7 +135,7 @@ def test_settings_hold_paths_only(folder: Path) -> None:
     assert (folder / KEY).read_text().splitlines()[1] not in str(config)
 
 
-def test_missing_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "udrl_proto.certificates", raising=False)
     monkeypatch.delattr("udrl_proto.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)

@@ -1,4 +1,4 @@
-"""The page for strangers names everything that there is, with its type and limits."""
+"""``proto/README.md`` describes every message, verb, key and error code, with types and limits."""
 
 import ast
 import json
@@ -28,7 +28,7 @@ STRUCTS = [*MESSAGES, Command, Config, EnvironmentSpec, *SPACES]
 
 
 def number(value: float) -> str:
-    """Return a limit, large powers of two as such."""
+    """Format a limit; large powers of two as powers."""
     whole = int(value)
     if whole != value:
         return str(value)
@@ -39,7 +39,7 @@ def number(value: float) -> str:
 
 
 def described(kind: inspect.Type) -> str:
-    """Return how the tables name a type."""
+    """Return the name of a type in the tables."""
     match kind:
         case inspect.UnionType(types=types):
             return " or ".join(map(described, types))
@@ -103,12 +103,12 @@ def default_of(field: inspect.Field) -> str:
 
 
 def rows_of(kind: type[msgspec.Struct]) -> list[list[str]]:
-    """Return the first cells of a type's table as it should be: field, type, default."""
+    """Return the expected first cells of a type's table: field, type, default."""
     return [[f"`{f.encode_name}`", described(f.type), default_of(f)] for f in setting_fields(kind)]
 
 
-def table_in(page: str, heading: str) -> list[list[str]]:
-    """Return the rows below a heading, without their table's head."""
+def rows_below(page: str, heading: str) -> list[list[str]]:
+    """Return the rows below a heading, without the table's header."""
     text = re.split(r"\n#+ ", page.split(f"\n{heading}\n", 1)[1], maxsplit=1)[0]
     lines = [line for line in text.splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[1:]]
@@ -120,28 +120,28 @@ def test_every_message_is_described_field_by_field(kind: type[Any]) -> None:
     if not expected:
         assert f"\n#### {kind.__name__}\n" in PAGE
         return
-    rows = table_in(PAGE, f"#### {kind.__name__}")
+    rows = rows_below(PAGE, f"#### {kind.__name__}")
     assert [row[:3] for row in rows] == expected
     assert all(row[3] for row in rows)
 
 
 def size(n: int) -> str:
-    """Return a size in bytes as the tables have it."""
+    """Format a size in bytes as in the tables."""
     for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
         if n > verbs.FEW and n % unit == 0:
             return f"{n // unit} {name}"
     return str(n)
 
 
-def test_every_verb_is_described_with_its_askers_messages_and_limits() -> None:
-    rows = {row[0].strip("`"): row[1:] for row in table_in(PAGE, "### Verbs")}
+def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
+    rows = {row[0].strip("`"): row[1:] for row in rows_below(PAGE, "### Verbs")}
     assert list(rows) == list(verbs.BY_NAME)
     for name, verb in verbs.BY_NAME.items():
         askers, request, reply, limit = rows[name]
         assert askers.split(", ") == list(verb.askers)
         assert request == f"[{verb.request.__name__}](#{verb.request.__name__.lower()})"
         assert reply == f"[{verb.reply.__name__}](#{verb.reply.__name__.lower()})"
-        if verb is verbs.EPISODE:  # it is the run's
+        if verb is verbs.EPISODE:  # the run's own limit
             assert limit.startswith("max_episode_steps x ")
             assert limit.endswith(f" + {verbs.FEW}")
         else:
@@ -169,8 +169,8 @@ def test_every_key_expression_is_described() -> None:
     assert key_expressions.RUN_ID.pattern in PAGE
 
 
-def codes_in_the_code() -> set[str]:
-    """Return every code that a refusal or problem is made with."""
+def codes_in_source() -> set[str]:
+    """Return the codes of all refusals and problems in the source."""
     found = set()
     for path in ROOT.glob("services/*/*/*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -186,10 +186,10 @@ def codes_in_the_code() -> set[str]:
 
 @pytest.mark.parametrize(("page", "heading"), [(PAGE, "## Errors"), (REASONS, "## Error codes")])
 def test_every_error_code_is_described(page: str, heading: str) -> None:
-    rows = table_in(page, heading)
-    assert {row[0].strip("`") for row in rows} == codes_in_the_code()
+    rows = rows_below(page, heading)
+    assert {row[0].strip("`") for row in rows} == codes_in_source()
     assert all(len(row) >= 3 and all(row) for row in rows)
 
 
-def test_version_of_the_protocol_is_the_one_in_the_code() -> None:
+def test_documented_protocol_version_is_current() -> None:
     assert f"This is protocol {PROTOCOL}." in PAGE

@@ -1,4 +1,4 @@
-"""The golden vectors are what the code says today, and the code says what the page promises."""
+"""The golden vectors match the code, and the code matches the description in the page."""
 
 import hashlib
 import json
@@ -39,27 +39,27 @@ def test_every_message_type_has_one_example() -> None:
 
 
 @each_example
-def test_encoding_gives_the_same_bytes(message: Message) -> None:
+def test_encoding_gives_the_golden_bytes(message: Message) -> None:
     assert encode(message) == golden(message)
 
 
 @each_example
-def test_decoding_gives_the_same_values(message: Message) -> None:
+def test_decoding_gives_the_golden_values(message: Message) -> None:
     assert decode(golden(message), type(message)) == message
 
 
 @each_example
-def test_order_of_fields_is_free(message: Message) -> None:
+def test_fields_may_be_in_any_order(message: Message) -> None:
     fields = msgpack.unpackb(golden(message))
     backwards = dict(reversed(fields.items()))
     assert decode(msgpack.packb(backwards), type(message)) == message
 
 
-def test_files_are_those_that_the_script_writes() -> None:
+def test_files_equal_the_generated_ones() -> None:
     written = {path.name: path.read_bytes() for path in GOLDEN.iterdir() if path.is_file()}
     del written["make.py"]
     expected = MAKE["contents"]()
-    # Logits are those of the machine that wrote them, on another kind up to the last bits.
+    # Logits depend on the machine in their last bits.
     then, now = (json.loads(files.pop("probe.json")) for files in (written, expected))
     np.testing.assert_allclose(then.pop("logits"), now.pop("logits"), rtol=0, atol=1e-5)
     del then["class"], now["class"]
@@ -67,7 +67,7 @@ def test_files_are_those_that_the_script_writes() -> None:
     assert written == expected
 
 
-# Arithmetic, by slow references that follow the page.
+# Arithmetic, with slow references that follow the page.
 
 
 def philox(key: bytes, n: int) -> list[int]:
@@ -91,7 +91,7 @@ PROBE: dict[str, Any] = json.loads((GOLDEN / "probe.json").read_text())
 
 
 @pytest.mark.parametrize("vector", STREAMS, ids=lambda v: v["hashed"])
-def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
+def test_stream_is_philox_with_a_hashed_key(vector: dict[str, Any]) -> None:
     key = hashlib.sha256(vector["hashed"].encode()).digest()[:16]
     words = philox(key, 9)
     assert key.hex() == vector["key"]
@@ -100,7 +100,7 @@ def test_stream_is_philox_under_a_hashed_key(vector: dict[str, Any]) -> None:
     assert Stream(key).uniforms(9).tolist() == vector["numbers"]
 
 
-def test_probe_is_what_the_page_says() -> None:
+def test_probe_follows_the_page() -> None:
     hello = msgpack.unpackb((GOLDEN / "hello.msgpack").read_bytes())
     weights = stranger.probe_weights(hello["graph"])
     assert stranger.arrays_digest(weights).hex() == PROBE["weights"]
@@ -112,7 +112,7 @@ def test_probe_is_what_the_page_says() -> None:
     np.testing.assert_allclose(logits, PROBE["logits"], rtol=0, atol=1e-5)
 
 
-def test_the_class_is_the_digest_of_logits_and_actions() -> None:
+def test_numerics_class_is_the_digest_of_logits_and_actions() -> None:
     arrays = {
         "logits": np.array(PROBE["logits"], "<f4"),
         "actions": np.array(PROBE["actions"], "|u1"),
@@ -120,25 +120,25 @@ def test_the_class_is_the_digest_of_logits_and_actions() -> None:
     assert stranger.arrays_digest(arrays).hex()[:16] == PROBE["class"]
 
 
-def test_the_digest_of_an_episode_follows_the_page() -> None:
+def test_episode_digest_follows_the_page() -> None:
     arrays = {n: np.array(a["values"], a["dtype"]) for n, a in DIGESTS["arrays"].items()}
     assert stranger.arrays_digest(arrays).hex() == DIGESTS["arrays_digest"]
     episode = arrays | {n: DIGESTS[n] for n in ("terminated", "truncated")}
     assert stranger.episode_digest(DIGESTS["id"], episode).hex() == DIGESTS["digest"]
 
 
-def test_logits_of_the_probe_are_written_exactly() -> None:
+def test_probe_logits_are_stored_exactly() -> None:
     logits = np.array(PROBE["logits"])
     assert logits.shape == (16, 2)
     assert np.array_equal(logits, logits.astype(np.float32))
 
 
 class Fixed:
-    """Acts by the same logits always."""
+    """An acting graph with constant logits."""
 
     def __init__(self, logits: list[float], spec: EnvironmentSpec) -> None:
         self._logits = np.array([logits], np.float32)
-        # The one observation that is stacked.
+        # The only observation that is stacked.
         shape, dtype = spec.observation_space.shape or (1,), spec.observation_space.dtype
         self.seen: Seen = (np.zeros((1, *shape), dtype),)
         self.state = self.next_state = np.zeros((1, 0), np.float32)
@@ -155,7 +155,7 @@ class Fixed:
 
 @pytest.mark.parametrize(("temperature", "key"), [(1.0, "action"), (0.5, "half"), (0.0, "mode")])
 @pytest.mark.parametrize("vector", CHOICES, ids=lambda v: f"{v['logits']}-{v['u']:.3f}")
-def test_actor_chooses_as_the_vectors_say(
+def test_actor_chooses_the_actions_of_the_vectors(
     vector: dict[str, Any], temperature: float, key: str
 ) -> None:
     generator = EpisodeGenerator(Config(environment="Figure2-v0"), 1)

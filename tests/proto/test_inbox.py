@@ -1,4 +1,4 @@
-"""What waits, waits within bounds, and bulk waits for all else."""
+"""The inbox: bounds, and two lanes of which bulk has the lower priority."""
 
 import threading
 
@@ -7,7 +7,7 @@ from udrl_proto.inbox import Inbox
 NOW = 0.0
 
 
-def test_bulk_waits_for_all_else_and_nothing_overtakes_its_like() -> None:
+def test_bulk_has_lower_priority_and_lanes_are_fifo() -> None:
     inbox: Inbox[str] = Inbox(100, 1000)
     for name in ("episode 1", "status", "episode 2", "commands"):
         assert inbox.put(name, 10, bulk=name.startswith("episode"))
@@ -23,7 +23,7 @@ def test_length_is_bounded() -> None:
     assert inbox.put(4, 1)
 
 
-def test_bulk_takes_no_room_from_all_else() -> None:
+def test_bulk_does_not_use_the_capacity_of_other_items() -> None:
     inbox: Inbox[str] = Inbox(2, 10)
     assert inbox.put("episode", 10, bulk=True)
     assert not inbox.put("episode", 1, bulk=True)
@@ -43,14 +43,14 @@ def test_size_is_bounded_but_a_single_item_always_fits() -> None:
     assert not inbox.has_room(10)
 
 
-def test_what_nobody_sends_again_is_always_taken_in() -> None:
+def test_must_put_ignores_the_bounds() -> None:
     inbox: Inbox[str] = Inbox(1, 10)
     assert inbox.put("question", 10)
-    inbox.must_put("somebody left")
-    assert inbox.take(5, 100, NOW) == ["question", "somebody left"]
+    inbox.must_put("departure")
+    assert inbox.take(5, 100, NOW) == ["question", "departure"]
 
 
-def test_group_ends_after_so_many_bytes() -> None:
+def test_batch_is_bounded_in_bytes() -> None:
     inbox: Inbox[int] = Inbox(100, 1000)
     for i in range(5):
         inbox.put(i, 10, bulk=True)
@@ -58,7 +58,7 @@ def test_group_ends_after_so_many_bytes() -> None:
     assert inbox.take(10, 1, NOW) == [3]
 
 
-def test_take_waits_for_the_first() -> None:
+def test_take_waits_for_the_first_item() -> None:
     inbox: Inbox[str] = Inbox(100, 1000)
     taken: list[str] = []
     thread = threading.Thread(target=lambda: taken.extend(inbox.take(5, 100, 10.0)))

@@ -1,4 +1,4 @@
-"""Key expressions: what is asked, published and declared alive, and where."""
+"""Key expressions of verbs, publications and presence tokens."""
 
 import re
 
@@ -15,28 +15,26 @@ ends = st.sampled_from([*verbs.BY_NAME, key_expressions.NEW_WEIGHTS, key_express
 
 
 @given(run_ids, ends)
-def test_key_can_be_taken_apart_again(run_id: str, verb: str) -> None:
+def test_key_round_trips_through_parse(run_id: str, verb: str) -> None:
     assert key_expressions.parse(key_expressions.key(run_id, verb)) == (str(PROTOCOL), run_id, verb)
 
 
 @given(run_ids, ends)
-def test_key_is_a_key_expression_without_wildcards(run_id: str, verb: str) -> None:
+def test_key_is_valid_without_wildcards(run_id: str, verb: str) -> None:
     expression = zenoh.KeyExpr(key_expressions.key(run_id, verb))
     assert "*" not in str(expression)
     assert "$" not in str(expression)
 
 
 @given(run_ids, st.sampled_from(["actor", "learner"]), names)
-def test_token_of_any_name_is_among_all_tokens_of_its_run(
-    run_id: str, role: str, name: str
-) -> None:
+def test_token_matches_the_wildcard_of_its_run(run_id: str, role: str, name: str) -> None:
     token = zenoh.KeyExpr(key_expressions.alive(run_id, role, name))
     assert zenoh.KeyExpr(key_expressions.alive(run_id, "*", "*")).includes(token)
     assert not zenoh.KeyExpr(key_expressions.alive(run_id + "x", "*", "*")).intersects(token)
 
 
 @given(st.integers(0, 99), run_ids, ends)
-def test_every_hello_finds_runs_of_every_protocol_and_nothing_else(
+def test_every_hello_matches_hellos_of_all_protocols_and_nothing_else(
     protocol: int, run_id: str, verb: str
 ) -> None:
     key = zenoh.KeyExpr(f"udrl/{protocol}/{run_id}/{verb}")
@@ -44,7 +42,7 @@ def test_every_hello_finds_runs_of_every_protocol_and_nothing_else(
 
 
 @pytest.mark.parametrize("expression", ["", "udrl", "udrl/1/run", "other/1/run/hello"])
-def test_foreign_key_is_refused(expression: str) -> None:
+def test_foreign_key_is_rejected(expression: str) -> None:
     with pytest.raises(ValueError, match=f"key '{expression}': expected udrl/"):
         key_expressions.parse(expression)
 

@@ -1,4 +1,4 @@
-"""Finding each other: endpoints, routers, runs, and what is said when there is none."""
+"""Sessions: endpoints, routers, and finding a run."""
 
 import logging
 import socket
@@ -30,13 +30,13 @@ from udrl_proto.messages import Hello
         "tcp/0.0.0.0:7447",
     ],
 )
-def test_endpoint_is_returned_as_it_came(endpoint: str) -> None:
+def test_valid_endpoint_is_returned_unchanged(endpoint: str) -> None:
     assert sessions.check_endpoint(endpoint) == endpoint
     secured = endpoint.replace("tcp", "tls")
     assert sessions.check_endpoint(secured, secure=True) == secured
 
 
-def test_endpoint_of_the_other_kind_is_refused_with_the_remedy() -> None:
+def test_endpoint_that_does_not_match_the_keys_is_rejected_with_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"'tls/a:1' needs keys; add --keys DIR"):
         sessions.check_endpoint("tls/a:1")
     with pytest.raises(ConfigError, match=r"'tcp/a:1' would ignore .* use tls/a:1$"):
@@ -62,7 +62,7 @@ def test_endpoint_of_the_other_kind_is_refused_with_the_remedy() -> None:
         "http://127.0.0.1:7447",
     ],
 )
-def test_malformed_endpoint_is_named_with_what_was_expected(endpoint: str) -> None:
+def test_malformed_endpoint_is_rejected_with_the_expected_form(endpoint: str) -> None:
     with pytest.raises(ConfigError) as caught:
         sessions.check_endpoint(endpoint)
     assert f"endpoint {endpoint!r}: expected tcp/HOST:PORT" in str(caught.value)
@@ -71,14 +71,14 @@ def test_malformed_endpoint_is_named_with_what_was_expected(endpoint: str) -> No
 @pytest.mark.parametrize(
     "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.1:7447", "tcp/localhost.org:7447"]
 )
-def test_listening_beyond_loopback_must_be_asked_for(endpoint: str) -> None:
+def test_listening_beyond_loopback_requires_the_insecure_option(endpoint: str) -> None:
     with pytest.raises(ConfigError, match=r"other machines .* --insecure"):
         sessions.listen(endpoint)
     with pytest.raises(ConfigError, match=r"other machines .* --insecure"):
         sessions.check_listening(endpoint)
 
 
-def test_listening_beyond_loopback_is_possible_by_name(endpoint: str) -> None:
+def test_listening_beyond_loopback_by_name_is_possible(endpoint: str) -> None:
     everywhere = endpoint.replace("127.0.0.1", "0.0.0.0")
     with (
         sessions.listen(everywhere, insecure=True),
@@ -87,7 +87,7 @@ def test_listening_beyond_loopback_is_possible_by_name(endpoint: str) -> None:
         assert list(client.info.routers_zid())
 
 
-def test_port_in_use_is_named(endpoint: str) -> None:
+def test_port_in_use_is_reported(endpoint: str) -> None:
     host, port = endpoint.removeprefix("tcp/").split(":")
     with (
         socket.create_server((host, int(port))),
@@ -109,26 +109,26 @@ def test_port_in_use_is_named(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["192.0.2.7", "nowhere.invalid"])
-def test_address_of_another_machine_is_named(host: str) -> None:
+def test_address_of_another_machine_is_reported(host: str) -> None:
     with pytest.raises(ConfigError, match=rf"cannot listen on 'tcp/{host}:7447': "):
         sessions.check_listening(f"tcp/{host}:7447", insecure=True)
 
 
-def test_nobody_at_an_endpoint_is_said_in_time(endpoint: str) -> None:
+def test_connecting_without_router_times_out(endpoint: str) -> None:
     began = time.monotonic()
     with pytest.raises(Unreachable, match=rf"no reply from '{endpoint}'.*--listen {endpoint}"):
         sessions.connect(endpoint, patience_s=0.2)
     assert time.monotonic() - began < 3.0
 
 
-def test_connecting_can_be_stopped(endpoint: str) -> None:
+def test_connecting_can_be_interrupted(endpoint: str) -> None:
     stop = threading.Event()
     stop.set()
     with pytest.raises(Interrupted, match=endpoint):
         sessions.connect(endpoint, patience_s=60.0, stop=stop)
 
 
-def test_client_connects_to_a_router_that_comes_later(endpoint: str) -> None:
+def test_client_connects_to_a_router_that_starts_later(endpoint: str) -> None:
     with ExitStack() as stack:
 
         class FirstPause(threading.Event):
@@ -141,22 +141,22 @@ def test_client_connects_to_a_router_that_comes_later(endpoint: str) -> None:
         assert list(client.info.routers_zid())
 
 
-def test_a_router_that_starts_up_is_waited_for_without_a_warning(
+def test_starting_router_causes_no_warning(
     endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class AtFirst(threading.Event):
+    class StopsAtFirstWait(threading.Event):
         def wait(self, timeout: float | None = None) -> bool:
             return True
 
     caplog.set_level(logging.INFO, "udrl")
     with pytest.raises(Interrupted):
-        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+        sessions.connect(endpoint, patience_s=60.0, stop=StopsAtFirstWait())
     assert [(r.levelname, r.message) for r in caplog.records] == [
         ("INFO", f"waiting for a replay service or router at {endpoint}")
     ]
     monkeypatch.setattr(sessions, "QUIET_S", 0.0)
     with pytest.raises(Interrupted):
-        sessions.connect(endpoint, patience_s=60.0, stop=AtFirst())
+        sessions.connect(endpoint, patience_s=60.0, stop=StopsAtFirstWait())
     assert caplog.records[-1].levelname == "WARNING"
     assert f"router at {endpoint}, for " in caplog.text
 
@@ -188,23 +188,25 @@ def served(router: zenoh.Session) -> zenoh.Session:
     return router
 
 
-def test_only_run_of_a_router_is_found(served: zenoh.Session, client: zenoh.Session) -> None:
+def test_only_run_is_found_without_its_name(served: zenoh.Session, client: zenoh.Session) -> None:
     assert sessions.find_run(client, None, patience_s=5.0) == hello("one")
 
 
-def test_run_among_several_is_found_by_name(served: zenoh.Session, client: zenoh.Session) -> None:
+def test_one_of_several_runs_is_found_by_name(served: zenoh.Session, client: zenoh.Session) -> None:
     serve(served, "two", encode(hello("two")))
     assert sessions.find_run(client, "two", patience_s=5.0) == hello("two")
 
 
-def test_several_runs_are_named_when_none_was(served: zenoh.Session, client: zenoh.Session) -> None:
+def test_several_runs_are_listed_if_no_name_is_given(
+    served: zenoh.Session, client: zenoh.Session
+) -> None:
     serve(served, "two", encode(hello("two")))
     with pytest.raises(ConfigError, match=r"one, two; choose one.*--run"):
         sessions.find_run(client, None, patience_s=5.0)
 
 
 @pytest.mark.parametrize(("run_id", "named"), [(None, "no run"), ("two", "no run 'two'")])
-def test_missing_run_is_said_in_time(
+def test_missing_run_times_out(
     run_id: str | None, named: str, router: zenoh.Session, client: zenoh.Session
 ) -> None:
     if run_id:
@@ -215,7 +217,7 @@ def test_missing_run_is_said_in_time(
     assert time.monotonic() - began < 3.0
 
 
-def test_run_of_another_protocol_is_refused_with_both_versions(
+def test_run_of_another_protocol_is_rejected_with_both_versions(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
     serve(router, "one", b"whatever it says then", protocol=PROTOCOL + 1)
@@ -224,15 +226,13 @@ def test_run_of_another_protocol_is_refused_with_both_versions(
         sessions.find_run(client, None, patience_s=5.0)
 
 
-def test_specification_that_is_none_is_refused(
-    router: zenoh.Session, client: zenoh.Session
-) -> None:
+def test_invalid_hello_is_rejected(router: zenoh.Session, client: zenoh.Session) -> None:
     serve(router, "one", b"\xc1")
     with pytest.raises(InvalidMessage, match=r"^Hello: "):
         sessions.find_run(client, None, patience_s=5.0)
 
 
-def test_looking_for_a_run_can_be_stopped(router: zenoh.Session, client: zenoh.Session) -> None:
+def test_finding_a_run_can_be_interrupted(router: zenoh.Session, client: zenoh.Session) -> None:
     stop = threading.Event()
     stop.set()
     with pytest.raises(Interrupted, match="looking for a run"):

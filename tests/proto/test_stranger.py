@@ -1,4 +1,4 @@
-"""The page is enough: an actor that was written from it gives the same bits and serves a run."""
+"""``proto/README.md`` suffices to write an actor: same bits, and it serves a run."""
 
 import ast
 import sys
@@ -63,7 +63,7 @@ def generator() -> Iterator[EpisodeGenerator]:
 
 
 class Pixels(gym.Env[npt.NDArray[np.uint8], np.int64]):
-    """Noise of two channels, which the last action moves."""
+    """Two channels of noise that depends on the last action."""
 
     observation_space = gym.spaces.Box(0, 255, (9, 8, 2), np.uint8)
     action_space = gym.spaces.Discrete(3)
@@ -85,13 +85,13 @@ class Pixels(gym.Env[npt.NDArray[np.uint8], np.int64]):
 
 @pytest.fixture
 def pixels() -> Iterator[str]:
-    """The id of an environment of images."""
+    """The id of an environment with image observations."""
     gym.register("Pixels-v0", entry_point=lambda **_: Pixels(), max_episode_steps=20)
     yield "Pixels-v0"
     del gym.registry["Pixels-v0"]
 
 
-def test_it_knows_nothing_but_the_page() -> None:
+def test_stranger_imports_nothing_from_udrl() -> None:
     tree = ast.parse(Path(stranger.__file__).read_text(encoding="utf-8"))
     imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
     imported |= {str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
@@ -111,9 +111,11 @@ def hello(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
 
 def assert_same_class(config: Config) -> None:
     generator = EpisodeGenerator(config, 1)
-    said = hello(config, generator.spec)
-    assert stranger.numerics_class(said) == acting_class(said["graph"], generator.spec.action_space)
-    assert stranger.environment_digest(said) == environment_digest(generator)
+    run_hello = hello(config, generator.spec)
+    assert stranger.numerics_class(run_hello) == acting_class(
+        run_hello["graph"], generator.spec.action_space
+    )
+    assert stranger.environment_digest(run_hello) == environment_digest(generator)
     generator.close()
 
 
@@ -121,7 +123,7 @@ def assert_same_class(config: Config) -> None:
 @pytest.mark.parametrize("desired_horizon", ["mean", "return"])
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-def test_probe_has_the_same_digest(
+def test_probe_has_equal_digests(
     activation: Any, baseline: Any, desired_horizon: Any, frame_stack: int
 ) -> None:
     assert_same_class(
@@ -133,7 +135,7 @@ def test_probe_has_the_same_digest(
 
 
 @pytest.mark.parametrize("baseline", ["none", "value"])
-def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None:
+def test_probe_of_images_has_equal_digests(baseline: Any, pixels: str) -> None:
     assert_same_class(
         change(CONFIG, environment=pixels, baseline=baseline, convolutions=(4, 6), frame_stack=2)
     )
@@ -148,7 +150,7 @@ def test_probe_has_the_same_digest_on_images(baseline: Any, pixels: str) -> None
         (1, {"temperature": 0.3}), (1, {"temperature": 0.0}),
     ],
 )  # fmt: skip
-def test_episode_has_the_same_bytes(
+def test_episode_has_equal_bytes(
     version: int, more: dict[str, Any], generator: EpisodeGenerator
 ) -> None:
     assert_same_episodes(CONFIG, generator, version, more)
@@ -164,7 +166,7 @@ def test_episode_has_the_same_bytes(
         ("Reach", {"memory": "gru", "memory_size": 5, "frame_stack": 2}),
     ],
 )
-def test_every_kind_of_space_has_the_same_class_and_bytes(
+def test_every_kind_of_space_has_equal_class_and_bytes(
     environment: str, settings: dict[str, Any]
 ) -> None:
     config = change(
@@ -194,19 +196,19 @@ def assert_same_episodes(
         )
         for index in range(5)
     ]
-    said = hello(config, generator.spec)
+    run_hello = hello(config, generator.spec)
     behavior = network = None
     if version:
         weights = untrained(config, generator.spec).weights
-        behavior = ActingFunction(said["graph"], weights)
-        network = stranger.Network(said["graph"], weights)
+        behavior = ActingFunction(run_hello["graph"], weights)
+        network = stranger.Network(run_hello["graph"], weights)
     for ours in generate_episodes(generator, commands, behavior):
         command = msgspec.to_builtins(commands[ours.command_id], builtin_types=(bytes,))
-        theirs = stranger.run_episode(command, said, network)
+        theirs = stranger.run_episode(command, run_hello, network)
         assert stranger.episode_digest(ours.command_id, theirs) == episode_digest(ours)
 
 
-def test_actor_written_from_the_page_serves_a_run(
+def test_stranger_serves_a_run(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path
 ) -> None:
     budget = Budget(max_env_steps=300)

@@ -1,4 +1,4 @@
-"""What others say, as a log shows it."""
+"""Text of peers is escaped before it is logged."""
 
 import unicodedata
 
@@ -20,7 +20,7 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize(
-    ("said", "shown"),
+    ("raw", "shown"),
     [
         ("", ""),
         ("läuft ± 3.5 観測 🙂", "läuft ± 3.5 観測 🙂"),
@@ -32,19 +32,19 @@ HOSTILE = (
         (ValueError("two\nlines"), r"two\nlines"),
     ],
 )
-def test_what_a_terminal_would_obey_is_written_out(said: object, shown: str) -> None:
-    assert printable(said) == shown
+def test_control_sequences_are_escaped(raw: object, shown: str) -> None:
+    assert printable(raw) == shown
 
 
 @given(st.text())
-def test_no_control_character_is_left(text: str) -> None:
+def test_no_control_character_remains(text: str) -> None:
     shown = printable(text)
     assert all(unicodedata.category(c)[0] != "C" for c in shown)
     assert "\n" not in shown
     assert printable(shown) == shown
 
 
-def test_name_of_an_unknown_field_is_written_out() -> None:
+def test_name_of_an_unknown_field_is_escaped() -> None:
     data = encode(Acknowledged()).replace(b"\x80", b"\x81\xa6\x1b[2J\n!\x01")
     with pytest.raises(InvalidMessage) as no:
         decode(data, FailureMessage)
@@ -52,7 +52,7 @@ def test_name_of_an_unknown_field_is_written_out() -> None:
     assert r"\x1b[2J" in str(no.value)
 
 
-def test_refusal_is_written_out() -> None:
+def test_refusal_is_escaped() -> None:
     scripted = Scripted("run")
     scripted.answers(verbs.STATE, lambda _: Problem(code="rewind", message=HOSTILE))
     with pytest.raises(Refused, match=r"no\\n2026") as no:

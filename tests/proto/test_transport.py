@@ -1,4 +1,4 @@
-"""Both transports do what services need of one."""
+"""Both transports provide the same guarantees."""
 
 import queue
 import threading
@@ -21,7 +21,7 @@ Ends = tuple[Transport, Transport]
 
 @pytest.fixture(params=["memory", "zenoh"])
 def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
-    """The ends of a replay service and of a client."""
+    """The transports of a replay service and of a client."""
     if request.param == "memory":
         exchange = Exchange()
         yield MemoryTransport(exchange), MemoryTransport(exchange)
@@ -36,13 +36,13 @@ def ask(client: Transport, data: bytes = b"?", timeout_s: float = WAIT_S) -> lis
 
 
 @pytest.mark.parametrize("is_problem", [False, True])
-def test_question_is_answered(ends: Ends, is_problem: bool) -> None:
+def test_request_is_answered(ends: Ends, is_problem: bool) -> None:
     service, client = ends
     service.answer(KEY, lambda query: query.reply(Answer(query.data + b"!", is_problem)))
-    wait_for(lambda: ask(client) == [Answer(b"?!", is_problem)], "the answer")
+    wait_for(lambda: ask(client) == [Answer(b"?!", is_problem)], "the reply")
 
 
-def test_question_may_be_answered_from_another_thread(ends: Ends) -> None:
+def test_request_may_be_answered_from_another_thread(ends: Ends) -> None:
     service, client = ends
     waiting: queue.Queue[Query] = queue.Queue()
     service.answer(KEY, waiting.put)
@@ -51,10 +51,10 @@ def test_question_may_be_answered_from_another_thread(ends: Ends) -> None:
         waiting.get(timeout=WAIT_S).reply(Answer(b"late", is_problem=False))
 
     threading.Thread(target=answer, daemon=True).start()
-    wait_for(lambda: ask(client) == [Answer(b"late", is_problem=False)], "the answer")
+    wait_for(lambda: ask(client) == [Answer(b"late", is_problem=False)], "the reply")
 
 
-def test_nobody_answers_what_is_dropped_or_was_never_declared_or_no_longer_is(ends: Ends) -> None:
+def test_undeclared_key_and_dropped_query_get_no_reply(ends: Ends) -> None:
     service, client = ends
     assert ask(client) == []
     declared = service.answer(KEY, lambda query: query.drop())
@@ -63,15 +63,15 @@ def test_nobody_answers_what_is_dropped_or_was_never_declared_or_no_longer_is(en
     assert ask(client) == []
 
 
-def test_question_that_hangs_is_given_up(ends: Ends) -> None:
+def test_unanswered_request_times_out(ends: Ends) -> None:
     service, client = ends
     hanging: list[Query] = []
     service.answer(KEY, hanging.append)
-    wait_for(lambda: ask(client, timeout_s=0.1) == [] and hanging, "the question")
+    wait_for(lambda: ask(client, timeout_s=0.1) == [] and hanging, "the request")
     hanging[0].drop()
 
 
-def test_news_reach_who_listens_until_it_does_not(ends: Ends) -> None:
+def test_publication_reaches_subscribers_until_they_undeclare(ends: Ends) -> None:
     service, client = ends
     heard: queue.Queue[bytes] = queue.Queue()
     subscription = client.subscribe(KEY, heard.put)
@@ -80,15 +80,15 @@ def test_news_reach_who_listens_until_it_does_not(ends: Ends) -> None:
         service.publish(KEY, b"news")
         return not heard.empty()
 
-    wait_for(is_heard, "the news")
+    wait_for(is_heard, "the publication")
     assert heard.get() == b"news"
     subscription.undeclare()
 
 
-def test_who_appears_and_goes_is_told(ends: Ends) -> None:
+def test_presence_changes_are_reported(ends: Ends) -> None:
     service, client = ends
     early = client.declare_presence(f"{ALIVE}/early")
-    wait_for(lambda: service.present(f"{ALIVE}/*", WAIT_S), "the first")
+    wait_for(lambda: service.present(f"{ALIVE}/*", WAIT_S), "the first token")
     seen: queue.Queue[Presence] = queue.Queue()
     watching = service.watch("udrl/3/run/alive/*/*", seen.put)
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=True)

@@ -1,4 +1,4 @@
-"""Runs in a directory of their own."""
+"""Runs, each in its own directory."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -13,7 +13,7 @@ from udrl_replay.run import StoredRun
 
 @pytest.fixture
 def stack() -> Iterator[ExitStack]:
-    """What is to be closed at the end."""
+    """Closes what it contains at the end of the test."""
     with ExitStack() as entered:
         yield entered
 
@@ -40,7 +40,7 @@ def make_run(stack: ExitStack, tmp_path: Path) -> Callable[..., StoredRun]:
 
 @pytest.fixture
 def reopened(stack: ExitStack, tmp_path: Path) -> Callable[..., StoredRun]:
-    """Ends a run's process and starts another."""
+    """Ends a replay service and starts another on the same run."""
 
     def start(run: StoredRun, budget: Budget | None = None) -> StoredRun:
         again = reopen(run, tmp_path, budget)

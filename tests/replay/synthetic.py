@@ -1,7 +1,7 @@
-"""A world without networks and environments: episodes and weights are digests of their causes.
+"""Runs without networks and environments, in which episodes and weights are digests.
 
-An episode here is a function of its command and of the weights that the command names; weights are
-a function of the version before and of the buffer. Whatever a run does wrong shows in the digests.
+An episode is a function of its command and of the weights that the command names; weights are
+a function of the version before and of the buffer. Every mistake of a run changes a digest.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ from udrl_replay.run import StoredRun
 from udrl_replay.run_state import RunState
 from udrl_replay.store import Store, Version
 
-#: Several pages of a file.
+#: Several pages of the file.
 BLOB = bytes(range(256)) * 40
 MAX_AGE = 3
 SPEC = EnvironmentSpec(
@@ -42,7 +42,7 @@ SPEC = EnvironmentSpec(
 
 
 def config(lead: int = 0) -> Config:
-    """Return a run of a dozen steps an iteration, with evaluations and many ties in return."""
+    """Return the settings of a run with a dozen steps an iteration, evaluations and many ties."""
     return build(
         Config,
         {
@@ -72,7 +72,7 @@ def hello(lead: int = 0) -> Hello:
 
 
 def create(run_dir: Path, lead: int = 0) -> Store:
-    """Make a new run's file."""
+    """Create a run."""
     return Store.create(run_dir, hello=hello(lead), progress=RunProgress())
 
 
@@ -90,9 +90,9 @@ def join(name: str, environments: int = 4) -> JoinRequest:
 
 
 def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
-    """Carry out a command; ``other``: as a machine would that rounds in its own way."""
-    told = f"{command.id}|{command.desired_return}|{command.desired_horizon}"
-    cause = hashlib.sha256(told.encode() + weights).digest()
+    """Run a command; ``other``: with the result of a machine that rounds differently."""
+    text = f"{command.id}|{command.desired_return}|{command.desired_horizon}"
+    cause = hashlib.sha256(text.encode() + weights).digest()
     length = 1 + cause[0] % command.max_steps
     return Episode(
         command_id=command.id,
@@ -105,7 +105,7 @@ def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
 
 
 def arrive(made: Episode, actor: str = "a") -> Arrival:
-    """Send an episode through the codec and the checks."""
+    """Encode, decode and check an episode."""
     return inspect(decode(encode_episode(made, actor), EpisodeMessage), SPEC)
 
 
@@ -114,13 +114,13 @@ def entry(made: Episode) -> Entry:
 
 
 def trained(version: int, before: bytes, buffer: Iterable[bytes]) -> Version:
-    """Train a version on a buffer, given as digests of its episodes by rank."""
+    """Train a version on a buffer, given as the episodes' digests by rank."""
     weights = hashlib.sha256(b"|".join([before, *buffer])).digest()
     return Version(version, hashlib.sha256(weights).digest(), 1.0 / version, weights, b"adam")
 
 
 class Result(NamedTuple):
-    """Where a run ended."""
+    """The state of a run, to be compared with :func:`reference`."""
 
     iteration: int
     env_steps: int
@@ -131,7 +131,7 @@ class Result(NamedTuple):
 
 
 def reference(lead: int, max_env_steps: int) -> Result:
-    """Do what a run does, the slow and obvious way: keep everything, begin with it each time."""
+    """Compute the expected result in the obvious way, from the beginning for each buffer."""
     settings = config(lead)
     sample = CommandSampler(settings, SPEC)
     weights = [b""]
@@ -148,34 +148,34 @@ def reference(lead: int, max_env_steps: int) -> Result:
             held = [e for e in held if e in best or e in newest]
         return sorted(held, key=entry)
 
-    def carry_out(commands: Sequence[Command]) -> list[Episode]:
+    def run_commands(commands: Sequence[Command]) -> list[Episode]:
         return [episode(c, weights[c.weights_version]) for c in commands]
 
     while not steps or steps[-1] < max_env_steps:
         i = len(steps)
         if i == 0:
-            explored.append(carry_out(sample.warm_up()))
+            explored.append(run_commands(sample.warm_up()))
         else:
             weights.append(trained(i, weights[-1], map(episode_digest, buffer(i - 1))).weights)
             source = weights_version(i, lead) - 1
             drawn_from = ReplayBuffer(settings.buffer, map(entry, buffer(source)))
-            explored.append(carry_out(sample.explore(i, drawn_from)))
+            explored.append(run_commands(sample.explore(i, drawn_from)))
             before = steps[source - 1] if source else 0
             due = evaluation_due(source, before, steps[source], settings.evaluation.eval_every)
             if due and i == opened_by(source, lead)[0]:
-                returns = [e.episode_return for e in carry_out(sample.evaluate(i, drawn_from))]
+                returns = [e.episode_return for e in run_commands(sample.evaluate(i, drawn_from))]
                 evaluation = summarise(returns)
         steps.append(sum(e.length for done in explored for e in done))
     digest = replay_digest(map(episode_digest, buffer(i)))
     final = None
     if i > 0:
         last = ReplayBuffer(settings.buffer, map(entry, buffer(i)))
-        final = summarise([e.episode_return for e in carry_out(sample.evaluate_final(i, last))])
+        final = summarise([e.episode_return for e in run_commands(sample.evaluate_final(i, last))])
     return Result(i, steps[-1], weights[-1], digest, evaluation, final)
 
 
 def result(run: RunState) -> Result:
-    """Say where a run stands, in the terms of :func:`reference`."""
+    """Return the state of a run in the terms of :func:`reference`."""
     version = run.store.version(run.progress.latest_version)
     last = run.store.last_evaluation(is_final=False)
     final = run.store.last_evaluation(is_final=True)
@@ -190,7 +190,7 @@ def result(run: RunState) -> Result:
 
 
 def train_next(run: StoredRun) -> Version:
-    """Do a learner's work: return the version that the run waits for."""
+    """Act as the learner: return the version that the run waits for."""
     number = run.progress.latest_version + 1
     before = run.store.version(number - 1)
     buffer = run.store.buffer(number - 1)
@@ -198,17 +198,19 @@ def train_next(run: StoredRun) -> Version:
 
 
 def weights_of(run: StoredRun, command: Command) -> bytes:
-    """Return the weights that a command names, which the run must have."""
+    """Return the weights that a command names, which the run must have kept."""
     if command.weights_version == 0:
         return b""
     version = run.store.version(command.weights_version)
     assert version is not None
-    assert version.weights, f"version {command.weights_version} is gone, {command.id} needs it"
+    assert version.weights, (
+        f"version {command.weights_version} is missing, but command {command.id} needs it"
+    )
     return version.weights
 
 
 def work(run: StoredRun) -> None:
-    """Deliver a version if one is awaited, and an episode for each command that can be obeyed."""
+    """Deliver a version if one is awaited, and an episode for each command whose weights exist."""
     with run.store.transaction():
         if run.awaits_version() is not None:
             run.add_version(train_next(run), 0.0)

@@ -1,4 +1,4 @@
-"""Who may take part in a run."""
+"""Admission of actors and learners to a run."""
 
 from collections.abc import Callable
 
@@ -21,14 +21,14 @@ def request(role: Role, name: str, numerics_class: str = "c") -> JoinRequest:
 
 
 def refusal(ask: Callable[[], None]) -> str:
-    """Return the code with which something is refused."""
+    """Return the code of a refusal."""
     with pytest.raises(Refused) as no:
         ask()
     return no.value.code
 
 
 @pytest.mark.parametrize("role", ["actor", "learner"])
-def test_who_is_not_known_must_join(role: Role, make_run: MakeRun) -> None:
+def test_unknown_service_must_join_first(role: Role, make_run: MakeRun) -> None:
     one = Admission(make_run())
     assert refusal(lambda: one.check(role, "a")) == "join_first"
     one.join(request(role, "a"), 0.0)
@@ -40,9 +40,7 @@ def test_who_is_not_known_must_join(role: Role, make_run: MakeRun) -> None:
 @pytest.mark.parametrize(
     ("role", "field"), [("actor", "acting_class"), ("learner", "training_class")]
 )
-def test_first_that_delivers_sets_the_numerics_class(
-    role: Role, field: str, make_run: MakeRun
-) -> None:
+def test_first_delivery_sets_the_numerics_class(role: Role, field: str, make_run: MakeRun) -> None:
     run = make_run()
     one = Admission(run)
     for name in ("first", "second"):
@@ -61,7 +59,7 @@ def test_first_that_delivers_sets_the_numerics_class(
     assert run.progress.exact
 
 
-def test_actors_and_learners_are_compared_among_themselves(make_run: MakeRun) -> None:
+def test_actors_and_learners_have_separate_numerics_classes(make_run: MakeRun) -> None:
     run = make_run()
     one = Admission(run)
     one.join(request("actor", "a", "of actors"), 0.0)
@@ -71,7 +69,7 @@ def test_actors_and_learners_are_compared_among_themselves(make_run: MakeRun) ->
     one.check("learner", "l")
 
 
-def test_what_an_actor_holds_that_may_no_longer_act_goes_to_others(make_run: MakeRun) -> None:
+def test_commands_of_a_refused_actor_go_to_others(make_run: MakeRun) -> None:
     run = make_run()
     one = Admission(run)
     for name in ("a", "b"):
@@ -85,7 +83,7 @@ def test_what_an_actor_holds_that_may_no_longer_act_goes_to_others(make_run: Mak
     assert held[0] in again
 
 
-def test_run_that_allows_it_is_inexact_once_it_holds_something_of_another_class(
+def test_run_becomes_inexact_with_the_first_delivery_of_another_class_if_allowed(
     make_run: MakeRun,
 ) -> None:
     run = make_run()
@@ -107,7 +105,7 @@ def test_another_environment_is_refused(make_run: MakeRun) -> None:
     assert refusal(lambda: Admission(make_run()).join(other, 0.0)) == "other_environment"
 
 
-def test_actors_in_quarantine_and_too_many_are_refused(
+def test_quarantined_actors_and_too_many_actors_are_refused(
     make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = make_run()
@@ -122,7 +120,7 @@ def test_actors_in_quarantine_and_too_many_are_refused(
     one.join(request("learner", "l"), 0.0)
 
 
-def test_learners_that_are_remembered_are_bounded(
+def test_number_of_remembered_learners_is_bounded(
     make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(admission, "_MOST_LEARNERS", 2)
@@ -133,13 +131,13 @@ def test_learners_that_are_remembered_are_bounded(
     assert refusal(lambda: one.check("learner", "b")) == "join_first"
 
 
-def test_actor_whose_environment_does_something_else_needs_an_inexact_run(
+def test_actor_with_another_environment_digest_requires_an_inexact_run(
     make_run: MakeRun,
 ) -> None:
     run = make_run()
     one = Admission(run)
     actor = replace(request("actor", "a"), environment_digest="of another")
-    one.join(actor, 0.0)  # this run's environment does not repeat itself: nothing to compare
+    one.join(actor, 0.0)  # environments that do not replay cannot be compared
     run.hello = replace(run.hello, environment_digest="of its own")
     assert refusal(lambda: one.join(actor, 0.0)) == "other_environment"
     one.join(request("learner", "l"), 0.0)

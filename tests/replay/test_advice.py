@@ -1,4 +1,4 @@
-"""A run that does not learn says so, with the most likely cause."""
+"""Advice for runs that do not learn."""
 
 from collections.abc import Callable
 
@@ -26,23 +26,25 @@ NETWORK = NetworkSettings(return_scale=0.05, horizon_scale=0.01)
 def run(make_run: Callable[..., StoredRun]) -> StoredRun:
     made = make_run(max_env_steps=60)
     finish(made)
-    made.progress.best_mean = -1.0  # its returns are 0 and more
+    made.progress.best_mean = -1.0  # all returns are nonnegative
     return made
 
 
-def test_a_run_that_does_not_learn_says_so_after_a_third_of_its_budget(run: StoredRun) -> None:
-    said = advice(run)
-    assert said.startswith(
+def test_advice_is_given_after_a_third_of_the_budget_without_learning(run: StoredRun) -> None:
+    text = advice(run)
+    assert text.startswith(
         "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
     )
-    assert said.endswith("See 'Signs of trouble' in docs/metrics.md")
-    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == said
+    assert text.endswith("See 'Signs of trouble' in docs/metrics.md")
+    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == text
     run.budget = Budget(max_env_steps=3 * run.progress.env_steps + 1)
     assert advice(run) == ""
 
 
 @pytest.mark.parametrize("best", [None, 100.0])
-def test_there_is_no_advice_without_need(run: StoredRun, best: float | None) -> None:
+def test_there_is_no_advice_without_evaluation_or_with_a_good_one(
+    run: StoredRun, best: float | None
+) -> None:
     run.progress.best_mean = best
     assert advice(run) == ""
 
@@ -57,16 +59,16 @@ def test_there_is_no_advice_without_need(run: StoredRun, best: float | None) -> 
          "return_scale = 1: it scales the warm-up's typical returns of 22 to 22"),
         ({"horizon_scale": 0.5}, {},
          "horizon_scale = 0.5: it scales the warm-up's typical lengths of 100 to 50"),
-        # Returns that cancel out are not small.
+        # Positive and negative returns that cancel out are not small.
         ({}, {"explored_return": 0.0}, "too little data: give it more env steps"),
         ({}, {"return_min": 0.0, "return_max": 0.0, "explored_return": 0.0},
          "too little data: all warm-up episodes have the same return"),
-        # Of a thousand the buffer may hold the best only, which are alike.
+        # A buffer that holds only the best of a thousand episodes may have equal returns.
         ({}, {"return_min": 1.0, "return_max": 1.0, "explored_return": 0.1},
          "return_scale = 0.05: it scales the warm-up's typical returns of 0.1 to 0.005"),
     ],
 )  # fmt: skip
-def test_the_most_likely_cause(
+def test_most_likely_cause(
     network: dict[str, float], warm_up: dict[str, float], expected: str
 ) -> None:
     found = cause(
@@ -75,7 +77,7 @@ def test_the_most_likely_cause(
     assert found.startswith(expected)
 
 
-def test_the_terminal_is_told_once(run: StoredRun, caplog: pytest.LogCaptureFixture) -> None:
+def test_advice_is_logged_once(run: StoredRun, caplog: pytest.LogCaptureFixture) -> None:
     adviser = Adviser()
     for _ in range(3):
         adviser.show(status(run, Throughput(), Waits(), 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""What is checked of an episode before the run sees it."""
+"""Checks of an episode before it is admitted to the run."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ SPEC = EnvironmentSpec(
 
 
 def episode(**changes: Any) -> Episode:
-    """Return a good episode of three steps, with some of its parts replaced."""
+    """Return a valid episode of three steps with some parts replaced."""
     parts: dict[str, Any] = {
         "command_id": 7,
         "observations": np.arange(6, dtype=np.float32).reshape(3, 2),
@@ -39,7 +39,7 @@ def message(made: Episode) -> EpisodeMessage:
     return decode(encode_episode(made, "actor-1"), EpisodeMessage)
 
 
-def test_good_episode_arrives_with_its_return_length_and_digest() -> None:
+def test_valid_episode_has_return_length_and_digest() -> None:
     arrival = inspect(message(episode()), SPEC)
     assert arrival.actor == "actor-1"
     assert arrival.entry == Entry(1.5, 7, 3)
@@ -49,7 +49,7 @@ def test_good_episode_arrives_with_its_return_length_and_digest() -> None:
 
 
 @pytest.mark.parametrize("flags", [(True, False), (False, True), (True, True)])
-def test_episode_may_end_either_way_or_both(flags: tuple[bool, bool]) -> None:
+def test_episode_may_terminate_or_be_truncated_or_both(flags: tuple[bool, bool]) -> None:
     made = episode(terminated=flags[0], truncated=flags[1])
     assert inspect(message(made), SPEC).digest == episode_digest(made)
 
@@ -86,12 +86,14 @@ def ones(*shape: int) -> np.typing.NDArray[np.float32]:
         ({"terminated": False}, "it neither terminated nor was truncated"),
     ],
 )
-def test_impossible_episode_is_refused_and_named(changes: dict[str, Any], complaint: str) -> None:
+def test_invalid_episode_is_rejected_with_the_fault(
+    changes: dict[str, Any], complaint: str
+) -> None:
     with pytest.raises(InvalidMessage, match=rf"^episode 7: {complaint}"):
         inspect(message(episode(**changes)), SPEC)
 
 
-def test_actions_of_large_action_spaces_are_signed_and_still_checked() -> None:
+def test_actions_of_large_action_spaces_are_signed_and_checked() -> None:
     spec = replace(SPEC, action_space=Categorical(n=1000))
     good = episode(actions=np.array([0, 1, 999], np.int32))
     assert inspect(message(good), spec).entry.id == 7
@@ -100,7 +102,7 @@ def test_actions_of_large_action_spaces_are_signed_and_still_checked() -> None:
             inspect(message(episode(actions=np.array([0, 1, bad], np.int32))), spec)
 
 
-def test_array_whose_bytes_do_not_fill_its_shape_is_refused() -> None:
+def test_array_whose_bytes_do_not_match_its_shape_is_rejected() -> None:
     short = Array(dtype="<f4", shape=(3,), data=bytes(11))
     with pytest.raises(InvalidMessage, match=r"11 bytes for <f4 \[3\], expected 12"):
         inspect(replace(message(episode()), rewards=short), SPEC)

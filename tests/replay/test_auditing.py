@@ -1,4 +1,4 @@
-"""Spot checks and quarantine: who lies is found, who does not is left alone; results stay."""
+"""Audits and quarantine: only lying actors are identified, and results do not change."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -34,7 +34,7 @@ def command(number: int) -> Command:
 
 
 def audited(*digests: tuple[str, bytes]) -> Verdict | None:
-    """Return the verdict over one command that actors deliver in this order."""
+    """Return the verdict on one command that actors deliver in this order."""
     auditor = Auditor(1.0)
     (first, digest), *others = digests
     auditor.maybe_audit(command(5), first, "c", digest)
@@ -45,7 +45,7 @@ def audited(*digests: tuple[str, bytes]) -> Verdict | None:
     return verdict
 
 
-def test_two_that_agree_need_no_third() -> None:
+def test_two_equal_episodes_end_the_audit() -> None:
     auditor = Auditor(1.0)
     auditor.maybe_audit(command(5), "a", "c", b"x")
     assert auditor.versions == {5}
@@ -57,36 +57,36 @@ def test_two_that_agree_need_no_third() -> None:
 
 
 @pytest.mark.parametrize(("digests", "liar"), [("xyx", "b"), ("xyy", "a")])
-def test_third_decides_between_two(digests: str, liar: str) -> None:
+def test_third_episode_decides_between_two(digests: str, liar: str) -> None:
     made = zip("abc", (d.encode() for d in digests), strict=True)
     assert audited(*made) == Verdict(liar)
 
 
-def test_three_that_differ_decide_nothing() -> None:
+def test_three_different_episodes_decide_nothing() -> None:
     assert audited(("a", b"x"), ("b", b"y"), ("c", b"z")) == Verdict(None)
 
 
-def test_nobody_checks_himself_or_another_class() -> None:
+def test_audit_goes_to_another_actor_of_the_same_class() -> None:
     auditor = Auditor(1.0)
     auditor.maybe_audit(command(5), "a", "c", b"x")
     assert auditor.assign("a", "c", (), 9) == []
     assert auditor.assign("b", "other", (), 9) == []
     assert auditor.assign("b", "c", (), 0) == []
     assert len(auditor.assign("b", "c", (), 9)) == 1
-    assert auditor.assign("d", "c", (), 9) == [], "one at a time"
+    assert auditor.assign("d", "c", (), 9) == [], "one audit of a command at a time"
 
 
-def test_what_an_actor_lost_goes_to_another() -> None:
+def test_lost_audit_is_assigned_again() -> None:
     auditor = Auditor(1.0)
     auditor.maybe_audit(command(5), "a", "c", b"x")
     auditor.assign("b", "c", (), 9)
-    assert auditor.assign("b", "c", {5}, 9) == [], "it holds it still"
-    assert len(auditor.assign("b", "c", (), 9)) == 1, "it lost it and may have it again"
+    assert auditor.assign("b", "c", {5}, 9) == [], "still assigned"
+    assert len(auditor.assign("b", "c", (), 9)) == 1, "lost, and may be assigned again"
     auditor.remove_actor("b")
     assert len(auditor.assign("d", "c", (), 9)) == 1
 
 
-def test_rate_is_the_share_that_is_checked() -> None:
+def test_rate_is_the_audited_share() -> None:
     numbers = iter([0.0, 0.24, 0.25, 0.9])
     auditor = Auditor(0.25, lambda: next(numbers))
     for i in range(4):
@@ -104,7 +104,7 @@ def test_open_audits_are_bounded() -> None:
     assert not auditor.open
 
 
-# In a run.
+# Audits in a run.
 
 
 def deliver(run: StoredRun, name: str, made: Command, *, lies: bool = False) -> str:
@@ -127,7 +127,7 @@ def audited_run(make_run: Callable[..., StoredRun]) -> StoredRun:
     return run
 
 
-def test_audit_changes_no_result(
+def test_audits_do_not_change_the_result(
     audited_run: StoredRun, make_run: Callable[..., StoredRun]
 ) -> None:
     run = audited_run
@@ -146,12 +146,12 @@ def test_audit_changes_no_result(
     assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
 
 
-def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: StoredRun, tmp_path: Path) -> None:
+def test_liar_stops_the_run_even_after_a_restart(audited_run: StoredRun, tmp_path: Path) -> None:
     run = audited_run
     (made,) = ask(run, "a")
     assert deliver(run, "a", made, lies=True) == "accepted"
     for name in "bc":
-        assert ask(run, name) == [made], "checks come before other work"
+        assert ask(run, name) == [made], "audits precede other commands"
         assert deliver(run, name, made) == "duplicate"
     assert run.progress.state == "failed"
     assert "actor a lied: its episode of command 0 differs" in run.progress.problem
@@ -163,7 +163,7 @@ def test_liar_stops_the_run_and_keeps_it_stopped(audited_run: StoredRun, tmp_pat
     assert Deceived.exit_code == 10
 
 
-def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
+def test_lying_auditor_is_quarantined_and_the_run_continues(
     audited_run: StoredRun, reopened: Callable[..., StoredRun]
 ) -> None:
     run = audited_run
@@ -183,7 +183,7 @@ def test_auditor_who_lies_is_quarantined_and_the_run_goes_on(
     assert set(reopened(run).quarantined.reasons) == {"b"}
 
 
-def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
+def test_liar_that_delivered_before_the_first_audit_stops_the_run(
     make_run: Callable[..., StoredRun], reopened: Callable[..., StoredRun]
 ) -> None:
     run = make_run()
@@ -204,7 +204,7 @@ def test_liar_that_delivered_before_anything_was_audited_stops_the_run(
     assert "actor b lied" in run.progress.problem
 
 
-def test_environment_that_is_not_deterministic_convicts_nobody(audited_run: StoredRun) -> None:
+def test_nondeterministic_environment_leads_to_no_quarantine(audited_run: StoredRun) -> None:
     run = audited_run
     (made,) = ask(run, "a")
     for name, weights in zip("abc", (b"1", b"2", b"3"), strict=True):
@@ -234,5 +234,5 @@ def test_repeated_offender_is_quarantined(make_run: Callable[..., StoredRun]) ->
         deliver(run, "a", made)
     assert run.progress.rejected == OFFENCES + 1
     run.dealer.join(join("b"), 0.0)
-    assert ask(run, "b") == [made], "its commands go to others"
+    assert ask(run, "b") == [made], "its commands must be reassigned"
     assert deliver(run, "b", made) == "accepted"

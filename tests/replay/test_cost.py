@@ -1,17 +1,17 @@
-"""What an iteration costs does not grow with the age of the run."""
+"""The cost of an iteration does not grow with the age of the run."""
 
 from collections.abc import Callable
 
 from tests.replay.synthetic import work
 from udrl_replay.run import StoredRun
 
-#: Tables whose size the settings bound; the others keep a row of every iteration for good.
+#: Tables of bounded size; the others keep a row for every iteration.
 BOUNDED = {"facts", "commands", "episodes", "bodies", "CONSTANT"}
 #: Indexes of the few rows that still have their blobs.
 SMALL = ("weights_kept", "optimizers_kept")
 
 
-def test_no_statement_reads_a_whole_table_that_grows(make_run: Callable[..., StoredRun]) -> None:
+def test_no_statement_scans_a_growing_table(make_run: Callable[..., StoredRun]) -> None:
     run = make_run(lead=1)
     for _ in range(5):
         work(run)

@@ -1,4 +1,4 @@
-"""Creating a run, going on with it, and writing its configuration."""
+"""Creating and resuming a run, and writing its configuration."""
 
 import re
 from contextlib import ExitStack, closing
@@ -34,7 +34,7 @@ def created(stack: ExitStack, tmp_path: Path) -> Store:
     return stack.enter_context(closing(creation.create(tmp_path, TOY)))
 
 
-def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
+def test_hello_of_a_new_run_is_complete(created: Store) -> None:
     hello = created.fact("hello", Hello)
     assert hello == Hello(
         protocol=PROTOCOL,
@@ -54,7 +54,7 @@ def test_new_run_says_all_that_a_service_needs_to_know(created: Store) -> None:
 
 
 @pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])
-def test_spaces_are_those_after_settings_are_chosen(
+def test_hello_has_the_spaces_after_automatic_settings(
     environment: str, shown: bool, tmp_path: Path
 ) -> None:
     config = Config(environment=environment)
@@ -76,20 +76,20 @@ def test_environment_that_does_not_replay_marks_the_run(
         assert not progress.exact
         hello = store.fact("hello", Hello)
         assert not hello.exact
-        assert hello.environment_digest == "", "nothing to compare actors by"
+        assert hello.environment_digest == "", "no digest to compare actors by"
     reason = "environment Figure2-v0 does not repeat an episode from its seed"
     assert progress.inexact_reason == reason
     assert reason in caplog.text
 
 
-def test_unknown_environment_leaves_no_run(tmp_path: Path) -> None:
+def test_unknown_environment_creates_no_run(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedEnvironment, match="Nowhere-v0"):
         creation.create(tmp_path / "run", Config(environment="Nowhere-v0"))
     assert not creation.exists(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_exists_once_it_is_created(created: Store, tmp_path: Path) -> None:
+def test_run_exists_after_its_creation(created: Store, tmp_path: Path) -> None:
     assert creation.exists(tmp_path)
     assert not creation.exists(tmp_path / "other")
 
@@ -101,7 +101,7 @@ def test_run_is_resumed_with_its_configuration(created: Store, tmp_path: Path) -
         assert store.fact("hello", Hello) == hello
 
 
-def test_other_configuration_is_refused_with_both_values(created: Store, tmp_path: Path) -> None:
+def test_other_configuration_is_rejected_with_both_values(created: Store, tmp_path: Path) -> None:
     created.close()
     other = build(
         Config, {"environment": "Figure2-v0", "max_return": 2.0, "seed": 7, "hidden": [8]}
@@ -109,22 +109,22 @@ def test_other_configuration_is_refused_with_both_values(created: Store, tmp_pat
     expected = r"seed = 1, not 7; hidden = \[32, 128, 128, 128\], not \[8\]; use its configuration"
     with pytest.raises(OtherConfiguration, match=expected):
         resume(tmp_path, other)
-    # The refusal has let go of the lock.
+    # The failed attempt has released the lock.
     resume(tmp_path, TOY).close()
 
 
-def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
+def test_resuming_without_a_run_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=rf"holds no run \({FILE} is missing\)"):
         resume(tmp_path, TOY)
 
 
 @pytest.mark.parametrize("name", ["run", "My Run.2", "-", "x" * 200, "läufe", "a" * 49 + "--b"])
-def test_id_of_a_run_fits_a_key_expression(name: str, tmp_path: Path) -> None:
+def test_run_id_is_valid_in_a_key_expression(name: str, tmp_path: Path) -> None:
     with closing(creation.create(tmp_path / name, TOY)) as store:
         assert key_expressions.RUN_ID.fullmatch(store.fact("hello", Hello).run_id)
 
 
-def test_runs_of_one_name_have_different_ids(tmp_path: Path) -> None:
+def test_runs_of_equal_names_have_different_ids(tmp_path: Path) -> None:
     ids = set()
     for parent in ("one", "two"):
         with closing(creation.create(tmp_path / parent / "run", TOY)) as store:
@@ -133,17 +133,17 @@ def test_runs_of_one_name_have_different_ids(tmp_path: Path) -> None:
 
 
 @given(st.text(min_size=1, max_size=200), st.integers(0, 2**63 - 1))
-def test_directory_of_any_environment_has_a_plain_name(environment: str, seed: int) -> None:
+def test_directory_name_is_plain_for_any_environment(environment: str, seed: int) -> None:
     name = creation.directory_name(Config(environment=environment, seed=seed))
     assert re.fullmatch(r"[a-z0-9][a-z0-9-]*", name)
 
 
-def test_directory_says_what_the_run_is() -> None:
+def test_directory_name_has_environment_and_seed() -> None:
     name = creation.directory_name(Config(environment="pack.age:LunarLander-v3", seed=12))
     assert re.fullmatch(r"pack-age-lunarlander-v3-seed12-\d{8}-\d{6}", name)
 
 
-def test_resumed_run_may_allow_what_it_did_not_before(created: Store, tmp_path: Path) -> None:
+def test_resumed_run_may_newly_allow_inexact_results(created: Store, tmp_path: Path) -> None:
     created.close()
     for allow_inexact in (True, False):
         with closing(resume(tmp_path, TOY, allow_inexact=allow_inexact)) as store:
@@ -166,7 +166,7 @@ kwargs: st.SearchStrategy[dict[str, Any]] = st.dictionaries(
     max_return=st.none() | st.floats(allow_nan=False, allow_infinity=False),
     stop_return=st.none() | st.floats(allow_nan=False, allow_infinity=False),
 )
-def test_written_configuration_can_be_read_again(
+def test_written_configuration_round_trips(
     environment_kwargs: dict[str, Any],
     learning_rate: float,
     hidden: tuple[int, ...],

@@ -1,4 +1,4 @@
-"""Power cuts, torn files, flipped bits: told, or harmless; never silently wrong."""
+"""Damaged files: detected or harmless, but never silently wrong."""
 
 import os
 import random
@@ -39,7 +39,7 @@ def written(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def unfinished(tmp_path: Path) -> Path:
-    """The closed file of a run that goes on, with rows in all tables."""
+    """The closed file of an unfinished run with rows in all tables."""
     with closing(create(tmp_path, lead=1)) as store:
         run = StoredRun(store, Budget(max_env_steps=1000))
         for _ in range(8):
@@ -48,7 +48,7 @@ def unfinished(tmp_path: Path) -> Path:
 
 
 def read_everything(run_dir: Path) -> object:
-    """Return all that a service can ask a store for."""
+    """Return all that a service can read from a store."""
     with closing(Store(run_dir)) as store:
         run = StoredRun(store, Budget(max_env_steps=60))
         ids = [*(e.id for e in run.buffer), 10**9]
@@ -68,38 +68,38 @@ def read_everything(run_dir: Path) -> object:
 # Damage.
 
 
-def test_damaged_file_is_told_or_harmless_whichever_page_is_hit(written: Path) -> None:
+def test_damaged_page_is_detected_or_harmless(written: Path) -> None:
     whole = written.read_bytes()
     expected = read_everything(written.parent)
     size = int.from_bytes(whole[16:18], "big")
-    told = 0
+    detected = 0
     for start in range(0, len(whole), size):
         for junk in (bytes(size), b"\xa5" * size):
             written.write_bytes(whole[:start] + junk + whole[start + size :])
             try:
                 assert read_everything(written.parent) == expected
             except DamagedStore:
-                told += 1
+                detected += 1
     written.write_bytes(whole)
     assert read_everything(written.parent) == expected
-    assert told > len(whole) // size
+    assert detected > len(whole) // size
 
 
 @pytest.mark.parametrize("left", [0, 1, 100, 5000, -4096, -1])
-def test_truncated_file_is_named(left: int, written: Path) -> None:
+def test_truncated_file_is_detected(left: int, written: Path) -> None:
     written.write_bytes(written.read_bytes()[:left])
     with pytest.raises(DamagedStore, match=f"{written}: .*restore the run directory from a backup"):
         read_everything(written.parent)
 
 
-def test_file_that_is_no_database_is_named(written: Path) -> None:
+def test_file_that_is_no_database_is_rejected(written: Path) -> None:
     written.write_text("These are not the episodes you are looking for. " * 100)
     with pytest.raises(DamagedStore, match=f"{written}: file is not a database"):
         Store(written.parent, read_only=True)
 
 
 @pytest.mark.parametrize("blob", ["weights", "optimizer"])
-def test_changed_weights_are_noticed(blob: str, written: Path) -> None:
+def test_changed_weights_are_detected(blob: str, written: Path) -> None:
     changed = b"\x01" + BLOB[1:]
     edit(written, f"UPDATE versions SET {blob} = ? WHERE version = 1000", changed)
     with closing(Store(written.parent)) as store:
@@ -108,7 +108,7 @@ def test_changed_weights_are_noticed(blob: str, written: Path) -> None:
             store.version(1000)
 
 
-def test_changed_weights_without_an_optimizer_are_noticed(written: Path) -> None:
+def test_changed_weights_without_an_optimizer_are_detected(written: Path) -> None:
     with closing(Store(written.parent)) as store:
         with store.transaction():
             store.drop_optimizers(1001)
@@ -120,7 +120,7 @@ def test_changed_weights_without_an_optimizer_are_noticed(written: Path) -> None
         store.version(1000)
 
 
-def test_changed_episode_is_noticed(written: Path) -> None:
+def test_changed_episode_is_detected(written: Path) -> None:
     edit(written, "UPDATE bodies SET body = x'00' WHERE id = ?", 10**9)
     with (
         closing(Store(written.parent)) as store,
@@ -143,7 +143,7 @@ def test_changed_episode_is_noticed(written: Path) -> None:
         ("DROP TABLE episodes", "no such table: episodes"),
     ],
 )
-def test_changed_rows_are_named(statement: str, complaint: str, written: Path) -> None:
+def test_changed_row_is_reported(statement: str, complaint: str, written: Path) -> None:
     edit(written, statement)
     with pytest.raises(DamagedStore) as caught:
         read_everything(written.parent)
@@ -154,7 +154,7 @@ def test_changed_rows_are_named(statement: str, complaint: str, written: Path) -
 @pytest.mark.parametrize(
     ("table", "column"), [(t, c) for t, columns in SEALED.items() for c in columns.split(", ")]
 )
-def test_value_that_became_another_one_is_noticed(table: str, column: str, written: Path) -> None:
+def test_changed_value_is_detected(table: str, column: str, written: Path) -> None:
     key = SEALED[table].split(",")[0]
     edit(
         written,
@@ -180,7 +180,7 @@ def primary_key(db: sqlite3.Connection, table: str) -> list[str]:
 
 @pytest.mark.parametrize("read_only", [False, True])
 @pytest.mark.parametrize("table", TABLES_THERE)
-def test_any_row_that_is_gone_is_noticed(table: str, read_only: bool, unfinished: Path) -> None:
+def test_missing_row_is_detected(table: str, read_only: bool, unfinished: Path) -> None:
     whole = unfinished.read_bytes()
     keys = keys_of(unfinished, table)
     assert keys
@@ -195,8 +195,8 @@ def test_any_row_that_is_gone_is_noticed(table: str, read_only: bool, unfinished
 
 
 @pytest.mark.parametrize("table", TABLES_THERE)
-def test_row_that_came_from_elsewhere_is_noticed(table: str, unfinished: Path) -> None:
-    """It has a seal, as the row of another run has."""
+def test_foreign_row_is_detected(table: str, unfinished: Path) -> None:
+    """Its seal is correct, like that of another run's row."""
     with closing(sqlite3.connect(unfinished)) as db, db:
         db.create_function("seal", -1, seal)
         key, *_ = primary_key(db, table)
@@ -212,8 +212,8 @@ def test_row_that_came_from_elsewhere_is_noticed(table: str, unfinished: Path) -
         Store(unfinished.parent)
 
 
-def test_table_that_is_as_it_was_before_is_noticed(tmp_path: Path) -> None:
-    """All its rows were written once, and as many."""
+def test_restored_old_table_is_detected(tmp_path: Path) -> None:
+    """All its rows were written by this run, and their number is the same."""
 
     def work_on(store: Store) -> None:
         run = StoredRun(store, Budget(max_env_steps=1000))
@@ -233,11 +233,11 @@ def test_table_that_is_as_it_was_before_is_noticed(tmp_path: Path) -> None:
         Store(tmp_path)
 
 
-def test_flipped_bits_are_told_or_harmless(written: Path) -> None:
+def test_flipped_bits_are_detected_or_harmless(written: Path) -> None:
     chance = random.Random(1)
     whole = written.read_bytes()
     expected = read_everything(written.parent)
-    told = 0
+    detected = 0
     for _ in range(300):
         broken = bytearray(whole)
         broken[chance.randrange(len(broken))] ^= 1 << chance.randrange(8)
@@ -245,12 +245,12 @@ def test_flipped_bits_are_told_or_harmless(written: Path) -> None:
         try:
             assert read_everything(written.parent) == expected
         except (DamagedStore, OtherConfiguration) as error:
-            assert str(written) in str(error)  # noqa: PT017 - either way is right
-            told += 1
-    assert told > 100
+            assert str(written) in str(error)  # noqa: PT017 - either outcome is correct
+            detected += 1
+    assert detected > 100
 
 
-def test_file_that_is_cut_anywhere_is_told(written: Path) -> None:
+def test_file_truncated_anywhere_is_detected(written: Path) -> None:
     chance = random.Random(2)
     whole = written.read_bytes()
     for _ in range(50):
@@ -259,13 +259,13 @@ def test_file_that_is_cut_anywhere_is_told(written: Path) -> None:
             read_everything(written.parent)
 
 
-def test_damaged_journal_costs_work_and_changes_nothing(tmp_path: Path) -> None:
+def test_damaged_journal_costs_work_but_changes_no_result(tmp_path: Path) -> None:
     chance = random.Random(3)
     with closing(create(tmp_path / "whole")) as store:
         run = StoredRun(store, Budget(max_env_steps=60))
         for _ in range(5):
             work(run)
-        for number in range(20):  # what a power cut leaves: the file and its journal
+        for number in range(20):  # the state after a power cut: the file and its journal
             shutil.copytree(tmp_path / "whole", tmp_path / f"cut{number}")
     for number in range(20):
         journal = tmp_path / f"cut{number}" / f"{FILE}-wal"
@@ -297,7 +297,7 @@ while run.progress.state in ("running", "finishing"):
 """
 
 
-def test_writer_that_is_killed_at_any_moment_loses_nothing_acknowledged(tmp_path: Path) -> None:
+def test_writer_killed_at_any_time_loses_nothing_acknowledged(tmp_path: Path) -> None:
     chance = random.Random(4)
     create(tmp_path).close()
     acknowledged = 0

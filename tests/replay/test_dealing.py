@@ -1,4 +1,4 @@
-"""Who gets which command, and who gets it next when that one does not answer."""
+"""Distribution of commands to actors, and reassignment after failures."""
 
 import pytest
 from hypothesis import given
@@ -48,20 +48,20 @@ def ask(
     version: int = 1,
     spare_cores: float = 0.0,
 ) -> list[int]:
-    """Return the ids that an actor is given."""
+    """Return the ids of the commands that an actor is given."""
     request = CommandsRequest(
         actor=name, wanted=wanted, running=tuple(running or ()), spare_cores=spare_cores
     )
     return [c.id for c in dealer.deal(request, version, now)]
 
 
-def test_first_actor_does_not_get_everything(dealer: Dealer) -> None:
+def test_first_actor_gets_its_share_only(dealer: Dealer) -> None:
     assert ask(dealer, "a") == ids(0, 1, 2)
     assert ask(dealer, "b") == ids(3, 4, 5)
 
 
 @given(n_commands=st.integers(1, 40), n_actors=st.integers(1, 9))
-def test_shares_are_even_and_leave_nothing(n_commands: int, n_actors: int) -> None:
+def test_shares_are_even_and_cover_all_commands(n_commands: int, n_actors: int) -> None:
     dealer = Dealer()
     dealer.add(command(index) for index in range(n_commands))
     names = [f"actor-{n}" for n in range(n_actors)]
@@ -72,12 +72,12 @@ def test_shares_are_even_and_leave_nothing(n_commands: int, n_actors: int) -> No
     assert max(map(len, dealt)) <= -(-n_commands // n_actors)
 
 
-def test_actor_gets_no_more_than_it_wants(dealer: Dealer) -> None:
+def test_actor_gets_at_most_what_it_wants(dealer: Dealer) -> None:
     assert ask(dealer, "a", wanted=2) == ids(0, 1)
     assert ask(dealer, "a", wanted=0, running=ids(0, 1)) == []
 
 
-def test_what_an_actor_runs_counts_towards_its_share(dealer: Dealer) -> None:
+def test_running_commands_count_towards_the_share(dealer: Dealer) -> None:
     running = ask(dealer, "a", wanted=2)
     assert ask(dealer, "a", running=running) == ids(2)
 
@@ -92,13 +92,13 @@ def test_command_waits_for_its_weights(dealer: Dealer) -> None:
     assert ask(dealer, "a", version=1) == ids(0, 1, 2)
 
 
-def test_commands_whose_weights_are_missing_do_not_hold_up_others(dealer: Dealer) -> None:
+def test_commands_with_missing_weights_do_not_block_others(dealer: Dealer) -> None:
     dealer.add([command(0, iteration=2, version=2)])
     assert ask(dealer, "a") + ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
     assert ask(dealer, "a", running=ids(0, 1, 2)) == []
 
 
-def test_full_answer_is_a_small_message() -> None:
+def test_largest_reply_is_a_small_message() -> None:
     dealer = Dealer()
     dealer.add(command(index) for index in range(2 * MAX_DEALT))
     dealer.join(join("a"), 0.0)
@@ -108,10 +108,10 @@ def test_full_answer_is_a_small_message() -> None:
     assert len(encode(CommandsReply(commands=tuple(commands)))) < SMALL
 
 
-# Actors that go, and replies that are lost.
+# Actors that leave, and lost replies.
 
 
-def test_commands_of_an_actor_that_is_gone_go_to_others(dealer: Dealer) -> None:
+def test_commands_of_a_removed_actor_go_to_others(dealer: Dealer) -> None:
     ask(dealer, "a")
     dealer.remove_actor("a")
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
@@ -128,7 +128,7 @@ def test_commands_of_a_lost_reply_are_dealt_again(dealer: Dealer) -> None:
     assert ask(dealer, "a", running=[]) == ids(0, 1, 2)
 
 
-def test_restarted_service_learns_what_actors_run(dealer: Dealer) -> None:
+def test_restarted_service_adopts_running_commands(dealer: Dealer) -> None:
     assert ask(dealer, "a", wanted=0, running=ids(4, 5)) == []
     assert ask(dealer, "b") == ids(0, 1, 2)
     assert dealer.holds("a", ids(4)[0])
@@ -151,14 +151,14 @@ def test_reruns_and_failures_are_counted_by_actor(dealer: Dealer) -> None:
     assert (dealer.actors["a"].reruns, dealer.actors["a"].failures) == (0, 0)
 
 
-def test_command_that_ran_before_a_restart_is_a_rerun_elsewhere(dealer: Dealer) -> None:
+def test_reassigned_command_of_before_a_restart_is_a_rerun(dealer: Dealer) -> None:
     ask(dealer, "a", wanted=0, running=ids(0))
     dealer.remove_actor("a")
     assert command(0).id in ask(dealer, "b")
     assert dealer.actors["b"].reruns == 1
 
 
-def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
+def test_silent_actor_is_removed(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     ask(dealer, "b", wanted=0, now=SILENCE_S)
     assert dealer.silent_actors(set(), SILENCE_S + 1) == ["a"]
@@ -167,14 +167,14 @@ def test_silent_actor_is_forgotten(dealer: Dealer) -> None:
     assert ask(dealer, "b") == ids(0, 1, 2, 3, 4, 5)
 
 
-def test_actor_that_delivers_is_not_silent(dealer: Dealer) -> None:
+def test_delivery_ends_an_actors_silence(dealer: Dealer) -> None:
     for name in ("a", "b", "stranger"):
         dealer.note_seen(name, SILENCE_S)
     assert dealer.silent_actors(set(), SILENCE_S + 1) == []
     assert list(dealer.actors) == ["a", "b"]
 
 
-def test_silent_actor_whose_token_is_alive_is_not_forgotten(dealer: Dealer) -> None:
+def test_silent_actor_with_a_presence_token_is_kept(dealer: Dealer) -> None:
     ask(dealer, "a", now=0.0)
     assert dealer.silent_actors({"a"}, SILENCE_S + 1) == ["b"]
 
@@ -184,7 +184,7 @@ def test_silent_actor_whose_token_is_alive_is_not_forgotten(dealer: Dealer) -> N
 
 @pytest.fixture
 def straggling(dealer: Dealer) -> Dealer:
-    """``a`` has one command since 0 s, all others are done; an episode takes 2 s."""
+    """``a`` has held one command since 0 s, all others are done; an episode takes 2 s."""
     first, *others = [c for name in ("a", "b") for c in ask(dealer, name)]
     for command_id in others:
         dealer.remove_command(command_id, now=2.0)
@@ -195,33 +195,33 @@ def straggling(dealer: Dealer) -> Dealer:
 OVERDUE = STRAGGLER * 2.0
 
 
-def test_straggler_goes_to_an_idle_actor_too(straggling: Dealer) -> None:
+def test_straggler_is_also_dealt_to_an_idle_actor(straggling: Dealer) -> None:
     assert ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0) == ids(0)
     assert straggling.holds("a", ids(0)[0])
 
 
-def test_straggler_is_given_time(straggling: Dealer) -> None:
+def test_straggler_is_not_dealt_again_too_early(straggling: Dealer) -> None:
     assert ask(straggling, "b", now=OVERDUE, spare_cores=1.0) == []
 
 
-def test_straggler_is_not_run_again_on_a_saturated_machine(straggling: Dealer) -> None:
+def test_straggler_is_not_dealt_again_on_a_saturated_machine(straggling: Dealer) -> None:
     assert ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=0.9) == []
 
 
-def test_straggler_is_not_run_again_by_an_actor_that_is_busy(straggling: Dealer) -> None:
+def test_straggler_is_not_dealt_again_to_a_busy_actor(straggling: Dealer) -> None:
     straggling.add([command(7)])
     ask(straggling, "b", wanted=1)
     busy = ask(straggling, "b", running=ids(7), now=OVERDUE + 0.1, spare_cores=1.0)
     assert busy == []
 
 
-def test_straggler_runs_on_two_actors_at_most(straggling: Dealer) -> None:
+def test_straggler_runs_on_at_most_two_actors(straggling: Dealer) -> None:
     straggling.join(join("c"), 0.0)
     ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0)
     assert ask(straggling, "c", now=100.0, spare_cores=1.0) == []
 
 
-def test_straggler_is_not_known_before_an_episode_has_come(dealer: Dealer) -> None:
+def test_there_are_no_stragglers_before_the_first_episode(dealer: Dealer) -> None:
     ask(dealer, "a")
     ask(dealer, "b", running=[])
     dealer.remove_actor("b")
@@ -231,7 +231,7 @@ def test_straggler_is_not_known_before_an_episode_has_come(dealer: Dealer) -> No
     assert ask(dealer, "b", now=1000.0, spare_cores=1.0) == []
 
 
-def test_straggler_whose_second_actor_dies_stays_with_the_first(straggling: Dealer) -> None:
+def test_straggler_stays_with_the_first_actor_if_the_second_dies(straggling: Dealer) -> None:
     ask(straggling, "b", now=OVERDUE + 0.1, spare_cores=1.0)
     straggling.remove_actor("b")
     assert straggling.holds("a", ids(0)[0])
@@ -252,12 +252,12 @@ def test_three_failures_on_two_actors_are_hopeless(dealer: Dealer) -> None:
     assert [fail(dealer, name) for name in "aba"] == [False, False, True]
 
 
-def test_failures_of_one_actor_may_be_its_own_fault(dealer: Dealer) -> None:
+def test_failures_on_one_of_two_actors_are_not_hopeless(dealer: Dealer) -> None:
     assert [fail(dealer, "a") for _ in range(5)] == [False] * 5
     assert fail(dealer, "b")
 
 
-def test_failures_of_the_only_actor_are_hopeless(dealer: Dealer) -> None:
+def test_failures_on_the_only_actor_are_hopeless(dealer: Dealer) -> None:
     dealer.remove_actor("b")
     assert [fail(dealer, "a") for _ in range(3)] == [False, False, True]
 
@@ -269,12 +269,12 @@ def test_failed_command_is_dealt_again(dealer: Dealer) -> None:
     assert ask(dealer, "b", wanted=1) == ids(0)
 
 
-# Actors that vanish with what they hold.
+# Actors that vanish together with their commands.
 
 
 @pytest.fixture
 def alone() -> Dealer:
-    """Three commands, of which the first was held by three actors that vanished."""
+    """Three commands; three actors vanished while they held the first."""
     dealer = Dealer()
     dealer.add(command(index) for index in range(3))
     for name in ("x", "y", "z"):
@@ -288,14 +288,14 @@ def alone() -> Dealer:
 
 
 def vanish(dealer: Dealer, name: str) -> bool:
-    """Let an actor die of the first command; say whether that makes it hopeless."""
+    """Let an actor vanish with the first command; return whether the command is hopeless then."""
     dealer.join(join(name), 0.0)
     assert ask(dealer, name) == ids(0)
     dealer.remove_actor(name)
     return dealer.is_hopeless(ids(0)[0])
 
 
-def test_command_of_three_vanished_actors_is_carried_out_alone(alone: Dealer) -> None:
+def test_suspect_command_is_dealt_alone(alone: Dealer) -> None:
     for name in ("a", "b"):
         alone.join(join(name), 0.0)
     assert ask(alone, "a") == ids(0)
@@ -303,7 +303,7 @@ def test_command_of_three_vanished_actors_is_carried_out_alone(alone: Dealer) ->
     assert ask(alone, "b") == ids(3, 4)
 
 
-def test_command_of_three_vanished_actors_waits_for_an_actor_without_work(alone: Dealer) -> None:
+def test_suspect_command_waits_for_an_idle_actor(alone: Dealer) -> None:
     alone.join(join("a"), 0.0)
     alone.add([command(7)])
     assert ask(alone, "a", running=ids(7)) == ids(3, 4, 5)
@@ -311,12 +311,12 @@ def test_command_of_three_vanished_actors_waits_for_an_actor_without_work(alone:
     assert ask(alone, "a") == ids(0)
 
 
-def test_command_of_three_vanished_actors_waits_for_its_weights(alone: Dealer) -> None:
+def test_suspect_command_waits_for_its_weights(alone: Dealer) -> None:
     alone.join(join("a"), 0.0)
     assert ask(alone, "a", version=0) == []
 
 
-def test_commands_that_are_carried_out_alone_and_succeed_are_done(dealer: Dealer) -> None:
+def test_suspect_commands_that_succeed_alone_are_done(dealer: Dealer) -> None:
     dealer.remove_actor("b")
     for name in ("a", "c", "d"):
         dealer.join(join(name), 0.0)
@@ -329,11 +329,11 @@ def test_commands_that_are_carried_out_alone_and_succeed_are_done(dealer: Dealer
     assert not dealer.outstanding
 
 
-def test_three_actors_that_vanish_with_nothing_else_are_hopeless(alone: Dealer) -> None:
+def test_suspect_command_is_hopeless_after_three_actors_vanish_with_it_alone(alone: Dealer) -> None:
     assert [vanish(alone, name) for name in "abc"] == [False, False, True]
 
 
-def test_vanished_actors_and_reported_failures_count_together(alone: Dealer) -> None:
+def test_vanished_actors_and_reported_failures_are_added(alone: Dealer) -> None:
     assert [vanish(alone, name) for name in "ab"] == [False, False]
     alone.join(join("c"), 0.0)
     assert ask(alone, "c") == ids(0)
@@ -341,13 +341,13 @@ def test_vanished_actors_and_reported_failures_count_together(alone: Dealer) -> 
     assert alone.is_hopeless(ids(0)[0])
 
 
-def test_actors_of_one_environment_are_given_three_more_tries() -> None:
+def test_actors_of_one_environment_get_three_more_attempts() -> None:
     dealer = Dealer()
     dealer.add([command(0)])
     assert [vanish(dealer, name) for name in "abcdef"] == [False] * 5 + [True]
 
 
-def test_actor_that_was_only_cut_off_has_not_vanished(alone: Dealer) -> None:
+def test_disconnected_actor_has_not_vanished(alone: Dealer) -> None:
     for _ in range(10):
         assert vanish(alone, "a") is False
         alone.join(join("a"), 0.0)
@@ -355,8 +355,8 @@ def test_actor_that_was_only_cut_off_has_not_vanished(alone: Dealer) -> None:
     assert alone.outstanding[ids(0)[0]].vanished.keys() == {"x", "y", "z"}
 
 
-def test_neighbours_of_a_deadly_command_are_never_blamed() -> None:
-    """One of eight commands ends every actor that begins it; the others always succeed."""
+def test_only_the_command_that_kills_actors_is_hopeless() -> None:
+    """One of eight commands ends every actor that runs it; the others always succeed."""
     dealer = Dealer()
     dealer.add(command(index) for index in range(8))
     (deadly,) = ids(5)
@@ -375,7 +375,7 @@ def test_neighbours_of_a_deadly_command_are_never_blamed() -> None:
 # Waiting.
 
 
-def test_larger_fleet_asks_less_often_and_not_at_once(dealer: Dealer) -> None:
+def test_retry_delay_grows_with_the_fleet_and_is_jittered(dealer: Dealer) -> None:
     few = [dealer.retry_after_s() for _ in range(100)]
     for number in range(100):
         dealer.join(join(f"actor-{number}"), 0.0)
@@ -385,7 +385,7 @@ def test_larger_fleet_asks_less_often_and_not_at_once(dealer: Dealer) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 5)), max_size=30))
-def test_iteration_is_left_with_what_is_outstanding(steps: list[tuple[str, int]]) -> None:
+def test_outstanding_commands_are_counted_by_iteration(steps: list[tuple[str, int]]) -> None:
     dealer = Dealer()
     dealer.add(command(index) for index in range(6))
     for name, index in steps:

@@ -1,4 +1,4 @@
-"""Peers whose words would forge a line of the log, or take over the terminal that shows it."""
+"""Peers cannot forge log lines or control the terminal with the text that they send."""
 
 import logging
 import threading
@@ -26,7 +26,7 @@ RUN = "synthetic"
 
 @pytest.fixture
 def transport(tmp_path: Path) -> Iterator[MemoryTransport]:
-    """Reaches a replay service that is served."""
+    """Connects to a replay service that is running."""
     with ExitStack() as stack:
         store = stack.enter_context(closing(create(tmp_path)))
         transport, stop = MemoryTransport(Exchange()), threading.Event()
@@ -39,8 +39,8 @@ def transport(tmp_path: Path) -> Iterator[MemoryTransport]:
         yield transport
 
 
-def tell_everything(transport: MemoryTransport) -> Status:
-    """Say something hostile wherever text can be said; return what the run says of itself."""
+def send_hostile_text(transport: MemoryTransport) -> Status:
+    """Send hostile text in every field that has text; return the status of the run."""
     asker = Asker(transport, RUN, "the test", patience_s=10.0)
     unknown = encode(CommandsRequest(actor="a", wanted=1)).replace(b"wanted", b"\n\x1b[2Jw")
     for _ in range(2):
@@ -60,15 +60,15 @@ def tell_everything(transport: MemoryTransport) -> Status:
     return asker.ask(verbs.STATUS, StatusRequest())
 
 
-def test_nothing_that_peers_say_forges_a_line_of_the_log(
+def test_hostile_text_forges_no_log_line(
     transport: MemoryTransport, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO, "udrl"):
-        status = tell_everything(transport)
-    said = [record.getMessage() for record in caplog.records]
+        status = send_hostile_text(transport)
+    logged = [record.getMessage() for record in caplog.records]
     for part in ("joined from no", " connected", " disconnected", "invalid commands: ",
                  "refused join: ", "failed on command", "failed three times"):  # fmt: skip
-        assert any(part in line for line in said), part
-    assert [line for line in said if not line.isprintable()] == []
+        assert any(part in line for line in logged), part
+    assert [line for line in logged if not line.isprintable()] == []
     assert status.state == "failed"
     assert status.problem.isprintable()

@@ -15,28 +15,28 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield made
 
 
-def test_offences_are_counted_by_actor_and_their_memory_is_bounded(store: Store) -> None:
+def test_offences_are_counted_by_actor_in_bounded_memory(store: Store) -> None:
     quarantine = Quarantine(store)
     assert [quarantine.count("a") for _ in range(OFFENCES)] == [False] * (OFFENCES - 1) + [True]
     for i in range(5000):
         assert not quarantine.count(f"b{i}")
     assert len(quarantine._offences) <= 1000
-    assert quarantine.count("a"), "who offends most is not forgotten for others"
+    assert quarantine.count("a"), "the worst offender must not be forgotten"
 
 
-def test_who_is_shut_out_is_remembered_by_the_store_and_told_why(store: Store) -> None:
+def test_quarantine_is_stored_with_its_reason(store: Store) -> None:
     quarantine = Quarantine(store)
     assert "a" not in quarantine
     quarantine.add("a", "it lied")
     again = Quarantine(store)
     assert "a" in again
-    assert not again.count("a"), "what it does now does not count any more"
+    assert not again.count("a"), "later offences must not count"
     refusal = again.refusal("a")
     assert refusal.code == "quarantined"
     assert "it lied" in str(refusal)
 
 
-def test_what_is_remembered_is_bounded(store: Store) -> None:
+def test_number_of_stored_quarantines_is_bounded(store: Store) -> None:
     quarantine = Quarantine(store)
     with store.transaction():
         for i in range(1001):

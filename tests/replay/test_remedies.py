@@ -1,4 +1,4 @@
-"""What a service is told to do when it cannot write."""
+"""Remedies for errors of writing."""
 
 import resource
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ MORE_FILES = "raise the limit of open files, e.g. ulimit -n 4096"
 
 @contextmanager
 def no_more_files() -> Iterator[None]:
-    """Let this process open none."""
+    """Exhaust this process's file descriptors."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
     try:
@@ -29,7 +29,7 @@ def no_more_files() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_too_many_open_files_are_named_and_not_the_disk(tmp_path: Path) -> None:
+def test_too_many_open_files_are_not_reported_as_a_full_disk(tmp_path: Path) -> None:
     with closing(create(tmp_path)) as store:
         pass
     for read_only in (False, True):
@@ -43,12 +43,12 @@ def test_too_many_open_files_are_named_and_not_the_disk(tmp_path: Path) -> None:
             create(tmp_path / "another")
 
 
-def test_full_disk_is_named(tmp_path: Path) -> None:
+def test_full_disk_is_reported(tmp_path: Path) -> None:
     error = unwritable(tmp_path / "file", OSError(28, "No space left on device"))
     assert "No space left on device; free some disk space, and restart with" in str(error)
 
 
-def test_service_that_runs_needs_no_more_files(tmp_path: Path) -> None:
+def test_running_service_opens_no_more_files(tmp_path: Path) -> None:
     with (
         closing(create(tmp_path)) as store,
         closing(MetricsFile(tmp_path, store)) as metrics,

@@ -1,4 +1,4 @@
-"""What a run tells about itself: status, who waits for whom, and ``metrics.csv``."""
+"""Reports of a run: status, waits, and ``metrics.csv``."""
 
 import csv
 import math
@@ -37,7 +37,7 @@ def shown(run: StoredRun, now: float = 0.0) -> Status:
 # Status.
 
 
-def test_status_of_a_new_run_is_empty_but_complete(make_run: MakeRun) -> None:
+def test_status_of_a_new_run_is_complete(make_run: MakeRun) -> None:
     seen = shown(make_run())
     assert (seen.state, seen.iteration, seen.env_steps) == ("running", 0, 0)
     assert (seen.buffer.episodes, seen.buffer.return_mean) == (0, None)
@@ -52,7 +52,7 @@ def test_useful_concurrency_grows_with_the_lead(make_run: MakeRun) -> None:
     assert shown(make_run(lead=3)).useful_concurrency == 4 * config().commands.n_episodes_per_iter
 
 
-def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
+def test_status_of_an_ended_run_has_the_reason(make_run: MakeRun) -> None:
     run = make_run(lead=1, max_env_steps=40)
     finish(run)
     seen = shown(run)
@@ -74,7 +74,7 @@ def test_status_of_an_ended_run_says_how_it_ended(make_run: MakeRun) -> None:
     assert decode(encode(seen), Status) == seen
 
 
-def test_status_shows_every_actor_as_its_last_request_described_it(make_run: MakeRun) -> None:
+def test_status_lists_actors_by_their_last_request(make_run: MakeRun) -> None:
     run = make_run(max_env_steps=1000)
     work(run)
     work(run)
@@ -91,7 +91,7 @@ def test_status_shows_every_actor_as_its_last_request_described_it(make_run: Mak
     assert seen.weights_lag == second.weights_lag == run.progress.latest_version
 
 
-def test_status_counts_what_was_delivered_twice_or_wrongly(make_run: MakeRun) -> None:
+def test_status_counts_duplicates_and_rejected_episodes(make_run: MakeRun) -> None:
     run = make_run()
     command = next(iter(run.dealer.outstanding.values())).command
     for _ in range(3):
@@ -102,7 +102,7 @@ def test_status_counts_what_was_delivered_twice_or_wrongly(make_run: MakeRun) ->
     assert (seen.delivered, seen.accepted, seen.duplicate, seen.rejected) == (4, 1, 2, 1)
 
 
-def test_digest_of_the_replay_covers_its_order_and_content(make_run: MakeRun) -> None:
+def test_replay_digest_covers_order_and_content(make_run: MakeRun) -> None:
     run = make_run()
     before = shown(run).replay_sha256
     work(run)
@@ -123,7 +123,7 @@ def test_throughput_is_the_mean_of_ten_seconds() -> None:
     assert throughput.per_second(20.0) == pytest.approx(110.0)
 
 
-def test_throughput_ends_with_the_episodes() -> None:
+def test_throughput_decreases_without_episodes() -> None:
     throughput = Throughput()
     assert throughput.per_second(0.0) == 0.0
     throughput.add(0.0, 100)
@@ -131,7 +131,7 @@ def test_throughput_ends_with_the_episodes() -> None:
     assert throughput.per_second(10.1) == 0.0
 
 
-def test_throughput_of_the_first_moment_is_not_infinite() -> None:
+def test_throughput_of_the_first_moment_is_finite() -> None:
     throughput = Throughput()
     throughput.add(5.0, 100)
     assert throughput.per_second(5.0) == 100.0
@@ -140,7 +140,7 @@ def test_throughput_of_the_first_moment_is_not_infinite() -> None:
 # Waits.
 
 
-def test_wait_for_the_same_goes_on() -> None:
+def test_wait_for_the_same_reason_continues() -> None:
     waits = Waits()
     waits.begin("actor a", "learner", "weights version 3", 10.0)
     waits.begin("actor a", "learner", "weights version 3", 12.0)
@@ -149,14 +149,14 @@ def test_wait_for_the_same_goes_on() -> None:
     )
 
 
-def test_wait_for_something_else_begins_anew() -> None:
+def test_wait_for_another_reason_starts_again() -> None:
     waits = Waits()
     waits.begin("actor a", "learner", "weights version 3", 10.0)
     waits.begin("actor a", "learner", "weights version 4", 12.0)
     assert [w.seconds for w in waits.list(15.0)] == [3.0]
 
 
-def test_wait_that_ended_is_not_listed() -> None:
+def test_ended_wait_is_not_listed() -> None:
     waits = Waits()
     for who in ("b", "a"):
         waits.begin(who, "learner", "", 0.0)
@@ -179,7 +179,7 @@ def write_metrics(run: StoredRun, run_dir: Path) -> None:
         metrics.update(run.progress.iteration)
 
 
-def test_every_iteration_has_one_line(make_run: MakeRun, tmp_path: Path) -> None:
+def test_every_iteration_has_one_row(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(lead=1, max_env_steps=60)
     with closing(MetricsFile(tmp_path, run.store)) as metrics:
         assert (tmp_path / "metrics.csv").read_text() == ",".join(COLUMNS) + "\n"
@@ -194,7 +194,7 @@ def test_every_iteration_has_one_line(make_run: MakeRun, tmp_path: Path) -> None
     assert all(tuple(line) == COLUMNS for line in found)
 
 
-def test_line_of_an_evaluated_iteration_carries_the_evaluation(
+def test_row_of_an_evaluated_iteration_has_the_evaluation(
     make_run: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(max_env_steps=60)
@@ -206,13 +206,13 @@ def test_line_of_an_evaluated_iteration_carries_the_evaluation(
     line = found[evaluation.iteration]
     assert float(line["eval_mean"]) == evaluation.evaluation.mean
     assert float(line["eval_ci95_low"]) == evaluation.evaluation.ci95_low
-    # The evaluated weights are those of the buffer before, whose env steps the line carries.
+    # The evaluated weights were trained on the previous buffer, whose env steps the row has.
     before = found[int(line["weights_version"]) - 1]
     assert line["eval_at_env_steps"] == before["env_steps"]
     assert found[0]["eval_mean"] == found[0]["loss"] == ""
 
 
-def test_metrics_of_a_resumed_run_are_those_of_one_that_never_stopped(
+def test_metrics_of_a_resumed_run_equal_those_of_an_uninterrupted_one(
     make_run: MakeRun, reopened: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(lead=2, max_env_steps=30)
@@ -234,10 +234,10 @@ def test_waits_are_bounded() -> None:
     assert len(waits.list(1.0)) == 10_000
 
 
-# History and contents, for whoever draws pictures.
+# History and contents, for plots.
 
 
-def test_history_is_what_the_metrics_say(make_run: MakeRun, tmp_path: Path) -> None:
+def test_history_equals_the_metrics(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(lead=1, max_env_steps=60)
     finish(run)
     write_metrics(run, tmp_path)
@@ -258,7 +258,7 @@ def test_history_is_what_the_metrics_say(make_run: MakeRun, tmp_path: Path) -> N
     assert 0 < sum(r.admitted for r in found.iterations) <= run.progress.accepted
 
 
-def test_history_comes_in_pages(make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_history_is_paginated(make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
     run = make_run(max_env_steps=60)
     finish(run)
     whole = history(run.store, -1)
@@ -276,7 +276,7 @@ def test_history_comes_in_pages(make_run: MakeRun, monkeypatch: pytest.MonkeyPat
     assert history(run.store, after) == History(iterations=(), evaluations=(), more=False)
 
 
-def test_contents_are_the_buffer_and_what_is_drawn_from_it(make_run: MakeRun) -> None:
+def test_contents_have_the_buffer_and_the_commands_drawn_from_it(make_run: MakeRun) -> None:
     run = make_run(lead=1)
     empty = contents(run)
     assert (empty.returns, empty.desired_return, empty.desired_horizon) == ((), None, None)
@@ -290,16 +290,16 @@ def test_contents_are_the_buffer_and_what_is_drawn_from_it(make_run: MakeRun) ->
     best = run.buffer.best(run.config.commands.last_few)
     mean = math.fsum(e.episode_return for e in best) / len(best)
     assert found.desired_return == pytest.approx(mean)
-    asked = [
+    dealt = [
         (o.command.desired_return, o.command.desired_horizon)
         for o in run.dealer.outstanding.values() if o.command.kind == "explore"
     ]  # fmt: skip
-    assert asked
-    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == asked
+    assert dealt
+    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == dealt
     assert set(found.versions) == set(run.store.versions_kept())
 
 
-def test_of_many_episodes_every_so_many_are_shown(
+def test_large_buffers_are_sampled_evenly(
     make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = make_run()
@@ -310,7 +310,7 @@ def test_of_many_episodes_every_so_many_are_shown(
     returns = [e.episode_return for e in run.buffer]
     assert len(returns) > 3
     assert len(found.returns) <= 3
-    assert found.returns[-1] == returns[-1], "the best is always shown"
+    assert found.returns[-1] == returns[-1], "the best episode must be included"
     assert list(found.returns) == sorted(found.returns)
 
 

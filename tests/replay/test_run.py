@@ -1,4 +1,4 @@
-"""The run as a state machine: whatever happens, and in whatever order, the result is the same."""
+"""The run as a state machine: its result does not depend on faults or on the order of events."""
 
 import tempfile
 from collections.abc import Callable
@@ -47,18 +47,18 @@ from udrl_replay.run import StoredRun
 from udrl_replay.run_state import RunState
 from udrl_replay.store import Store, Version
 
-#: Env steps after which every run of the machine ends at last.
+#: Env steps at which every run of the machine ends.
 FINAL = 60
-#: Where a file is synced at once: on a disk this takes ten times as long.
+#: A file system that syncs at once; a disk takes ten times as long.
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 class Died(Exception):
-    """The process ends in the middle of a transaction."""
+    """The process dies in the middle of a transaction."""
 
 
 class RunMachine(RuleBasedStateMachine):
-    """Actors, a learner and a replay process that do everything they can do, in any order."""
+    """Actors, a learner and a replay service, whose operations happen in any order."""
 
     @initialize(
         lead=st.integers(0, 3),
@@ -132,8 +132,8 @@ class RunMachine(RuleBasedStateMachine):
         assert self.deliver(arrival) == expected
 
     @rule(rounds=st.integers(1, 4), share=st.integers(1, 3))
-    def everybody_works(self, rounds: int, share: int) -> None:
-        """Carry out a part of what can be, which takes the run further than single steps do."""
+    def all_services_work(self, rounds: int, share: int) -> None:
+        """Run a share of the available commands, to get further than single steps do."""
         for _ in range(rounds):
             if self.run.awaits_version() is not None:
                 self.learner_delivers()
@@ -164,7 +164,7 @@ class RunMachine(RuleBasedStateMachine):
         assert not (other and known and self.run.progress.exact)
 
     @rule(iteration=st.integers(0, 3), index=st.integers(6, FINAL_EVALUATION - 1))
-    def actor_delivers_what_nobody_wants(self, iteration: int, index: int) -> None:
+    def actor_delivers_an_unknown_command(self, iteration: int, index: int) -> None:
         unknown = Command(
             id=iteration * COMMANDS_PER_ITERATION + index,
             kind="explore",
@@ -245,15 +245,15 @@ class RunMachine(RuleBasedStateMachine):
         budget = self.budget(min(self.run.budget.max_env_steps + more, FINAL))
         self.run = reopen(self.run, self.run_dir, budget)
         if self.run.progress.state == "running":
-            # Evaluations that closed the run before are forgotten.
+            # The evaluations of the earlier end are discarded.
             self.accepted = {
                 i: a for i, a in self.accepted.items() if a[0].index < FINAL_EVALUATION
             }
 
-    # What is true at every moment.
+    # Invariants.
 
     @invariant()
-    def nothing_is_created_or_lost(self) -> None:
+    def ledgers_balance(self) -> None:
         shown = status(self.run, Throughput(), Waits(), 0.0, self.now)
         assert_conserved(shown)
         assert shown.episodes.accepted >= len(self.accepted)
@@ -267,7 +267,7 @@ class RunMachine(RuleBasedStateMachine):
         assert sorted(self.run.digests) == sorted(e.id for e in self.run.buffer)
 
     @invariant()
-    def earlier_buffers_can_be_asked_for(self) -> None:
+    def earlier_buffers_are_available(self) -> None:
         for iteration in self.needed_buffers():
             ids = [p.entry.id for p in self.run.store.buffer(iteration)]
             assert ids == [e.id for e in self.best(iteration)]
@@ -281,7 +281,7 @@ class RunMachine(RuleBasedStateMachine):
                 weights_of(self.run, command)
 
     @invariant()
-    def everything_is_on_disk(self) -> None:
+    def progress_is_on_disk(self) -> None:
         assert self.run.store.fact("progress", RunProgress) == self.run.progress
 
     @invariant()
@@ -290,12 +290,12 @@ class RunMachine(RuleBasedStateMachine):
         assert store._rows("SELECT id FROM bodies") == store._rows("SELECT id FROM episodes")
 
     def needed_buffers(self) -> range:
-        """Return the iterations after which the buffer may still be asked for."""
+        """Return the iterations after which the buffer may still be requested."""
         latest, iteration = self.run.progress.latest_version, self.run.progress.iteration
         return range(min(latest, iteration), iteration + 1)
 
     def best(self, iteration: int) -> list[Entry]:
-        """Return the buffer after an iteration, from all that was ever accepted."""
+        """Return the buffer after an iteration, computed from all accepted episodes."""
         held: list[Entry] = []
         settings = config().buffer
         for i in range(iteration + 1):
@@ -306,7 +306,7 @@ class RunMachine(RuleBasedStateMachine):
         return sorted(held)
 
     def check_collected(self) -> None:
-        """A version has arrived: nothing is kept that nobody can ask for."""
+        """Check after a version that everything unneeded was deleted."""
         store, progress = self.run.store, self.run.progress
         wanted = {p.entry.id for i in self.needed_buffers() for p in store.buffer(i)}
         wanted |= store.pending_ids()
@@ -342,7 +342,7 @@ def assert_conserved(shown: Status) -> None:
     assert episodes.delivered == episodes.accepted + episodes.duplicate + episodes.rejected
 
 
-# The same, one thing at a time.
+# Single cases.
 
 MakeRun = Callable[..., StoredRun]
 
@@ -359,7 +359,7 @@ def deliver(run: StoredRun, command: Command, other: bool = False) -> str:
             run.save()
 
 
-def until_closing(run: StoredRun) -> None:
+def work_until_final_evaluation(run: StoredRun) -> None:
     """Work until only the final evaluation is left."""
     while run.progress.state == "running":
         work(run)
@@ -391,7 +391,7 @@ def test_run_equals_the_reference(lead: int, max_env_steps: int, make_run: MakeR
     assert result(run) == reference(lead, max_env_steps)
 
 
-def test_reopened_run_issues_nothing_again(make_run: MakeRun, reopened: MakeRun) -> None:
+def test_reopened_run_issues_no_command_twice(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run()
     before = outstanding(run)
     run = reopened(run)
@@ -407,7 +407,7 @@ def test_second_delivery_is_a_duplicate(make_run: MakeRun) -> None:
     assert run.progress.exact
 
 
-def test_other_episode_of_a_command_is_a_duplicate_that_marks_the_run(make_run: MakeRun) -> None:
+def test_different_episode_of_a_command_is_a_duplicate_and_marks_the_run(make_run: MakeRun) -> None:
     run = make_run()
     command = outstanding(run)[0]
     deliver(run, command)
@@ -416,7 +416,7 @@ def test_other_episode_of_a_command_is_a_duplicate_that_marks_the_run(make_run: 
     assert f"command {command.id} and their episodes differ" in run.progress.inexact_reason
 
 
-def test_longer_episode_than_the_command_allows_leaves_it_outstanding(make_run: MakeRun) -> None:
+def test_episode_above_max_steps_is_rejected_and_stays_outstanding(make_run: MakeRun) -> None:
     run = make_run()
     command = next(c for c in outstanding(run) if len(episode(c, b"").rewards) > 1)
     run.dealer.outstanding[command.id].command = replace(command, max_steps=1)
@@ -426,7 +426,7 @@ def test_longer_episode_than_the_command_allows_leaves_it_outstanding(make_run: 
     assert command.id in run.dealer.outstanding
 
 
-def test_warm_up_that_spends_the_budget_ends_the_run(make_run: MakeRun) -> None:
+def test_warm_up_that_exhausts_the_budget_ends_the_run(make_run: MakeRun) -> None:
     run = make_run(max_env_steps=1)
     for command in outstanding(run):
         deliver(run, command)
@@ -434,13 +434,13 @@ def test_warm_up_that_spends_the_budget_ends_the_run(make_run: MakeRun) -> None:
     assert run.awaits_version() is None
 
 
-def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) -> None:
+def test_final_evaluation_has_the_final_weights_and_fresh_seeds(make_run: MakeRun) -> None:
     run = make_run(lead=2, max_env_steps=20)
     seeds = set()
     while run.progress.state == "running":
         seeds |= {c.environment_seed for c in outstanding(run)}
         work(run)
-    until_closing(run)
+    work_until_final_evaluation(run)
     final = run.progress.iteration
     assert [c.id for c in outstanding(run)] == [
         final * COMMANDS_PER_ITERATION + FINAL_EVALUATION + n
@@ -450,15 +450,15 @@ def test_run_closes_with_the_final_weights_and_fresh_seeds(make_run: MakeRun) ->
     assert seeds.isdisjoint(c.environment_seed for c in outstanding(run))
 
 
-def test_closing_episode_delivered_again_is_a_duplicate(make_run: MakeRun) -> None:
+def test_repeated_episode_of_the_final_evaluation_is_a_duplicate(make_run: MakeRun) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     final = outstanding(run)
     assert [deliver(run, c) for c in final + final] == ["accepted"] * 2 + ["duplicate"] * 2
     assert run.progress.state == "ended"
 
 
-def test_cancelled_command_is_refused_until_the_run_goes_on(
+def test_cancelled_command_is_refused_until_the_run_is_resumed(
     make_run: MakeRun, reopened: MakeRun
 ) -> None:
     run = make_run(lead=1, max_env_steps=20)
@@ -470,9 +470,7 @@ def test_cancelled_command_is_refused_until_the_run_goes_on(
     assert deliver(run, cancelled) == "accepted"
 
 
-def test_resumed_run_completes_what_had_arrived_before_its_end(
-    make_run: MakeRun, reopened: MakeRun
-) -> None:
+def test_resumed_run_completes_the_pending_episodes(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run(lead=1)
     work(run)
     budget = run.progress.env_steps + 1  # iteration 1 reaches it
@@ -494,7 +492,9 @@ def test_evaluation_that_reaches_the_stop_return_ends_the_run(make_run: MakeRun)
     assert evaluation.iteration == run.progress.iteration == 1
 
 
-def test_run_says_why_it_ended(make_run: MakeRun, reopened: MakeRun, tmp_path: Path) -> None:
+def test_run_has_the_reason_of_its_end(
+    make_run: MakeRun, reopened: MakeRun, tmp_path: Path
+) -> None:
     run = make_run(stop_return=0.0)
     assert run.progress.why_ended() == ""
     finish(run)
@@ -507,18 +507,18 @@ def test_run_says_why_it_ended(make_run: MakeRun, reopened: MakeRun, tmp_path: P
     assert read_status(tmp_path).ended_because == run.progress.why_ended()
 
 
-def test_failed_run_says_why(make_run: MakeRun, tmp_path: Path) -> None:
+def test_failed_run_has_the_reason(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run()
     for actors in ("ab", "a"):
         fail(run, 2, *actors)
     assert read_status(tmp_path).ended_because.startswith("failed: command 2 failed three times: ")
 
 
-def test_run_that_was_stopped_is_told_from_one_that_was_killed(
+def test_stopped_run_differs_from_a_killed_one(
     make_run: MakeRun, reopened: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     with run.store.transaction():
         run.save()
     assert read_status(tmp_path).state == "stopped"
@@ -545,7 +545,7 @@ def test_best_version_is_kept(make_run: MakeRun) -> None:
     assert version.weights
 
 
-def test_so_many_of_the_evaluated_versions_are_kept(
+def test_keep_versions_limits_the_evaluated_versions(
     make_run: MakeRun, reopened: MakeRun, tmp_path: Path
 ) -> None:
     run = make_run(lead=1, max_env_steps=120, keep_versions=2)
@@ -564,7 +564,7 @@ def test_so_many_of_the_evaluated_versions_are_kept(
     assert result(run) == reference(1, 200)
 
 
-def test_version_with_other_values_is_refused_with_both_digests(make_run: MakeRun) -> None:
+def test_different_version_is_refused_with_both_digests(make_run: MakeRun) -> None:
     run = make_run()
     work(run)
     version = train_next(run)
@@ -595,7 +595,7 @@ def test_three_failures_on_two_actors_stop_the_run(make_run: MakeRun) -> None:
     )
 
 
-def test_failure_that_is_reported_again_counts_once(make_run: MakeRun) -> None:
+def test_repeated_failure_counts_once(make_run: MakeRun) -> None:
     run = make_run()
     fail(run, 2, "a")
     for _ in range(3):
@@ -604,7 +604,7 @@ def test_failure_that_is_reported_again_counts_once(make_run: MakeRun) -> None:
     assert run.progress.state == "running"
 
 
-def test_failed_run_tries_again_when_it_is_resumed(make_run: MakeRun, reopened: MakeRun) -> None:
+def test_failed_run_retries_when_it_is_resumed(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run(max_env_steps=20)
     fail(run, 2, "a", "b")
     fail(run, 2, "a")
@@ -614,9 +614,9 @@ def test_failed_run_tries_again_when_it_is_resumed(make_run: MakeRun, reopened: 
     assert result(run) == reference(0, 20)
 
 
-def test_failed_final_evaluation_is_tried_again(make_run: MakeRun, reopened: MakeRun) -> None:
+def test_failed_final_evaluation_is_retried(make_run: MakeRun, reopened: MakeRun) -> None:
     run = make_run(max_env_steps=20)
-    until_closing(run)
+    work_until_final_evaluation(run)
     for actors in ("ab", "a"):
         fail(run, outstanding(run)[0].id, *actors)
     assert run.progress.state == "failed"
@@ -627,7 +627,7 @@ def test_failed_final_evaluation_is_tried_again(make_run: MakeRun, reopened: Mak
 
 
 def vanish(run: StoredRun, *actors: str) -> set[int]:
-    """Let actors get commands and vanish, one after the other; return what the last one held."""
+    """Let actors get commands and vanish, one after the other; return the last one's commands."""
     for name in actors:
         run.dealer.join(join(name), 0.0)
         request = CommandsRequest(actor=name, wanted=100)
@@ -638,7 +638,7 @@ def vanish(run: StoredRun, *actors: str) -> set[int]:
     return {command.id for command in held}
 
 
-def test_command_that_ends_its_actors_stops_the_run_and_is_named(
+def test_command_that_kills_its_actors_stops_the_run(
     make_run: MakeRun, reopened: MakeRun, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = make_run(max_env_steps=20)
@@ -657,13 +657,13 @@ def test_command_that_ends_its_actors_stops_the_run_and_is_named(
     assert result(run) == reference(0, 20)
 
 
-def test_end_of_an_actor_that_never_joined_is_no_news(make_run: MakeRun) -> None:
+def test_removal_of_an_unknown_actor_has_no_effect(make_run: MakeRun) -> None:
     run = make_run()
     run.remove_actor("stranger")
     assert run.progress.state == "running"
 
 
-def test_run_that_is_only_looked_at_writes_nothing(make_run: MakeRun, tmp_path: Path) -> None:
+def test_read_only_run_writes_nothing(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(max_env_steps=20)
     finish(run)
     with closing(Store(tmp_path, read_only=True)) as store:

@@ -1,4 +1,4 @@
-"""The file of a run: whole or not there, one writer, and never silently wrong."""
+"""The file of a run: atomic creation, one writer, transactions."""
 
 import sqlite3
 from collections.abc import Callable
@@ -26,13 +26,13 @@ def store(stack: ExitStack, tmp_path: Path) -> Store:
 # Creation.
 
 
-def test_new_file_holds_its_facts_at_once(tmp_path: Path) -> None:
+def test_new_file_has_its_facts(tmp_path: Path) -> None:
     with closing(Store.create(tmp_path, answer=42)) as store:
         assert store.fact("answer", int) == 42
     assert not list(tmp_path.glob("*.new"))
 
 
-def test_creation_that_fails_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_creation_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def rename(self: Path, target: Path) -> Path:
         raise OSError("no space left")
 
@@ -53,13 +53,13 @@ def test_existing_run_is_not_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / FILE).read_bytes() == before
 
 
-def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_folder_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StoreError, match=r"run directory .*file/run: .*use a writable directory"):
         create(tmp_path / "file" / "run")
 
 
-def test_folder_without_a_run_is_named(tmp_path: Path) -> None:
+def test_folder_without_a_run_is_reported(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=rf"{tmp_path} holds no run \({FILE} is missing\)"):
         Store(tmp_path)
 
@@ -72,7 +72,7 @@ def test_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
     assert (tmp_path / name / FILE).exists()
 
 
-# Who may open it.
+# Locks and permissions.
 
 
 def test_second_writer_is_refused(store: Store, tmp_path: Path) -> None:
@@ -82,12 +82,12 @@ def test_second_writer_is_refused(store: Store, tmp_path: Path) -> None:
         create(tmp_path)
 
 
-def test_file_is_free_again_after_its_writer_closed_it(store: Store, tmp_path: Path) -> None:
+def test_file_can_be_reopened_after_its_writer_closed_it(store: Store, tmp_path: Path) -> None:
     store.close()
     Store(tmp_path).close()
 
 
-def test_reader_beside_a_writer_sees_one_moment(store: Store, tmp_path: Path) -> None:
+def test_reader_sees_a_consistent_snapshot(store: Store, tmp_path: Path) -> None:
     with closing(Store(tmp_path, read_only=True)) as reader:
         with store.transaction():
             store.set_fact("answer", 42)
@@ -105,13 +105,13 @@ def test_reader_cannot_write(store: Store, tmp_path: Path) -> None:
         reader.set_fact("answer", 42)
 
 
-def test_file_of_another_schema_is_refused(tmp_path: Path) -> None:
+def test_file_of_another_schema_is_rejected(tmp_path: Path) -> None:
     create(tmp_path).close()
     edit(tmp_path / FILE, "UPDATE facts SET value = '99' WHERE name = 'schema'")
     other = f"schema 99, this version of udrl reads {SCHEMA}; use"
     with pytest.raises(OtherConfiguration, match=other):
         Store(tmp_path)
-    # The refusal has let go of the lock.
+    # The failed attempt has released the lock.
     edit(tmp_path / FILE, "UPDATE facts SET value = ? WHERE name = 'schema'", b"%d" % SCHEMA)
     Store(tmp_path).close()
 
@@ -123,7 +123,7 @@ class Stop(Exception):
     pass
 
 
-def test_transaction_that_is_left_by_an_error_changes_nothing(store: Store) -> None:
+def test_transaction_that_raises_changes_nothing(store: Store) -> None:
     with suppress(Stop), store.transaction():
         store.set_fact("answer", 42)
         raise Stop
@@ -135,7 +135,7 @@ def test_transaction_that_is_left_by_an_error_changes_nothing(store: Store) -> N
 
 
 def limit_size(store: Store, more_pages: int) -> None:
-    """Let the file grow by so many pages and no further, as if the disk were full then."""
+    """Limit the growth of the file, as a full disk does."""
     (pages,) = store._db.execute("PRAGMA page_count").fetchone()
     store._db.execute(f"PRAGMA max_page_count = {pages + more_pages}")
 
@@ -146,7 +146,7 @@ def write(store: Store) -> None:
         store.add_version(Version(1, b"d", 0.5, BLOB, BLOB), 0.1)
 
 
-def test_full_disk_is_reported_and_nothing_is_half_written(store: Store) -> None:
+def test_full_disk_is_reported_and_rolls_back(store: Store) -> None:
     limit_size(store, 3)
     with pytest.raises(StoreError, match=r"disk is full; nothing acknowledged is lost: free some"):
         write(store)
@@ -158,7 +158,7 @@ def test_full_disk_is_reported_and_nothing_is_half_written(store: Store) -> None
     assert store.version(1) == Version(1, b"d", 0.5, BLOB, BLOB)
 
 
-def test_run_goes_on_after_a_full_disk_as_if_it_had_not_been_full(tmp_path: Path) -> None:
+def test_run_resumes_after_a_full_disk_with_the_same_result(tmp_path: Path) -> None:
     with closing(create(tmp_path)) as store:
         run = StoredRun(store, Budget(max_env_steps=600))
         work(run)
@@ -171,7 +171,7 @@ def test_run_goes_on_after_a_full_disk_as_if_it_had_not_been_full(tmp_path: Path
         assert result(run) == reference(0, 600)
 
 
-# What it keeps.
+# Queries.
 
 
 def test_page_of_episodes_is_bounded_but_never_empty(store: Store, tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_page_of_episodes_is_bounded_but_never_empty(store: Store, tmp_path: Pat
     assert store.episode_bodies(ids, 1) == bodies[:1]
 
 
-def test_page_of_episodes_ends_before_one_that_is_not_kept(store: Store) -> None:
+def test_page_of_episodes_ends_before_a_missing_one(store: Store) -> None:
     run = StoredRun(store, Budget(max_env_steps=1000))
     work(run)
     first, second, *_ = [e.id for e in run.buffer]
@@ -192,7 +192,7 @@ def test_page_of_episodes_ends_before_one_that_is_not_kept(store: Store) -> None
     assert store.episode_bodies([999], LARGEST) == []
 
 
-def test_last_evaluation_is_of_its_sort(store: Store) -> None:
+def test_last_evaluation_is_of_the_requested_kind(store: Store) -> None:
     assert store.last_evaluation(is_final=False) is None
     rows = [
         EvaluationRow(iteration, closing, 10 * iteration, 1.5, 3, summarise([1.0, 2.0]))
@@ -205,7 +205,7 @@ def test_last_evaluation_is_of_its_sort(store: Store) -> None:
     assert store.last_evaluation(is_final=True) == rows[2]
 
 
-def test_forgotten_blobs_leave_digest_and_loss(store: Store) -> None:
+def test_dropped_weights_leave_digest_and_loss(store: Store) -> None:
     with store.transaction():
         store.add_version(Version(3, b"digest", 0.25, b"w", b"o"), 0.1)
         store.drop_weights([3])
@@ -214,11 +214,11 @@ def test_forgotten_blobs_leave_digest_and_loss(store: Store) -> None:
 
 
 @pytest.mark.parametrize("ask", [lambda s: s.version(9), lambda s: s.episode_digest(9)])
-def test_what_was_never_there_is_none(ask: Callable[[Store], object], store: Store) -> None:
+def test_unknown_id_is_none(ask: Callable[[Store], object], store: Store) -> None:
     assert ask(store) is None
 
 
-def test_learner_never_goes_on_from_a_part_of_the_latest_version(store: Store) -> None:
+def test_incomplete_latest_version_is_damage(store: Store) -> None:
     with pytest.raises(DamagedStore, match="weights version 3, the latest, is missing"):
         store.state(3)
     whole = Version(3, b"digest", 0.25, b"w", b"o")

@@ -39,7 +39,7 @@ STATUS = Status(
 )  # fmt: skip
 
 
-def test_line_says_all_that_a_user_watches() -> None:
+def test_line_has_all_values() -> None:
     text = line(STATUS)
     for part in (
         "iteration 7", "12,345 of 100,000 env steps (9,876/s)",
@@ -50,7 +50,7 @@ def test_line_says_all_that_a_user_watches() -> None:
         assert part in text
 
 
-def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
+def test_remaining_time_is_an_upper_bound_with_a_stop_return() -> None:
     stopping = msgspec.structs.replace(STATUS, stop_return=200.0)
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
@@ -60,7 +60,7 @@ def test_a_run_that_a_return_may_end_has_at_most_its_budget_left() -> None:
     assert "target         mean return 200.0 in an evaluation" in capture.get()
 
 
-def test_what_a_terminal_would_obey_is_written_out() -> None:
+def test_control_sequences_are_escaped() -> None:
     hostile = "\x1b]0;owned\x07 \x9b2J\nended: all is well \u202e"
     status = msgspec.structs.replace(
         STATUS,
@@ -76,7 +76,7 @@ def test_what_a_terminal_would_obey_is_written_out() -> None:
     assert "\\x1b]0;owned\\x07" in line(status)
 
 
-def test_line_before_anything_is_known() -> None:
+def test_line_without_values() -> None:
     empty = BufferStatus(episodes=0, return_min=None, return_mean=None, return_max=None)
     text = line(
         msgspec.structs.replace(STATUS, evaluation=None, buffer=empty, time_left_s=None, waiting=())
@@ -86,7 +86,7 @@ def test_line_before_anything_is_known() -> None:
     assert "waits" not in text
 
 
-def test_panel_names_the_quarantined_and_what_is_audited() -> None:
+def test_panel_lists_quarantined_actors_and_open_audits() -> None:
     watched = msgspec.structs.replace(
         STATUS,
         audit=AuditStatus(rate=0.25, agreed=31, open=4, disputed=1),
@@ -99,7 +99,7 @@ def test_panel_names_the_quarantined_and_what_is_audited() -> None:
     assert "actor-9: its episode of command 7 differs" in capture.get()
 
 
-def test_why_a_run_ended_is_told() -> None:
+def test_end_of_a_run_has_its_reason() -> None:
     ended = msgspec.structs.replace(STATUS, state="ended", ended_because="reached return 100")
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
@@ -109,14 +109,14 @@ def test_why_a_run_ended_is_told() -> None:
     assert "because" not in line(STATUS)
 
 
-def test_advice_is_shown_beside_the_numbers() -> None:
+def test_panel_has_the_advice() -> None:
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
         console.print(panel(msgspec.structs.replace(STATUS, advice="return_scale = 0.025: ...")))
     assert "advice         return_scale = 0.025: ..." in capture.get()
 
 
-def test_small_returns_are_told_apart() -> None:
+def test_small_returns_are_distinguishable() -> None:
     assert STATUS.evaluation is not None
     small = msgspec.structs.replace(
         STATUS,
@@ -146,7 +146,7 @@ def shown(status: Status, width: int) -> list[str]:
         (range(10, 200, 10), ["weights kept   19 versions: 10, 20, 30, 40, … 160, 170, 180, 190"]),
     ],
 )
-def test_panel_lists_the_weights_that_are_kept(kept: Sequence[int], text: list[str]) -> None:
+def test_panel_lists_kept_weights(kept: Sequence[int], text: list[str]) -> None:
     status = msgspec.structs.replace(STATUS, weights_kept=tuple(kept))
     assert [row for row in shown(status, 120) if "kept" in row] == text
 
@@ -158,7 +158,7 @@ def test_panel_fits_its_terminal(width: int) -> None:
     assert "mean return 42.0 ± 1.0" in "\n".join(lines)
 
 
-def test_a_number_and_its_label_are_on_one_line() -> None:
+def test_number_and_label_are_on_one_line() -> None:
     assert shown(STATUS, 50) == [
         "run            run",
         "environment    CartPole-v1",
@@ -180,11 +180,11 @@ def test_a_number_and_its_label_are_on_one_line() -> None:
         "waiting        learner l for actors:",
         "               iteration 7 (2.5 s)",
     ]
-    assert len(shown(STATUS, 80)) == 13  # a line each
+    assert len(shown(STATUS, 80)) == 13  # one line each
     assert "replay buffer  lowest return 1.0; mean 2.0; highest 3.0" in shown(STATUS, 80)
 
 
-def test_a_long_name_is_not_cut() -> None:
+def test_long_name_is_not_truncated() -> None:
     run_id = "cartpole-v1-seed7-20261130-103400-1a2b3c4d"
     text = "\n".join(shown(msgspec.structs.replace(STATUS, run_id=run_id), 50))
     assert run_id in "".join(text.split())
@@ -193,14 +193,14 @@ def test_a_long_name_is_not_cut() -> None:
 @pytest.mark.parametrize(
     ("steps", "percent"), [(0, 0), (99_999, 99), (100_000, 100), (120_000, 100)]
 )
-def test_progress_is_that_of_the_budget(steps: int, percent: int) -> None:
+def test_progress_is_relative_to_the_budget(steps: int, percent: int) -> None:
     lines = shown(msgspec.structs.replace(STATUS, env_steps=steps), 80)
     (progress,) = [row for row in lines if row.startswith("progress")]
     assert progress.endswith(f" {percent} % of 100,000 env steps")
     assert ("━" * 20 in progress) == (percent == 100)
 
 
-def test_pipe_gets_plain_lines_and_none_twice() -> None:
+def test_pipe_gets_plain_lines_without_repetition() -> None:
     output = io.StringIO()
     with Display(Console(file=output, force_terminal=False)) as display:
         display.show(STATUS)
@@ -218,9 +218,7 @@ class Terminal(io.StringIO):
     ("output", "environment"),
     [(io.StringIO(), {"FORCE_COLOR": "1"}), (Terminal(), {"TERM": "dumb"})],
 )
-def test_what_cannot_be_drawn_over_gets_plain_lines(
-    output: io.StringIO, environment: dict[str, str]
-) -> None:
+def test_dumb_output_gets_plain_lines(output: io.StringIO, environment: dict[str, str]) -> None:
     console = Console(file=output, _environ=environment, no_color=True)
     assert console.is_terminal
     with Display(console) as display:
@@ -236,7 +234,7 @@ def test_terminal_gets_a_panel() -> None:
     assert "\x1b" in output.getvalue()
 
 
-def test_panel_ends_with_the_final_evaluation_and_takes_names_as_they_are() -> None:
+def test_panel_shows_the_final_evaluation_and_names_verbatim() -> None:
     assert STATUS.evaluation is not None
     closed = msgspec.structs.replace(
         STATUS,

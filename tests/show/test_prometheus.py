@@ -1,4 +1,4 @@
-"""What Prometheus is told, read by its own parser; and what the dashboard asks for."""
+"""Metrics for Prometheus, read by its own parser, and the dashboard's queries."""
 
 import json
 import re
@@ -42,45 +42,47 @@ def scraped(status: Status | None) -> dict[tuple[str, tuple[tuple[str, str], ...
     }
 
 
-def test_every_number_of_the_status_is_told() -> None:
-    told = scraped(FULL)
-    assert told["udrl_up", ()] == 1
-    assert told["udrl_env_steps_total", ()] == 12345
-    assert told["udrl_env_steps_per_second", ()] == 9876.5
-    assert told["udrl_weights_lag_seconds", ()] == 0.25
-    assert told["udrl_loss_nats", ()] == 0.5
-    assert told["udrl_exact", ()] == 1
-    assert told["udrl_state", (("state", "running"),)] == 1
-    assert told["udrl_state", (("state", "ended"),)] == 0
-    assert told["udrl_eval_return", (("stat", "mean"),)] == 42
-    assert told["udrl_replay_return", (("stat", "max"),)] == 3
-    assert told["udrl_commands", (("state", "issued"),)] == 1
+def test_every_number_of_the_status_is_exported() -> None:
+    metrics = scraped(FULL)
+    assert metrics["udrl_up", ()] == 1
+    assert metrics["udrl_env_steps_total", ()] == 12345
+    assert metrics["udrl_env_steps_per_second", ()] == 9876.5
+    assert metrics["udrl_weights_lag_seconds", ()] == 0.25
+    assert metrics["udrl_loss_nats", ()] == 0.5
+    assert metrics["udrl_exact", ()] == 1
+    assert metrics["udrl_state", (("state", "running"),)] == 1
+    assert metrics["udrl_state", (("state", "ended"),)] == 0
+    assert metrics["udrl_eval_return", (("stat", "mean"),)] == 42
+    assert metrics["udrl_replay_return", (("stat", "max"),)] == 3
+    assert metrics["udrl_commands", (("state", "issued"),)] == 1
     actor = (("actor", "actor-1"), ("host", "here"))
-    assert told["udrl_actor_env_steps_per_second", actor] == 500.5
-    assert told["udrl_actor_reruns_total", actor] == 2
-    assert told["udrl_actor_failures_total", actor] == 1
-    assert told["udrl_waiting_seconds", (("for", "actors"), ("who", "learner l"))] == 2.5
-    assert told["udrl_quarantined_actors", ()] == 1
+    assert metrics["udrl_actor_env_steps_per_second", actor] == 500.5
+    assert metrics["udrl_actor_reruns_total", actor] == 2
+    assert metrics["udrl_actor_failures_total", actor] == 1
+    assert metrics["udrl_waiting_seconds", (("for", "actors"), ("who", "learner l"))] == 2.5
+    assert metrics["udrl_quarantined_actors", ()] == 1
 
 
-def test_what_is_not_known_is_not_told() -> None:
-    told = scraped(
+def test_unknown_values_are_not_exported() -> None:
+    metrics = scraped(
         msgspec.structs.replace(STATUS, loss=None, time_left_s=None, evaluation=None, waiting=())
     )
-    names = {name for name, _ in told}
+    names = {name for name, _ in metrics}
     assert not names & {"udrl_loss_nats", "udrl_time_left_seconds", "udrl_eval_return"}
     assert scraped(None) == {("udrl_up", ()): 0}
 
 
-def test_the_dashboard_asks_for_metrics_that_there_are() -> None:
-    told = {name for name, _ in scraped(FULL)}
+def test_dashboard_queries_existing_metrics() -> None:
+    metrics = {name for name, _ in scraped(FULL)}
     dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text())
-    asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
-    assert len(asked) > 10
-    for expression in asked:
+    queries = [
+        target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])
+    ]
+    assert len(queries) > 10
+    for expression in queries:
         found = re.findall(r"udrl_\w+", expression)
         assert found, expression
-        assert set(found) <= told, expression
+        assert set(found) <= metrics, expression
 
 
 def test_every_metric_is_in_the_glossary() -> None:
@@ -89,7 +91,7 @@ def test_every_metric_is_in_the_glossary() -> None:
     assert {name for name, _ in scraped(FULL)} == named
 
 
-def test_a_port_that_is_taken() -> None:
+def test_port_in_use_is_reported() -> None:
     with (
         closing(Exporter(lambda: None, "127.0.0.1", 0)) as first,
         pytest.raises(ConfigError, match=f"port {first.port}: .*a free port"),
@@ -97,7 +99,7 @@ def test_a_port_that_is_taken() -> None:
         Exporter(lambda: None, "127.0.0.1", first.port)
 
 
-def test_a_status_that_is_old_says_nothing_of_now() -> None:
+def test_outdated_status_is_not_exported_as_current() -> None:
     now = [0.0]
     watchers = Watchers(clock=lambda: now[0])
     assert watchers.latest() is None

@@ -1,4 +1,4 @@
-"""Keys in the window of ``udrl play``."""
+"""Keyboard input in the window of ``udrl play``."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from udrl_show.window import Window
 
 
 class Episode:
-    """What a window changes of a rollout."""
+    """The part of a rollout that a window changes."""
 
     def __init__(self) -> None:
         self.command = type("Command", (), {"desired_return": 200.0, "desired_horizon": 100,
@@ -30,7 +30,7 @@ def window(monkeypatch: pytest.MonkeyPatch) -> Window:
 
 
 def show(window: Window, episode: Episode, *moments: str) -> bool:
-    """Press keys, those of a moment separated by spaces, and show a picture."""
+    """Press keys, those of a moment separated by spaces, and show a frame."""
     pygame: Any = window._pygame
     pressed = iter(moments)
     window._keys = lambda: next(pressed).split(", ")  # type: ignore[method-assign]
@@ -38,7 +38,7 @@ def show(window: Window, episode: Episode, *moments: str) -> bool:
     rollout: Any = episode
     assert pygame.display.get_init()
     going_on = window.show(rollout, picture, "a caption")
-    assert next(pressed, None) is None, "it did not wait for all keys"
+    assert next(pressed, None) is None, "the window must wait for all keys"
     return going_on
 
 
@@ -51,13 +51,13 @@ def show(window: Window, episode: Episode, *moments: str) -> bool:
         ("page down, up", (160.0, 75)),
     ],
 )
-def test_the_command_can_be_changed(window: Window, keys: str, expected: tuple[float, int]) -> None:
+def test_keys_change_the_command(window: Window, keys: str, expected: tuple[float, int]) -> None:
     episode = Episode()
     assert show(window, episode, keys)
     assert (episode.desired_return, episode.desired_horizon) == expected
 
 
-def test_a_paused_window_waits_and_goes_step_by_step(window: Window) -> None:
+def test_paused_window_waits_and_single_steps(window: Window) -> None:
     episode = Episode()
     assert show(window, episode, "space", "", "", "right")
     assert show(window, episode, "", "right")
@@ -65,7 +65,7 @@ def test_a_paused_window_waits_and_goes_step_by_step(window: Window) -> None:
     assert show(window, episode, "")
 
 
-def test_greedy_and_back(window: Window) -> None:
+def test_greedy_is_toggled(window: Window) -> None:
     episode = Episode()
     show(window, episode, "g")
     assert episode.temperature == 0
@@ -77,14 +77,14 @@ def test_quit(window: Window) -> None:
     assert not show(window, Episode(), "up, q")
 
 
-def test_without_a_screen_there_is_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_screen_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ConfigError, match=r"without a screen|there is no screen;"):
         Window(fps=1000)
 
 
-def test_a_rollout_is_what_the_episode_here_stands_for() -> None:
+def test_rollout_has_the_attributes_of_the_stand_in() -> None:
     attributes = {"command", "desired_return", "desired_horizon", "temperature"}
     assert attributes <= set(vars(Episode()))
     assert callable(Rollout.set_command)
