@@ -187,7 +187,9 @@ def test_generic_preset_has_automatic_settings() -> None:
 
 
 def test_unknown_preset_is_rejected_with_the_available_ones() -> None:
-    with pytest.raises(ConfigError, match=r"'Pong': expected one of CartPole-v1, LunarLander-v3"):
+    with pytest.raises(
+        ConfigError, match=r"'Pong': expected one of CartPole-v1, Hopper-v5, LunarLander-v3"
+    ):
         preset("Pong")
 
 

@@ -193,7 +193,9 @@ class NoPause(threading.Event):
 def test_learner_gives_up_after_repeated_rewinds(replay: Scripted) -> None:
     never = NoPause()
     replay.answers(verbs.CHANGES, lambda _: Problem(code="rewind", message="version 7 is next"))
-    with pytest.raises(Refused, match=r"failed 7 times to train the version after 0: version 7 is next; the"):
+    with pytest.raises(
+        Refused, match=r"failed 7 times to train the version after 0: version 7 is next; the"
+    ):
         LearnerService(replay.transport, HELLO, "l", never).run()
     assert len(replay.requests(verbs.STATE)) == 7
     assert never.waits == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]

@@ -32,7 +32,13 @@ from udrl.spaces import MAX_LEAVES, Bits, ObservationSpace, Vector, leaves_of
 
 Environment = gym.Env[Any, Any]
 
-_EXTRAS = {"Box2D": "box2d", "pygame": "box2d", "matplotlib": "plot", "vizdoom": "doom"}
+_EXTRAS = {
+    "Box2D": "box2d",
+    "pygame": "box2d",
+    "matplotlib": "plot",
+    "mujoco": "mujoco",
+    "vizdoom": "doom",
+}
 
 
 #: Environment variable with an environment's index while it is made, which is unique among the
