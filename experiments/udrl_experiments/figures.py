@@ -1,6 +1,6 @@
 """Figures of the studies, drawn from tidy tables, in the layout of the paper's figures.
 
-Lines can be told apart in greyscale and with colour blindness (:mod:`udrl_show.styles`).
+Lines are distinguishable in greyscale and with colour blindness (:mod:`udrl_show.styles`).
 """
 
 import itertools

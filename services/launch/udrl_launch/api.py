@@ -104,10 +104,9 @@ def train(
     if resume and run_dir is None:
         raise ConfigError("resume needs run_dir, the directory of the run to resume")
     to_call = [callbacks] if callable(callbacks) else list(callbacks)
-    _require_functions("callbacks", to_call)
-    _require_functions("on_iteration, on_evaluation, on_end", [
-        function for function in (on_iteration, on_evaluation, on_end) if function is not None
-    ])  # fmt: skip
+    _require_functions(callbacks=to_call)
+    events = {"on_iteration": on_iteration, "on_evaluation": on_evaluation, "on_end": on_end}
+    _require_functions(**{name: [one] for name, one in events.items() if one is not None})
     chosen = None if run_dir is None else Path(run_dir).absolute()
     is_resumed = resume and chosen is not None and exists(chosen)
     gathered = gather(
@@ -143,10 +142,12 @@ def train(
     return Trained(folder, status)
 
 
-def _require_functions(name: str, values: Iterable[object]) -> None:
-    for value in values:
-        if not callable(value):
-            raise ConfigError(f"{name}: {value!r} is not a function")
+def _require_functions(**values: Iterable[object]) -> None:
+    """Raise :class:`ConfigError` for values of a parameter that are not functions."""
+    for name, several in values.items():
+        for value in several:
+            if not callable(value):
+                raise ConfigError(f"{name}: {value!r} is not a function; pass one, or leave it out")
 
 
 class _Callbacks:
