@@ -22,7 +22,6 @@ from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl_proto import key_expressions, verbs
 from udrl_proto import session as sessions
-from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, encode, encode_array
 from udrl_proto.messages import (
     CommandsReply,
@@ -33,6 +32,7 @@ from udrl_proto.messages import (
     Message,
     Weights,
 )
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.zenoh_transport import ZenohTransport
 
 RUN = "scale"
@@ -104,7 +104,9 @@ class Fleet:
             for i in range(self._load.actors)
         ]
         for actor in actors:
-            Asker(ZenohTransport(actor.session), RUN, actor.name).ask(verbs.JOIN, self._join(actor))
+            ReplayClient(ZenohTransport(actor.session), RUN, actor.name).request(
+                verbs.JOIN, self._join(actor)
+            )
         for actor in actors:
             self._next(actor)
         warm = time.monotonic() + self._load.seconds / 4

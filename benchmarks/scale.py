@@ -39,9 +39,9 @@ from udrl.weights import encode_weights
 from udrl_launch.training_run import free_port
 from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto import session as sessions
-from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
 from udrl_proto.messages import ChangesRequest, Hello, JoinRequest, VersionMessage, Weights
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import write_config
@@ -82,8 +82,8 @@ def deliver_versions(
     state.optimizer.step()  # a delivery needs the state of Adam
     weights, optimizer = encode_weights(state.weights), encode_optimizer(state)
     with contextlib.suppress(Interrupted), sessions.connect(endpoint, 30.0, stop) as session:
-        asker = Asker(ZenohTransport(session), RUN, "learner scale", stop)
-        asker.ask(
+        client = ReplayClient(ZenohTransport(session), RUN, "learner scale", stop)
+        client.request(
             verbs.JOIN,
             JoinRequest(
                 role="learner", id="scale", host="bench", pid=1, software="0", numerics_class="c"
@@ -92,7 +92,7 @@ def deliver_versions(
         version = 1
         while not stop.is_set():
             request = ChangesRequest(learner="scale", version=version)
-            changes = asker.ask(verbs.CHANGES, request)
+            changes = client.request(verbs.CHANGES, request)
             if changes.wait is not None:
                 stop.wait(min(changes.wait.retry_after_s, 0.05))
                 continue
@@ -100,7 +100,7 @@ def deliver_versions(
                 learner="scale", version=version, weights=weights, optimizer=optimizer, loss=1.0,
                 train_s=0.0,
             )  # fmt: skip
-            asker.ask(verbs.VERSION, message)
+            client.request(verbs.VERSION, message)
             announced.append(Announced(version, time.monotonic()))
             news = encode(Weights(version=version, weights=weights))
             session.put(key_expressions.key(RUN, key_expressions.NEW_WEIGHTS), news)
@@ -189,7 +189,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
         replay_service(Path(folder) / "run", hello, endpoint) as pid,
         sessions.connect(endpoint, 30.0) as session,
     ):
-        asker = Asker(ZenohTransport(session), RUN, "scale", patience_s=30.0)
+        client = ReplayClient(ZenohTransport(session), RUN, "scale", patience_s=30.0)
         learner = threading.Thread(
             target=deliver_versions, args=(endpoint, hello, stop, announced), daemon=True
         )
@@ -203,10 +203,10 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
             msgspec.json.encode(load).decode(), str(report),
         ])  # fmt: skip
         try:
-            status = asker.ask(verbs.STATUS, StatusRequest())
+            status = client.request(verbs.STATUS, StatusRequest())
             deadline = time.monotonic() + 60.0 + 3 * options.seconds
             while fleet.poll() is None and time.monotonic() < deadline:
-                status = asker.ask(verbs.STATUS, StatusRequest())
+                status = client.request(verbs.STATUS, StatusRequest())
                 samples.append(_sample(pid, status))
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     fleet.wait(1.0)

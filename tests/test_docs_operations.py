@@ -16,7 +16,7 @@ from udrl_launch import supervisor
 from udrl_launch.roles import open_run
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.subcommands.settings_options import gather_settings
-from udrl_proto import asking, verbs
+from udrl_proto import replay_client, verbs
 from udrl_proto.access import RIGHTS
 from udrl_proto.messages import Hello
 from udrl_replay import auditing, dealing, quarantine, replay_service
@@ -122,7 +122,7 @@ def test_message_flow_diagram_matches_the_rights_of_each_role() -> None:
         else:
             assert receiver == "replay"
             drawn[sender] |= set(what.split(", "))
-    assert drawn == {role: set(verbs.asked_by(role)) for role in RIGHTS}
+    assert drawn == {role: set(verbs.sent_by(role)) for role in RIGHTS}
     assert publishes == {role: set(rights.publishes) for role, rights in RIGHTS.items()}
     assert joins == {role for role, rights in RIGHTS.items() if rights.joins}
 
@@ -145,7 +145,7 @@ def plain(page: str) -> str:
     ("page", "phrase"),
     [
         (OPERATIONS, f"reads stores of schema {SCHEMA}."),
-        (OPERATIONS, f"retries for {asking.PATIENCE_S:.0f} s"),
+        (OPERATIONS, f"retries for {replay_client.PATIENCE_S:.0f} s"),
         (OPERATIONS, f"has died {WORDS[supervisor._MOST_DEATHS]} times without progress"),
         (OPERATIONS, f"At most {auditing.MOST_OPEN} audits are open"),
         (OPERATIONS, f"delivered {WORDS[quarantine.OFFENCES]} episodes that were malformed"),
@@ -155,7 +155,7 @@ def plain(page: str) -> str:
         ),
         ("docs/protocol.md", f"sends nothing for {dealing.SILENCE_S:.0f} s"),
         ("docs/protocol.md", f"{dealing.MOST_ACTORS:,} actors have joined"),
-        ("docs/protocol.md", f"exit code 7 after {WORDS[asking._JOINS]} times"),
+        ("docs/protocol.md", f"exit code 7 after {WORDS[replay_client._JOINS]} times"),
         (
             "docs/protocol.md",
             f"{replay_service._INBOX:,} requests and {replay_service._INBOX_BYTES >> 20} MiB",

@@ -7,17 +7,17 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.automatic_settings import resolve_automatic
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config
+from udrl.datasets import resolve_dataset
 from udrl.digests import Digest, arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
-from udrl.fitting import fit
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import resolve_arithmetic
-from udrl.offline import resolve_dataset
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.segments import Experience
@@ -85,7 +85,7 @@ def algorithm1(
         budget: stopping criteria.
         n_environments: episodes generated at the same time; affects speed, not the result.
         report: called after every iteration.
-        automatic: names of automatic settings (:mod:`udrl.fitting`).
+        automatic: names of automatic settings (:mod:`udrl.automatic_settings`).
 
     Raises:
         ConfigError: ``lead`` is not 0, or other settings cannot be used.
@@ -95,7 +95,7 @@ def algorithm1(
         raise ConfigError(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
-    config = resolve_arithmetic(fit(config, automatic))
+    config = resolve_arithmetic(resolve_automatic(config, automatic))
     generator = EpisodeGenerator(config, n_environments)
     config, offline = resolve_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec)

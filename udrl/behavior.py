@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from udrl.action_losses import negative_log_likelihood
 from udrl.architecture import FORBIDDEN, layer_widths, n_features
 from udrl.config import Config
-from udrl.custom import make_custom
+from udrl.custom_networks import make_custom
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
 from udrl.environments.making import EnvironmentSpec
 from udrl.initialisation import draw_weights

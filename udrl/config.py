@@ -139,7 +139,8 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
     keep_versions: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
 
 
-#: Settings that accept ``auto``, with placeholders until :mod:`udrl.fitting` chooses values.
+#: Settings that accept ``auto``, with placeholders until :mod:`udrl.automatic_settings` chooses
+#: values.
 AUTOMATIC: Mapping[str, Any] = {
     "observe_time": False,
     "return_scale": 1.0,

@@ -155,10 +155,10 @@ class _Builder(Nodes):
         return logits if self._mask is None else self._masked(logits)
 
     def _custom(self) -> str:
-        """Append a custom network, as exported by torch; see :mod:`udrl.custom`."""
+        """Append a custom network, as exported by torch; see :mod:`udrl.custom_networks`."""
         # Imported here, because it imports torch, which no other graph needs.
         try:
-            exported = import_module("udrl.custom").exported
+            exported = import_module("udrl.custom_networks").exported
         except ModuleNotFoundError as error:
             raise ConfigError(
                 f"behavior {self._network.behavior!r} needs {error.name} where its run is created; "

@@ -1,7 +1,7 @@
 """Numerics classes of machines, and settings that depend on the machine that creates a run.
 
-A run is exact if its environment is deterministic (:mod:`udrl.repeating`) and all machines compute
-the same bits. The latter is checked by their *numerics class*, the digest of a fixed probe
+A run is exact if its environment is deterministic (:mod:`udrl.determinism`) and all machines
+compute the same bits. The latter is checked by their *numerics class*, the digest of a fixed probe
 (:func:`acting_class`, :func:`udrl.training_class.training_class`).
 """
 

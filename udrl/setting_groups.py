@@ -45,7 +45,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
 
     Attributes:
         behavior: a torch module in place of the paper's network, as ``package.module:Class``
-            (:mod:`udrl.custom`). None: the paper's network.
+            (:mod:`udrl.custom_networks`). None: the paper's network.
         frame_stack: number of most recent observations in the input, concatenated along the first
             dimension. At the start of an episode, the first observation is repeated.
         memory: ``none``, or ``gru``: a gated recurrent unit between encoder and command, which

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 
 from udrl.config import Config, change
+from udrl.determinism import PROBE_STEPS
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.repeating import PROBE_STEPS
 from udrl.segments import Experience
 from udrl.spaces import noise, parts_of
 from udrl.streams import Purpose, Stream, stream_key

@@ -13,9 +13,9 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
+from udrl.automatic_settings import resolve_automatic
 from udrl.config import AUTOMATIC, Config, build, change, flat, preset
 from udrl.errors import ConfigError
-from udrl.fitting import fit
 from udrl.spaces import Image, Vector
 from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
@@ -160,7 +160,7 @@ def search_environment(
     with space.errors_of("UDRL"):
         build(Config, {"environment": environment} | drawn)
     settings = gather(environment, options=own | drawn, assignments=plan.assignments)
-    config = fit(settings.config, settings.automatic)
+    config = resolve_automatic(settings.config, settings.automatic)
     others = [algorithm for algorithm in chosen if algorithm != "UDRL"]
     with closing(EpisodeGenerator(shared(config) if others else config, 1)) as generator:
         spec = generator.spec

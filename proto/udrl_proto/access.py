@@ -98,7 +98,7 @@ def _request(verb: str) -> str:
 def _of_client(role: str) -> dict[Rule, list[str]]:
     """Return the messages that the router accepts from a role and forwards to it."""
     rights = RIGHTS[role]
-    requests = [_request(verb) for verb in verbs.asked_by(role)]
+    requests = [_request(verb) for verb in verbs.sent_by(role)]
     subscriptions = [key_expressions.key("*", name) for name in rights.subscribes]
     publications = [key_expressions.key("*", name) for name in rights.publishes]
     alive = [key_expressions.alive("*", role, "*")] if rights.joins else []

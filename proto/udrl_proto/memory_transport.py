@@ -34,7 +34,7 @@ class MemoryTransport:
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
 
-    def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
         """Yield the reply to a query, if there is one in time."""
         receive = self._exchange.answering.get(key)
         if receive is None:

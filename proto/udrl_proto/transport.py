@@ -60,7 +60,7 @@ class Declaration(Protocol):
 class Transport(Protocol):
     """One service's access to the keys of a run (:mod:`udrl_proto.key_expressions`)."""
 
-    def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
         """Yield the replies to a query that arrive within ``timeout_s`` seconds."""
         ...
 

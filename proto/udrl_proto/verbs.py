@@ -52,7 +52,7 @@ class Verb(Generic[Request, Reply]):
         name: the verb in keys.
         request: message type of the request.
         reply: message type of the reply; a refusal is a :class:`udrl_proto.messages.Problem`.
-        askers: roles that may send it (:mod:`udrl_proto.access`).
+        senders: roles that may send it (:mod:`udrl_proto.access`).
         limit: largest request, bytes; for episodes each run computes its own limit.
         reply_limit: largest reply, bytes.
         is_bulk: whether its requests are many and large, and have low priority.
@@ -61,7 +61,7 @@ class Verb(Generic[Request, Reply]):
     name: str
     request: type[Request]
     reply: type[Reply]
-    askers: tuple[str, ...]
+    senders: tuple[str, ...]
     limit: int = FEW
     reply_limit: int = SMALL
     is_bulk: bool = False
@@ -94,6 +94,6 @@ VERBS: tuple[AnyVerb, ...] = (
 BY_NAME = {verb.name: verb for verb in VERBS}
 
 
-def asked_by(role: str) -> Iterable[str]:
+def sent_by(role: str) -> Iterable[str]:
     """Return the names of the verbs that a role may send."""
-    return [verb.name for verb in VERBS if role in verb.askers]
+    return [verb.name for verb in VERBS if role in verb.senders]

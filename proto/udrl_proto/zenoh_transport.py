@@ -24,7 +24,7 @@ class ZenohTransport:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
 
-    def ask(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
         """Yield the replies to a query; Zenoh's own errors are ignored."""
         for reply in self._session.get(
             key,

@@ -18,7 +18,6 @@ from udrl.streams import Purpose, stream_key
 from udrl.weights import encode_weights
 from udrl_actor.courier import Assignment, Courier
 from udrl_proto import PROTOCOL, key_expressions, verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     CommandsReply,
     CommandsRequest,
@@ -30,6 +29,7 @@ from udrl_proto.messages import (
     Wait,
     Weights,
 )
+from udrl_proto.replay_client import ReplayClient
 from whole_run import wait_for
 
 CONFIG = build(Config, {"environment": "Synthetic-v0", "hidden": [4, 4]})
@@ -89,8 +89,8 @@ def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
 
     def begin(*answers: Message) -> Courier:
         replay.answers(verbs.COMMANDS, Deals(*answers))
-        asker = Asker(replay.transport, HELLO.run_id, "actor a", stop)
-        courier = Courier(replay.transport, HELLO, JOIN, asker, stop)
+        client = ReplayClient(replay.transport, HELLO.run_id, "actor a", stop)
+        courier = Courier(replay.transport, HELLO, JOIN, client, stop)
         courier.start()
         started.append(courier)
         return courier

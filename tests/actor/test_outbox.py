@@ -16,7 +16,6 @@ from udrl.errors import EnvironmentFault, Refused
 from udrl_actor import outbox as outboxes
 from udrl_actor.outbox import Outbox, deliver
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     Acknowledged,
     EpisodeMessage,
@@ -26,6 +25,7 @@ from udrl_proto.messages import (
     Message,
     Problem,
 )
+from udrl_proto.replay_client import ReplayClient
 from whole_run import wait_for
 
 DEADLINE_S = 10.0
@@ -141,18 +141,20 @@ def scripted() -> Scripted:
 
 
 @pytest.fixture
-def asker(scripted: Scripted) -> Asker:
-    return Asker(scripted.transport, "scripted", "actor a", threading.Event())
+def client(scripted: Scripted) -> ReplayClient:
+    return ReplayClient(scripted.transport, "scripted", "actor a", threading.Event())
 
 
-def test_episode_is_delivered(scripted: Scripted, asker: Asker) -> None:
+def test_episode_is_delivered(scripted: Scripted, client: ReplayClient) -> None:
     scripted.answers(verbs.EPISODE, lambda _: EpisodeReply(result="accepted"))
-    assert deliver(asker, JOIN, episode(7)) == 7
+    assert deliver(client, JOIN, episode(7)) == 7
     (message,) = scripted.requests(verbs.EPISODE)
     assert (message.actor, message.command_id) == ("a", 7)
 
 
-def test_episode_is_redelivered_to_a_restarted_service(scripted: Scripted, asker: Asker) -> None:
+def test_episode_is_redelivered_to_a_restarted_service(
+    scripted: Scripted, client: ReplayClient
+) -> None:
     known = False
 
     def join(_: JoinRequest) -> Message:
@@ -166,39 +168,41 @@ def test_episode_is_redelivered_to_a_restarted_service(scripted: Scripted, asker
 
     scripted.answers(verbs.JOIN, join)
     scripted.answers(verbs.EPISODE, accept)
-    assert deliver(asker, JOIN, episode(7)) == 7
+    assert deliver(client, JOIN, episode(7)) == 7
     assert [name for name, _ in scripted.received] == ["episode", "join", "episode"]
 
 
-def test_delivery_gives_up_after_repeated_join_first(scripted: Scripted, asker: Asker) -> None:
+def test_delivery_gives_up_after_repeated_join_first(
+    scripted: Scripted, client: ReplayClient
+) -> None:
     scripted.answers(verbs.JOIN, lambda _: JoinReply())
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="join_first", message="who is that?"))
     with pytest.raises(Refused, match="who is that"):
-        deliver(asker, JOIN, episode(7))
+        deliver(client, JOIN, episode(7))
     assert len(scripted.requests(verbs.JOIN)) == 5
 
 
-def test_failure_is_delivered(scripted: Scripted, asker: Asker) -> None:
+def test_failure_is_delivered(scripted: Scripted, client: ReplayClient) -> None:
     scripted.answers(verbs.FAILURE, lambda _: Acknowledged())
     command = Command(
         id=8, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=1,
         stream_key=bytes(16), weights_version=0, max_steps=1,
     )  # fmt: skip
-    assert deliver(asker, JOIN, Failure(command, EnvironmentFault("it broke"))) == 8
+    assert deliver(client, JOIN, Failure(command, EnvironmentFault("it broke"))) == 8
     (message,) = scripted.requests(verbs.FAILURE)
     assert (message.actor, message.command_id, message.error) == ("a", 8, "it broke")
 
 
 def test_rejected_episode_is_discarded(
-    scripted: Scripted, asker: Asker, caplog: pytest.LogCaptureFixture
+    scripted: Scripted, client: ReplayClient, caplog: pytest.LogCaptureFixture
 ) -> None:
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="rejected", message="the run has ended"))
     with caplog.at_level(logging.INFO, "udrl"):
-        assert deliver(asker, JOIN, episode(7)) == 7
+        assert deliver(client, JOIN, episode(7)) == 7
     assert "the run has ended" in caplog.text
 
 
-def test_other_refusals_are_raised(scripted: Scripted, asker: Asker) -> None:
+def test_other_refusals_are_raised(scripted: Scripted, client: ReplayClient) -> None:
     scripted.answers(verbs.EPISODE, lambda _: Problem(code="quarantined", message="it lied"))
     with pytest.raises(Refused, match="it lied"):
-        deliver(asker, JOIN, episode(7))
+        deliver(client, JOIN, episode(7))

@@ -11,6 +11,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
 from udrl.behavior import BehaviorFunction
 from udrl.config import Config, build
+from udrl.determinism import environment_digest, repeated_digest
 from udrl.environments import Environment, EnvironmentSpec
 from udrl.environments.making import adapt
 from udrl.environments.obedience import Obedience
@@ -18,7 +19,6 @@ from udrl.errors import EnvironmentFault
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import acting_class
-from udrl.repeating import environment_digest, repeated_digest
 from udrl.spaces import Vector
 from udrl.training_class import training_class
 

@@ -13,13 +13,13 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build, refuse_ineffective
+from udrl.datasets import read_dataset
 from udrl.digests import arrays_digest
 from udrl.environments import make_environment
 from udrl.environments.making import specify
 from udrl.environments.previous import PREVIOUS, ObservePrevious, null_action
 from udrl.episode import Episode
 from udrl.errors import ConfigError, UnsupportedEnvironment
-from udrl.offline import read_dataset
 from udrl.segments import Experience
 from udrl.spaces import Record, Vector
 from udrl.training import train, untrained

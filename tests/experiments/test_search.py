@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from tests.experiments.finished_runs import finish
+from udrl.automatic_settings import resolve_automatic
 from udrl.config import change, preset, read_toml
 from udrl.errors import ConfigError, UnsupportedEnvironment
-from udrl.fitting import fit
 from udrl_experiments import search as search_module
 from udrl_experiments import study_command
 from udrl_experiments.jobs import Job
@@ -173,10 +173,10 @@ def test_custom_environment_is_searched_from_the_settings_of_training(custom_spa
         (algorithm, seed) for algorithm in ("UDRL", "PPO") for _ in range(2) for seed in (1, 2)
     ]
     settings = gather("MountainCar-v0", options={"seed": 1}, assignments=plan.assignments)
-    fitted = fit(settings.config, settings.automatic)
+    resolved = resolve_automatic(settings.config, settings.automatic)
     drawn = read_space("MountainCar-v0", custom_space).draw("UDRL", 1)
     assert study.jobs[3].config == change(
-        fitted, seed=2, eval_seeds="search", eval_every=50_000, **drawn
+        resolved, seed=2, eval_seeds="search", eval_every=50_000, **drawn
     )
     assert study.jobs[3].config.network.return_scale == 0.5
     ppo = study.jobs[6]

@@ -15,9 +15,9 @@ from tests.foreign.conventions import Plain, register
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config, build
+from udrl.datasets import dataset_digest, read_dataset, write_dataset
 from udrl.environments import make_environment, specify
 from udrl.errors import ConfigError
-from udrl.offline import dataset_digest, read_dataset, write_dataset
 from udrl.streams import Purpose, stream_key
 
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from gymnasium import spaces
 
 from tests.foreign.conventions import Plain, ResetsToObservation, register
-from tests.foreign.test_repeating import Unseeded
+from tests.foreign.test_determinism import Unseeded
 from udrl.config import Config, build
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl_inspect.checking import check

@@ -14,10 +14,10 @@ from msgspec.structs import replace
 from udrl.actions import Categorical
 from udrl.algorithm1 import algorithm1
 from udrl.config import Budget, Config
+from udrl.datasets import dataset_digest, read_dataset, write_dataset
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
-from udrl.offline import dataset_digest, read_dataset, write_dataset
 from udrl.spaces import Image, Vector
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.cli import cli as command_line

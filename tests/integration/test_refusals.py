@@ -17,9 +17,9 @@ from udrl_actor.actor_service import ActorService
 from udrl_inspect.address import Address
 from udrl_launch import roles
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import encode, encode_array
 from udrl_proto.messages import CommandsRequest, EpisodeMessage, Hello, JoinRequest, VersionMessage
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.session import connect, find_run
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -45,17 +45,17 @@ class Hosted:
         self.session: zenoh.Session = connect(self.endpoint, 10)
         self.transport = ZenohTransport(self.session)
         self.hello: Hello = find_run(self.session, None, 10)
-        self.asker = Asker(self.transport, self.hello.run_id, "the test", patience_s=10)
+        self.client = ReplayClient(self.transport, self.hello.run_id, "the test", patience_s=10)
 
     def status(self) -> Status:
-        return self.asker.ask(verbs.STATUS, StatusRequest())
+        return self.client.request(verbs.STATUS, StatusRequest())
 
     def join(self, role: Literal["actor", "learner"], name: str, numerics_class: str = "c") -> None:
         request = JoinRequest(
             role=role, id=name, host="here", pid=1, software="0", numerics_class=numerics_class,
             environment_digest=self.hello.environment_digest,
         )  # fmt: skip
-        self.asker.ask(verbs.JOIN, request)
+        self.client.request(verbs.JOIN, request)
 
     def finish(self) -> Status:
         """Let a valid actor and learner end the run; return its last status."""
@@ -121,13 +121,13 @@ def test_actor_with_another_environment_digest_is_refused(
 def test_first_delivery_sets_the_numerics_class(hosted: Hosted) -> None:
     hosted.join("actor", "two", "of two")
     hosted.join("actor", "one", "of one")
-    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
+    assert hosted.client.request(verbs.EPISODE, EPISODE).result == "accepted"
     of_two = msgspec.structs.replace(EPISODE, actor="two", command_id=4)
     with pytest.raises(Refused, match=r"class of one, this machine has of two,") as no:
-        hosted.asker.ask(verbs.EPISODE, of_two)
+        hosted.client.request(verbs.EPISODE, of_two)
     assert no.value.code == "other_numerics"
     with pytest.raises(Refused, match="actor two has not joined"):
-        hosted.asker.ask(verbs.EPISODE, of_two)
+        hosted.client.request(verbs.EPISODE, of_two)
     with pytest.raises(Refused, match=r"class of one, this machine has [0-9a-f]{16},"):
         ActorService(hosted.transport, hosted.hello, "three", 1, hosted.stop).run()
     assert hosted.status().exact
@@ -138,7 +138,7 @@ def test_first_delivery_sets_the_numerics_class(hosted: Hosted) -> None:
 def test_joining_without_delivery_sets_no_numerics_class(hosted: Hosted) -> None:
     hosted.join("actor", "idle", "of its own")
     hosted.join("learner", "idle", "of its own")
-    assert hosted.asker.ask(verbs.COMMANDS, CommandsRequest(actor="idle", wanted=1)).commands
+    assert hosted.client.request(verbs.COMMANDS, CommandsRequest(actor="idle", wanted=1)).commands
     assert digests(hosted.finish()) == digests(reference(hosted.hello.config, BUDGET))
 
 
@@ -168,11 +168,11 @@ def test_bad_episodes_are_refused_and_the_run_continues(hosted: Hosted) -> None:
     }
     for reason, message in bad.items():
         with pytest.raises(Refused, match=reason):
-            hosted.asker.ask(verbs.EPISODE, message)
+            hosted.client.request(verbs.EPISODE, message)
     with pytest.raises(Refused, match="not MessagePack"):
-        hosted.asker.ask(verbs.EPISODE, b"\xc1 garbage")
+        hosted.client.request(verbs.EPISODE, b"\xc1 garbage")
     with pytest.raises(Refused, match="at most"):
-        hosted.asker.ask(verbs.EPISODE, bytes(1 << 20))
+        hosted.client.request(verbs.EPISODE, bytes(1 << 20))
     status = hosted.status()
     assert status.episodes.rejected == len(bad) + 2
     assert_conserved(status)
@@ -184,7 +184,7 @@ def test_bad_weights_are_refused(hosted: Hosted) -> None:
         learner="mallory", version=1, weights=b"x", optimizer=b"y", loss=0.0, train_s=0.0
     )
     with pytest.raises(Refused, match="not safetensors"):
-        hosted.asker.ask(verbs.VERSION, encode(message))
+        hosted.client.request(verbs.VERSION, encode(message))
     assert hosted.status().weights_version == 0
 
 
@@ -192,10 +192,10 @@ def test_different_episode_for_a_command_marks_the_run_inexact(hosted: Hosted) -
     status = hosted.status()
     assert status.exact
     hosted.join("actor", "one")
-    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "accepted"
-    assert hosted.asker.ask(verbs.EPISODE, EPISODE).result == "duplicate"
+    assert hosted.client.request(verbs.EPISODE, EPISODE).result == "accepted"
+    assert hosted.client.request(verbs.EPISODE, EPISODE).result == "duplicate"
     other = msgspec.structs.replace(EPISODE, actions=encode_array(np.ones(1, np.uint8)))
-    assert hosted.asker.ask(verbs.EPISODE, other).result == "duplicate"
+    assert hosted.client.request(verbs.EPISODE, other).result == "duplicate"
     status = hosted.status()
     assert not status.exact
     assert "command 3" in status.inexact_reason

@@ -388,7 +388,7 @@ def test_table_of_rights_is_documented() -> None:
             found[role] = set(asks), set(hears), set(publishes), tokens
     assert found == {
         role: (
-            set(verbs.asked_by(role)),
+            set(verbs.sent_by(role)),
             set(rights.subscribes),
             set(rights.publishes),
             [f"alive/{role}/*"] if rights.joins else [],
@@ -398,7 +398,7 @@ def test_table_of_rights_is_documented() -> None:
 
 
 def test_every_verb_belongs_to_a_role() -> None:
-    assert {verb for role in RIGHTS for verb in verbs.asked_by(role)} == set(verbs.BY_NAME)
+    assert {verb for role in RIGHTS for verb in verbs.sent_by(role)} == set(verbs.BY_NAME)
     assert set(ROLES) == set(MAY_ASK)
 
 

@@ -137,8 +137,8 @@ def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
     rows = {row[0].strip("`"): row[1:] for row in rows_below(PAGE, "### Verbs")}
     assert list(rows) == list(verbs.BY_NAME)
     for name, verb in verbs.BY_NAME.items():
-        askers, request, reply, limit = rows[name]
-        assert askers.split(", ") == list(verb.askers)
+        senders, request, reply, limit = rows[name]
+        assert senders.split(", ") == list(verb.senders)
         assert request == f"[{verb.request.__name__}](#{verb.request.__name__.lower()})"
         assert reply == f"[{verb.reply.__name__}](#{verb.reply.__name__.lower()})"
         if verb is verbs.EPISODE:  # the run's own limit

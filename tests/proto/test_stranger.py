@@ -20,12 +20,12 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
 from udrl.commands import Command
 from udrl.config import Budget, Config, build, change, flat
+from udrl.determinism import environment_digest
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import acting_class
-from udrl.repeating import environment_digest
 from udrl.streams import Purpose, stream_key
 from udrl.training import untrained
 from udrl_learner.learner_service import LearnerService

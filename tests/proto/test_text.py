@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from tests.proto.scripted import Scripted
 from udrl.errors import InvalidMessage, Refused
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Acknowledged, FailureMessage, Problem, StateRequest
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.text import printable
 
 HOSTILE = (
@@ -56,5 +56,7 @@ def test_refusal_is_escaped() -> None:
     scripted = Scripted("run")
     scripted.answers(verbs.STATE, lambda _: Problem(code="rewind", message=HOSTILE))
     with pytest.raises(Refused, match=r"no\\n2026") as no:
-        Asker(scripted.transport, "run", "learner l").ask(verbs.STATE, StateRequest(learner="l"))
+        ReplayClient(scripted.transport, "run", "learner l").request(
+            verbs.STATE, StateRequest(learner="l")
+        )
     assert str(no.value).isprintable()

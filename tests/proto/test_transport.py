@@ -32,7 +32,7 @@ def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
 
 
 def ask(client: Transport, data: bytes = b"?", timeout_s: float = WAIT_S) -> list[Answer]:
-    return list(client.ask(KEY, data, timeout_s))
+    return list(client.query(KEY, data, timeout_s))
 
 
 @pytest.mark.parametrize("is_problem", [False, True])

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
 from udrl.config import Budget, Config, build, flat, read_toml
+from udrl.determinism import environment_digest
 from udrl.environments import EnvironmentSpec
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
-from udrl.repeating import environment_digest
 from udrl.spaces import Category
 from udrl.version import __version__
 from udrl_proto import PROTOCOL, key_expressions

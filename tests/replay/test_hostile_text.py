@@ -14,10 +14,10 @@ from tests.replay.synthetic import create, join
 from udrl.config import Budget
 from udrl.errors import Refused
 from udrl_proto import key_expressions, verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import encode
 from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import CommandsRequest, FailureMessage
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.replay_service import ReplayService
 
@@ -41,23 +41,23 @@ def transport(tmp_path: Path) -> Iterator[MemoryTransport]:
 
 def send_hostile_text(transport: MemoryTransport) -> Status:
     """Send hostile text in every field that has text; return the status of the run."""
-    asker = Asker(transport, RUN, "the test", patience_s=10.0)
+    client = ReplayClient(transport, RUN, "the test", patience_s=10.0)
     unknown = encode(CommandsRequest(actor="a", wanted=1)).replace(b"wanted", b"\n\x1b[2Jw")
     for _ in range(2):
         with pytest.raises(Refused, match="unknown field"):
-            asker.ask(verbs.COMMANDS, unknown)
+            client.request(verbs.COMMANDS, unknown)
     hostile = replace(join("a"), host=HOSTILE, software=HOSTILE, numerics_class=HOSTILE)
-    asker.ask(verbs.JOIN, hostile)
+    client.request(verbs.JOIN, hostile)
     transport.declare_presence(key_expressions.alive(RUN, "actor", HOSTILE)).undeclare()
     spec = hostile.environment
     assert spec is not None
     with pytest.raises(Refused, match="the run's environment is"):
-        asker.ask(verbs.JOIN, replace(hostile, environment=replace(spec, max_episode_steps=3)))
+        client.request(verbs.JOIN, replace(hostile, environment=replace(spec, max_episode_steps=3)))
     for _ in range(3):
-        (command,) = asker.ask(verbs.COMMANDS, CommandsRequest(actor="a", wanted=1)).commands
+        (command,) = client.request(verbs.COMMANDS, CommandsRequest(actor="a", wanted=1)).commands
         failure = FailureMessage(actor="a", command_id=command.id, error=HOSTILE)
-        asker.ask(verbs.FAILURE, failure)
-    return asker.ask(verbs.STATUS, StatusRequest())
+        client.request(verbs.FAILURE, failure)
+    return client.request(verbs.STATUS, StatusRequest())
 
 
 def test_hostile_text_forges_no_log_line(

@@ -9,17 +9,17 @@ import time
 
 from udrl.acting import EpisodeGenerator, Failure
 from udrl.config import Config
+from udrl.determinism import environment_digest
 from udrl.environments.making import Environment, make_environment
 from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
-from udrl.repeating import environment_digest
 from udrl.version import __version__
 from udrl_actor.courier import Courier
 from udrl_actor.outbox import Outbox, deliver
 from udrl_proto import key_expressions, verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, JoinRequest
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
@@ -75,7 +75,7 @@ class ActorService:
         config, run_id = self._hello.config, self._hello.run_id
         generator = EpisodeGenerator(config, self._environments, self._make, self._first_index)
         self._arm(_MAKING_S)  # the probe is many steps
-        asker = Asker(self._transport, run_id, f"actor {self._name}", self._stop)
+        client = ReplayClient(self._transport, run_id, f"actor {self._name}", self._stop)
         token = None
         try:
             join = JoinRequest(
@@ -89,14 +89,14 @@ class ActorService:
                 environment=generator.spec,
                 environment_digest=environment_digest(generator),
             )
-            asker.ask(verbs.JOIN, join)
+            client.request(verbs.JOIN, join)
             token = self._transport.declare_presence(
                 key_expressions.alive(run_id, "actor", self._name)
             )
-            courier = Courier(self._transport, self._hello, join, asker, self._stop)
+            courier = Courier(self._transport, self._hello, join, client, self._stop)
 
             def deliver_one(outcome: Episode | Failure) -> None:
-                courier.note_acknowledged(deliver(asker, join, outcome))
+                courier.note_acknowledged(deliver(client, join, outcome))
 
             outbox = Outbox(f"outbox of {self._name}", deliver_one, courier.fail)
             courier.start()

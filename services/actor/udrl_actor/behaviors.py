@@ -8,9 +8,9 @@ from udrl.errors import InvalidMessage
 from udrl.inference import ActingFunction
 from udrl.weights import decode_behavior
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode
 from udrl_proto.messages import Hello, Weights, WeightsRequest
+from udrl_proto.replay_client import ReplayClient
 
 log = logging.getLogger("udrl")
 
@@ -23,16 +23,16 @@ class Behaviors:
 
     Args:
         hello: the run specification.
-        asker: sends requests to the replay service.
+        client: sends requests to the replay service.
         changed: notified when a version is published.
 
     Attributes:
         newest: greatest version decoded so far; 0: none.
     """
 
-    def __init__(self, hello: Hello, asker: Asker, changed: threading.Condition) -> None:
+    def __init__(self, hello: Hello, client: ReplayClient, changed: threading.Condition) -> None:
         self._hello = hello
-        self._asker = asker
+        self._client = client
         self._changed = changed
         self._announced: bytes | None = None
         self._kept: dict[int, ActingFunction] = {}
@@ -71,7 +71,7 @@ class Behaviors:
         if version > self.newest:
             self._await_announcement(version)
         if version not in self._kept:
-            self._decode(self._asker.ask(verbs.WEIGHTS, WeightsRequest(version=version)))
+            self._decode(self._client.request(verbs.WEIGHTS, WeightsRequest(version=version)))
         return self._kept[version]
 
     def _await_announcement(self, version: int) -> None:

@@ -15,12 +15,12 @@ from udrl.errors import Refused
 from udrl.inference import ActingFunction
 from udrl_actor.behaviors import Behaviors
 from udrl_proto import key_expressions, verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import (
     CommandsRequest,
     Hello,
     JoinRequest,
 )
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
@@ -40,7 +40,7 @@ class Courier(threading.Thread):
         transport: reaches the run.
         hello: the run specification.
         join: the actor's request to join.
-        asker: sends the actor's requests to the replay service.
+        client: sends the actor's requests to the replay service.
         stop: ends the thread.
     """
 
@@ -49,14 +49,14 @@ class Courier(threading.Thread):
         transport: Transport,
         hello: Hello,
         join: JoinRequest,
-        asker: Asker,
+        client: ReplayClient,
         stop: threading.Event,
     ) -> None:
         super().__init__(name=f"courier of {join.id}", daemon=True)
         self._transport = transport
         self._hello = hello
         self._join = join
-        self._asker = asker
+        self._client = client
         self._stop_event = stop
         self._changed = threading.Condition()
         self._assignments: deque[Assignment] = deque()
@@ -64,7 +64,7 @@ class Courier(threading.Thread):
         self._free = 0
         self._steps = 0
         self._acknowledged = False
-        self._behaviors = Behaviors(hello, asker, self._changed)
+        self._behaviors = Behaviors(hello, client, self._changed)
         self.ended = False
         self.error: Exception | None = None
 
@@ -166,7 +166,7 @@ class Courier(threading.Thread):
             env_steps_per_s=round(rate, 1),
             weights_version=self._behaviors.newest,
         )
-        reply = self._asker.ask_joined(verbs.COMMANDS, request, self._join)
+        reply = self._client.request_joined(verbs.COMMANDS, request, self._join)
         if reply.ended:
             self.ended = True
         with self._changed:

@@ -14,9 +14,9 @@ from udrl.acting import Failure
 from udrl.episode import Episode
 from udrl.errors import Refused
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import encode_episode
 from udrl_proto.messages import FailureMessage, JoinRequest
+from udrl_proto.replay_client import ReplayClient
 
 log = logging.getLogger("udrl")
 
@@ -27,11 +27,11 @@ _BYTES_IN_TRANSIT = 256 * 1024
 _LOOK_S = 0.5
 
 
-def deliver(asker: Asker, join: JoinRequest, outcome: Episode | Failure) -> int:
+def deliver(client: ReplayClient, join: JoinRequest, outcome: Episode | Failure) -> int:
     """Deliver the outcome of a command; return the command's id when that is acknowledged.
 
     Args:
-        asker: sends the actor's requests to the replay service.
+        client: sends the actor's requests to the replay service.
         join: the actor's request to join.
         outcome: the command's episode or failure.
 
@@ -43,10 +43,10 @@ def deliver(asker: Asker, join: JoinRequest, outcome: Episode | Failure) -> int:
         command_id = outcome.command.id
         error = str(outcome.error)[:4000]
         failure = FailureMessage(actor=join.id, command_id=command_id, error=error)
-        asker.ask(verbs.FAILURE, failure)
+        client.request(verbs.FAILURE, failure)
         return command_id
     try:
-        asker.ask_joined(verbs.EPISODE, encode_episode(outcome, join.id), join)
+        client.request_joined(verbs.EPISODE, encode_episode(outcome, join.id), join)
     except Refused as refusal:
         if refusal.code != "rejected":
             raise

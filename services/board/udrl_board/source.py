@@ -16,8 +16,8 @@ from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
 from udrl_inspect.obedience_report import ObedienceReport, load_report
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello, Weights, WeightsRequest
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import (
     Contents,
     ContentsRequest,
@@ -152,7 +152,7 @@ class Served:
     def __init__(self, address: Address) -> None:
         self._address = address
         self._stack = ExitStack()
-        self._line: tuple[Asker, Hello] | None = None
+        self._line: tuple[ReplayClient, Hello] | None = None
         self._lock = threading.Lock()
 
     def place(self) -> RunLocation:
@@ -170,21 +170,21 @@ class Served:
 
     def status(self) -> Status:
         """Return the status of the run."""
-        return self._query(lambda asker: asker.ask(verbs.STATUS, StatusRequest()))
+        return self._query(lambda client: client.request(verbs.STATUS, StatusRequest()))
 
     def history(self, after: int) -> History:
         """Return the iterations after one, or the first of them."""
         request = HistoryRequest(after=after)
-        return self._query(lambda asker: asker.ask(verbs.HISTORY, request))
+        return self._query(lambda client: client.request(verbs.HISTORY, request))
 
     def contents(self) -> Contents:
         """Return the contents of the replay buffer."""
-        return self._query(lambda asker: asker.ask(verbs.CONTENTS, ContentsRequest()))
+        return self._query(lambda client: client.request(verbs.CONTENTS, ContentsRequest()))
 
     def weights(self, version: Wanted) -> Weights:
         """Return a weights version that is kept."""
         request = WeightsRequest(version=version)
-        return self._query(lambda asker: asker.ask(verbs.WEIGHTS, request))
+        return self._query(lambda client: client.request(verbs.WEIGHTS, request))
 
     def obedience(self) -> ObedienceReport | None:
         """Return None: the report is in the run's directory, perhaps on another machine."""
@@ -196,19 +196,22 @@ class Served:
             self._line = None
             self._stack.close()
 
-    def _query(self, query: Callable[[Asker], Answer]) -> Answer:
+    def _query(self, query: Callable[[ReplayClient], Answer]) -> Answer:
         with self._lock:
-            asker, _ = self._connected()
+            client, _ = self._connected()
             try:
-                return query(asker)
+                return query(client)
             except Unreachable:
                 self._disconnect()
                 raise
 
-    def _connected(self) -> tuple[Asker, Hello]:
+    def _connected(self) -> tuple[ReplayClient, Hello]:
         if self._line is None:
             transport, hello = self._stack.enter_context(connected("observer", self._address))
-            self._line = Asker(transport, hello.run_id, "the board", patience_s=_ANSWER_S), hello
+            self._line = (
+                ReplayClient(transport, hello.run_id, "the board", patience_s=_ANSWER_S),
+                hello,
+            )
         return self._line
 
     def _disconnect(self) -> None:

@@ -15,13 +15,13 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from udrl.acting import EpisodeGenerator
+from udrl.automatic_settings import choose, scale_fits
 from udrl.commands import CommandSampler
 from udrl.config import Config, change, flat
 from udrl.cost import slow_training_warning
+from udrl.determinism import environment_digest, repeated_digest
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
-from udrl.fitting import choose, fits
-from udrl.repeating import environment_digest, repeated_digest
 
 #: Number of random episodes, and seconds after which no further one is started.
 _EPISODES = 20
@@ -82,7 +82,7 @@ def check(config: Config, automatic: Collection[str] = ()) -> Check:
 
     Args:
         config: the settings of a run.
-        automatic: settings to choose automatically (:mod:`udrl.fitting`).
+        automatic: settings to choose automatically (:mod:`udrl.automatic_settings`).
 
     Raises:
         UnsupportedEnvironment: it cannot be created or is not supported.
@@ -205,7 +205,7 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
         ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
     ):
-        if not fits(scale, size):
+        if not scale_fits(scale, size):
             advice.append(
                 f"{name} = {scale:g} scales values of about {size:.3g} to inputs of about "
                 f"{scale * size:.2g}; the network needs inputs of about 1; try {name} = auto."

@@ -7,9 +7,9 @@ from tempfile import TemporaryDirectory
 
 from udrl import folder as folders
 from udrl.config import change
+from udrl.datasets import write_dataset
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import return_text
-from udrl.offline import write_dataset
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.hub import HUB_SCHEME, upload

@@ -12,8 +12,8 @@ from udrl.config import Budget, build, flat, read_toml
 from udrl.errors import UdrlError
 from udrl_inspect.address import Address, connected, served_at
 from udrl_proto import verbs
-from udrl_proto.asking import Asker
 from udrl_proto.messages import Hello
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.progress import RunProgress
 from udrl_replay.reporting import Throughput, Waits, status
@@ -33,8 +33,8 @@ def status_at(address: Address) -> Status:
         ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
     """
     with connected("observer", address) as (transport, hello):
-        asker = Asker(transport, hello.run_id, "udrl status", patience_s=_ANSWER_S)
-        return asker.ask(verbs.STATUS, StatusRequest())
+        client = ReplayClient(transport, hello.run_id, "udrl status", patience_s=_ANSWER_S)
+        return client.request(verbs.STATUS, StatusRequest())
 
 
 def status_from(

@@ -112,7 +112,7 @@ class Settings(NamedTuple):
         budget: when it ends.
         fleet: its parallelism.
         automatic: settings of ``config`` that are chosen automatically when the run is created
-            (:mod:`udrl.fitting`). Until then their values have no meaning.
+            (:mod:`udrl.automatic_settings`). Until then their values have no meaning.
     """
 
     config: Config

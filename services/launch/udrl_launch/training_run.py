@@ -20,8 +20,8 @@ from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto import verbs
 from udrl_proto.access import ROLES
-from udrl_proto.asking import Asker
 from udrl_proto.credentials import load
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.creation import config_of
 from udrl_replay.reporting import write_weights
@@ -164,7 +164,7 @@ def _watch(
     """Show the status until the services are done or ``stop`` is set."""
     stopped = _StoppedOrFailed(services, stop)
     with connected("observer", address, stopped) as (transport, hello):
-        asker = Asker(transport, hello.run_id, "the display", stopped)
+        client = ReplayClient(transport, hello.run_id, "the display", stopped)
         asked = time.monotonic() - _POLL_S
         while not stop.wait(_CHECK_S):
             services.check()
@@ -174,7 +174,7 @@ def _watch(
                 continue
             asked = time.monotonic()
             try:
-                status = asker.ask(verbs.STATUS, StatusRequest())
+                status = client.request(verbs.STATUS, StatusRequest())
             except (Unreachable, Interrupted) as error:
                 log.debug("no status: %s", error)
                 continue

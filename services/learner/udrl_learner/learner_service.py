@@ -25,7 +25,6 @@ from udrl.training_class import training_class
 from udrl.version import __version__
 from udrl.weights import encode_weights
 from udrl_proto import key_expressions, verbs
-from udrl_proto.asking import Asker
 from udrl_proto.codec import LARGEST, decode, decode_episode, encode
 from udrl_proto.messages import (
     ChangesRequest,
@@ -37,6 +36,7 @@ from udrl_proto.messages import (
     VersionMessage,
     Weights,
 )
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
@@ -82,7 +82,7 @@ class LearnerService:
         self._spec = hello.environment
         self._name = name
         self._stop = stop
-        self._asker = Asker(transport, hello.run_id, f"learner {name}", stop)
+        self._client = ReplayClient(transport, hello.run_id, f"learner {name}", stop)
         self._progress = threading.Event()
         self._delivered = False
 
@@ -97,7 +97,7 @@ class LearnerService:
         run_id = self._hello.run_id
         declared: list[Any] = []
         try:
-            self._asker.ask(verbs.JOIN, self._join)
+            self._client.request(verbs.JOIN, self._join)
             declared += [
                 self._transport.declare_presence(
                     key_expressions.alive(run_id, "learner", self._name)
@@ -157,7 +157,7 @@ class LearnerService:
     def _latest(self) -> TrainingState:
         """Return the state of the replay service's latest version."""
         request = StateRequest(learner=self._name)
-        reply = self._asker.ask(verbs.STATE, request)
+        reply = self._client.request(verbs.STATE, request)
         if reply.version == 0:
             return untrained(self._config, self._spec)
         log.info("learner %s continues from weights version %d", self._name, reply.version)
@@ -237,7 +237,7 @@ class LearnerService:
         while not useless.is_set():
             self._progress.clear()
             request = ChangesRequest(learner=self._name, version=version)
-            changes = self._asker.ask_joined(verbs.CHANGES, request, self._join)
+            changes = self._client.request_joined(verbs.CHANGES, request, self._join)
             if changes.ended:
                 break
             if changes.wait is None:
@@ -251,13 +251,13 @@ class LearnerService:
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
             request = EpisodesRequest(ids=tuple(left[:_ASK_FOR]))
-            page = self._asker.ask(verbs.EPISODES, request)
+            page = self._client.request(verbs.EPISODES, request)
             messages = [decode(body, EpisodeMessage, LARGEST) for body in page.episodes]
             episodes += [decode_episode(m, self._spec.observation_space) for m in messages]
         return episodes
 
     def _deliver(self, message: VersionMessage) -> None:
-        self._asker.ask_joined(verbs.VERSION, message, self._join)
+        self._client.request_joined(verbs.VERSION, message, self._join)
         self._delivered = True
         # Without acknowledgement, so that a stopped actor cannot stall training. An actor that
         # misses this requests the weights from the replay service.

@@ -2,8 +2,8 @@
 
 import math
 
+from udrl.automatic_settings import scale_fits
 from udrl.evaluation import return_text
-from udrl.fitting import fits
 from udrl.setting_groups import NetworkSettings
 from udrl_proto.reports import IterationStatus
 from udrl_replay.run_state import RunState
@@ -48,7 +48,7 @@ def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
         ("return_scale", network.return_scale, "returns", size),
         ("horizon_scale", network.horizon_scale, "lengths", length),
     ):
-        if not fits(scale, usual):
+        if not scale_fits(scale, usual):
             return (
                 f"{name} = {scale:g}: it scales the warm-up's typical {what} of {usual:.3g} to "
                 f"{scale * usual:.2g}, but the network needs values around 1; try {name} = auto"

@@ -12,15 +12,15 @@ from pathlib import Path
 import msgspec
 
 from udrl.acting import EpisodeGenerator
+from udrl.automatic_settings import resolve_automatic
 from udrl.config import Budget, Config, flat
 from udrl.cost import slow_training_warning
+from udrl.datasets import resolve_dataset
+from udrl.determinism import repeated_digest
 from udrl.episode import Episode
 from udrl.errors import StoreError
-from udrl.fitting import fit
 from udrl.graph import acting_graph
 from udrl.numerics import resolve_arithmetic
-from udrl.offline import resolve_dataset
-from udrl.repeating import repeated_digest
 from udrl.strategies import make_strategy
 from udrl.version import __version__
 from udrl_proto import PROTOCOL
@@ -71,7 +71,8 @@ def create(
     Args:
         run_dir: its directory.
         config: its settings.
-        automatic: settings to choose by properties of the environment (:mod:`udrl.fitting`).
+        automatic: settings to choose by properties of the environment
+            (:mod:`udrl.automatic_settings`).
         allow_inexact: accept services of other numerics classes.
 
     Raises:
@@ -101,7 +102,7 @@ def _create(
     make_strategy(config)
     if automatic:
         log.info("choosing settings by random episodes of %s", config.environment)
-    config = resolve_arithmetic(fit(config, automatic))
+    config = resolve_arithmetic(resolve_automatic(config, automatic))
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First and in a fresh instance, as actors do.
         digest = repeated_digest(generator)

@@ -11,9 +11,9 @@ import msgspec
 from udrl.acting import EpisodeGenerator
 from udrl.commands import CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Config, flat
+from udrl.determinism import difference, environment_digest
 from udrl.errors import EnvironmentFault, OtherConfiguration
 from udrl.numerics import resolve_as
-from udrl.repeating import difference, environment_digest
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.progress import RunProgress

@@ -56,7 +56,7 @@ def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
         raise ConfigError(
             f"behavior {name!r} cannot be created: {type(error).__name__}: {error}; name a class "
             f"that is importable here, as package.module:Class, and takes a specification and "
-            f"settings (udrl.custom)"
+            f"settings (udrl.custom_networks)"
         ) from error
     if not isinstance(made, nn.Module):
         raise ConfigError(f"behavior {name!r} is {type(made).__name__}, expected a torch.nn.Module")
@@ -86,7 +86,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
             raise
         raise ConfigError(
             f"behavior {network.behavior!r} cannot be computed or exported: "
-            f"{type(error).__name__}: {error}; see udrl.custom for its requirements"
+            f"{type(error).__name__}: {error}; see udrl.custom_networks for its requirements"
         ) from error
     trained = {name for name, tensor in module.named_parameters() if tensor.requires_grad}
     if others := sorted(module.state_dict().keys() - trained):

@@ -12,8 +12,8 @@ from tests.foreign.conventions import Plain, register
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config, build
+from udrl.determinism import difference
 from udrl.errors import Deceived, OtherConfiguration
-from udrl.repeating import difference
 from udrl.streams import Purpose, stream_key
 from udrl_inspect.inspection import read_status
 from udrl_proto.messages import Hello

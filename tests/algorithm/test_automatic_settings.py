@@ -9,9 +9,9 @@ import pytest
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
+from udrl.automatic_settings import Sample, choose, resolve_automatic, scale_fits
 from udrl.config import AUTOMATIC, Budget, Config, build, change
 from udrl.episode import Episode
-from udrl.fitting import Sample, choose, fit, fits
 
 
 class Endless(gym.Env[Any, Any]):
@@ -74,26 +74,26 @@ def test_scales_are_the_inverse_of_typical_values(
 def test_explicit_values_are_kept() -> None:
     generator = EpisodeGenerator(config(), 1)
     given = config(return_scale=0.5, horizon_scale=0.5)
-    assert fit(given, ()) == given
+    assert resolve_automatic(given, ()) == given
     half = choose(given, ("horizon_scale",), generator).network
     assert half.return_scale == 0.5
     assert half.horizon_scale != 0.5
 
 
 def test_choice_is_independent_of_the_number_of_environments() -> None:
-    fitted = [choose(config(), AUTOMATIC, EpisodeGenerator(config(), n)) for n in (1, 7)]
-    assert fitted[0] == fitted[1]
-    assert 0.01 < fitted[0].network.return_scale < 0.1
+    resolved = [choose(config(), AUTOMATIC, EpisodeGenerator(config(), n)) for n in (1, 7)]
+    assert resolved[0] == resolved[1]
+    assert 0.01 < resolved[0].network.return_scale < 0.1
 
 
 def test_algorithm_1_chooses_automatic_settings() -> None:
     small = {"n_warm_up_episodes": 4, "n_episodes_per_iter": 2, "n_updates_per_iter": 2,
              "batch_size": 16, "replay_size": 10, "last_few": 2}  # fmt: skip
-    fitted = fit(config(**small), SCALES)
+    resolved = resolve_automatic(config(**small), SCALES)
     budget = Budget(max_env_steps=300)
     ways = [
         algorithm1(config(**small), budget, automatic=SCALES),
-        algorithm1(fitted, budget),
+        algorithm1(resolved, budget),
     ]
     assert ways[0].weights_sha256 == ways[1].weights_sha256
 
@@ -137,17 +137,17 @@ def test_baseline_is_action_value_in_stochastic_environments(slippery: bool, exp
         Config,
         {"environment": "FrozenLake-v1", "environment_kwargs": {"is_slippery": slippery}},
     )
-    fitted = choose(
+    resolved = choose(
         settings,
         ("baseline", "horizon_scale", "held_actions", "held_rate"),
         EpisodeGenerator(settings, 1),
     )
-    assert fitted.network.baseline == expected
-    assert (fitted.network.horizon_scale == 0) is slippery
-    assert fitted.commands.held_actions == (0.5 if slippery else 0.25)
-    assert fitted.commands.held_rate == (0.15 if slippery else 0.05)
+    assert resolved.network.baseline == expected
+    assert (resolved.network.horizon_scale == 0) is slippery
+    assert resolved.commands.held_actions == (0.5 if slippery else 0.25)
+    assert resolved.commands.held_rate == (0.15 if slippery else 0.05)
     everything = change(settings, segments="all")
-    assert fit(everything, ["baseline"]).network.baseline == "none"
+    assert resolve_automatic(everything, ["baseline"]).network.baseline == "none"
 
 
 @pytest.mark.parametrize(
@@ -155,52 +155,54 @@ def test_baseline_is_action_value_in_stochastic_environments(slippery: bool, exp
     [(1.0, 0.0, True), (0.01, 500.0, True), (0.01, 5.0, False), (0.0, 5.0, True)],
 )
 def test_scale_is_checked_against_typical_values(scale: float, size: float, good: bool) -> None:
-    assert fits(scale, size) is good
+    assert scale_fits(scale, size) is good
 
 
 @pytest.mark.parametrize(("environment", "expected"), [("MountainCar-v0", 32), ("CartPole-v1", 1)])
 def test_actions_are_held_where_one_step_has_little_effect(environment: str, expected: int) -> None:
     settings = config(environment=environment)
-    fitted = choose(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
-    assert fitted.warm_up_hold == expected
-    assert fitted.hold_steps == settings.commands.hold_steps
+    resolved = choose(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
+    assert resolved.warm_up_hold == expected
+    assert resolved.hold_steps == settings.commands.hold_steps
 
 
 @pytest.mark.parametrize(("length", "expected"), [(9, 0.95), (80, 0.95), (200, 0.98), (500, 0.992)])
 def test_return_lambda_follows_the_length_of_episodes(length: int, expected: float) -> None:
     settings = config()
     generator = EpisodeGenerator(settings, 1)
-    fitted = choose(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
-    assert fitted.training.return_lambda == expected
+    resolved = choose(settings, ("return_lambda",), generator, episodes((1.0, length)) * 3)
+    assert resolved.training.return_lambda == expected
 
 
 def test_long_episodes_are_sampled_in_part() -> None:
     endless = config(environment=Endless.id)
     with closing(EpisodeGenerator(endless, 1)) as generator:
-        fitted = choose(endless, AUTOMATIC, generator)
+        resolved = choose(endless, AUTOMATIC, generator)
     assert Endless.steps <= 60_000
-    assert fitted.network.horizon_scale == 0.0005
-    assert fitted.commands.n_warm_up_episodes == 50
+    assert resolved.network.horizon_scale == 0.0005
+    assert resolved.commands.n_warm_up_episodes == 50
 
 
 def test_short_episodes_make_a_longer_warm_up() -> None:
     settings = config(environment="FrozenLake-v1")
-    fitted = choose(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
-    assert 300 < fitted.n_warm_up_episodes < 1_000  # of about 8 steps
+    resolved = choose(settings, ("n_warm_up_episodes",), EpisodeGenerator(settings, 1)).commands
+    assert 300 < resolved.n_warm_up_episodes < 1_000  # of about 8 steps
 
 
 def test_dataset_sets_the_number_of_warm_up_episodes() -> None:
     settings = config(n_warm_up_episodes=3)
-    fitted = choose(settings, AUTOMATIC, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
-    assert fitted.commands.n_warm_up_episodes == 3
-    assert fitted.commands.warm_up_hold == 1
+    resolved = choose(settings, AUTOMATIC, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
+    assert resolved.commands.n_warm_up_episodes == 3
+    assert resolved.commands.warm_up_hold == 1
 
 
 @pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])
 def test_time_left_is_observed_if_random_episodes_last_half_the_step_limit(
     environment: str, shown: bool
 ) -> None:
-    assert fit(config(environment=environment), ("observe_time",)).observe_time is shown
+    assert (
+        resolve_automatic(config(environment=environment), ("observe_time",)).observe_time is shown
+    )
 
 
 @pytest.mark.parametrize(

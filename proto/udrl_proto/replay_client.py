@@ -27,7 +27,7 @@ PATIENCE_S = 300.0
 _JOINS = 5
 
 
-class Asker:
+class ReplayClient:
     """Sends one service's requests to the replay service of a run.
 
     Args:
@@ -52,7 +52,7 @@ class Asker:
         self._stop = stop or threading.Event()
         self._patience_s = patience_s
 
-    def ask(self, verb: Verb[Request, Reply], request: Request | bytes) -> Reply:
+    def request(self, verb: Verb[Request, Reply], request: Request | bytes) -> Reply:
         """Send a request and return the reply.
 
         Args:
@@ -70,15 +70,15 @@ class Asker:
         pause, attempt_s = 0.02, ATTEMPT_S
         warn_at = 2.0
         while not self._stop.is_set():
-            asked = time.monotonic()
+            sent = time.monotonic()
             key = key_expressions.key(self._run_id, verb.name)
-            for answer in self._transport.ask(key, payload, attempt_s):
+            for answer in self._transport.query(key, payload, attempt_s):
                 if answer.is_problem:
                     problem = decode(answer.data, Problem)
                     raise Refused(problem.code, printable(problem.message))
                 return decode(answer.data, verb.reply, verb.reply_limit)
             now = time.monotonic()
-            if now - asked >= attempt_s:
+            if now - sent >= attempt_s:
                 attempt_s = min(2 * attempt_s, LONGEST_ATTEMPT_S)
             waited = now - began
             if waited >= self._patience_s:
@@ -96,15 +96,15 @@ class Asker:
             pause = min(2 * pause, 1.0)
         raise Interrupted(f"{self._who} was stopped while waiting for {verb.name!r}")
 
-    def ask_joined(
+    def request_joined(
         self, verb: Verb[Request, Reply], request: Request | bytes, join: JoinRequest
     ) -> Reply:
-        """Send a request as :meth:`ask` does; rejoin if the replay service was restarted."""
+        """Send a request as :meth:`request` does; rejoin if the replay service was restarted."""
         for _ in range(_JOINS):
             try:
-                return self.ask(verb, request)
+                return self.request(verb, request)
             except Refused as refusal:
                 if refusal.code != "join_first":
                     raise
-            self.ask(JOIN, join)
-        return self.ask(verb, request)
+            self.request(JOIN, join)
+        return self.request(verb, request)

@@ -12,9 +12,8 @@ import pytest
 import zenoh
 
 from udrl.errors import Interrupted, InvalidMessage, Refused, Unreachable
-from udrl_proto import asking, key_expressions, verbs
+from udrl_proto import key_expressions, replay_client, verbs
 from udrl_proto.answering import Question, serve
-from udrl_proto.asking import Asker
 from udrl_proto.codec import SMALL, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
@@ -24,6 +23,7 @@ from udrl_proto.messages import (
     StateReply,
     StateRequest,
 )
+from udrl_proto.replay_client import ReplayClient
 from udrl_proto.session import connect
 from udrl_proto.transport import Answer, Transport
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -47,18 +47,20 @@ def inbox(router: zenoh.Session) -> Questions:
 
 
 @pytest.fixture
-def asker(client: zenoh.Session) -> Asker:
-    return Asker(ZenohTransport(client), RUN, "learner l", patience_s=WAIT_S)
+def learner(client: zenoh.Session) -> ReplayClient:
+    return ReplayClient(ZenohTransport(client), RUN, "learner l", patience_s=WAIT_S)
 
 
 @pytest.fixture
-def ask(asker: Asker) -> Iterator[Ask]:
+def ask(learner: ReplayClient) -> Iterator[Ask]:
     """Sends a request from another thread."""
     with ThreadPoolExecutor(1) as thread:
 
         def submit(request: Any = REQUEST, limit: int = SMALL) -> Future[StateReply]:
             return thread.submit(
-                lambda: asker.ask(dataclasses.replace(verbs.STATE, reply_limit=limit), request)
+                lambda: learner.request(
+                    dataclasses.replace(verbs.STATE, reply_limit=limit), request
+                )
             )
 
         yield submit
@@ -106,18 +108,18 @@ def test_problem_is_raised_with_its_code(inbox: Questions, ask: Ask) -> None:
     assert caught.value.code == "rewind"
 
 
-def test_unanswered_request_is_retried(router: zenoh.Session, asker: Asker) -> None:
+def test_unanswered_request_is_retried(router: zenoh.Session, learner: ReplayClient) -> None:
     answer_each(router, zenoh.Query.drop, zenoh.Query.drop, answer)
-    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
+    assert learner.request(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_timed_out_request_is_retried(
-    router: zenoh.Session, asker: Asker, monkeypatch: pytest.MonkeyPatch
+    router: zenoh.Session, learner: ReplayClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asking, "ATTEMPT_S", 0.1)
+    monkeypatch.setattr(replay_client, "ATTEMPT_S", 0.1)
     hanging: list[zenoh.Query] = []
     answer_each(router, hanging.append, answer)
-    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
+    assert learner.request(verbs.STATE, REQUEST) == ANSWER
     hanging.pop().drop()
 
 
@@ -126,7 +128,7 @@ def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch
     attempts: list[float] = []
 
     class SilentTransport:
-        def ask(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
+        def query(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
             nonlocal now
             now += timeout_s
             attempts.append(timeout_s)
@@ -136,34 +138,36 @@ def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch
         def wait(self, timeout: float | None = None) -> bool:
             return False
 
-    monkeypatch.setattr(asking, "time", SimpleNamespace(monotonic=lambda: now))
-    asker = Asker(cast(Transport, SilentTransport()), RUN, "learner l", NoPause(), patience_s=100.0)
+    monkeypatch.setattr(replay_client, "time", SimpleNamespace(monotonic=lambda: now))
+    learner = ReplayClient(
+        cast(Transport, SilentTransport()), RUN, "learner l", NoPause(), patience_s=100.0
+    )
     with pytest.raises(Unreachable):
-        asker.ask(verbs.STATE, REQUEST)
+        learner.request(verbs.STATE, REQUEST)
     assert attempts == [3.0, 6.0, 12.0, 24.0, 30.0, 30.0]
 
 
-def test_foreign_error_reply_is_ignored(router: zenoh.Session, asker: Asker) -> None:
+def test_foreign_error_reply_is_ignored(router: zenoh.Session, learner: ReplayClient) -> None:
     answer_each(router, lambda query: query.reply_err(b"router is busy"), answer)
-    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
+    assert learner.request(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_service_that_starts_later_is_found(
-    router: zenoh.Session, asker: Asker, monkeypatch: pytest.MonkeyPatch
+    router: zenoh.Session, learner: ReplayClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class FirstPause(threading.Event):
         def wait(self, timeout: float | None = None) -> bool:
             answer_each(router, answer)
             return False
 
-    monkeypatch.setattr(asker, "_stop", FirstPause())
-    assert asker.ask(verbs.STATE, REQUEST) == ANSWER
+    monkeypatch.setattr(learner, "_stop", FirstPause())
+    assert learner.request(verbs.STATE, REQUEST) == ANSWER
 
 
 def test_request_without_reply_raises_unreachable(client: zenoh.Session) -> None:
-    asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
+    learner = ReplayClient(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable, match=r"^learner l got no reply to 'state' from .* of run in"):
-        asker.ask(verbs.STATE, REQUEST)
+        learner.request(verbs.STATE, REQUEST)
 
 
 def test_long_wait_is_logged_with_service_and_verb(
@@ -177,10 +181,10 @@ def test_long_wait_is_logged_with_service_and_verb(
     clock = SimpleNamespace(
         monotonic=lambda: next(seconds)
     )  # every reading advances the clock by a second
-    monkeypatch.setattr(asking, "time", clock)
-    asker = Asker(ZenohTransport(client), RUN, "learner l", NoPause(), patience_s=5.0)
+    monkeypatch.setattr(replay_client, "time", clock)
+    learner = ReplayClient(ZenohTransport(client), RUN, "learner l", NoPause(), patience_s=5.0)
     with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
-        asker.ask(verbs.STATE, REQUEST)
+        learner.request(verbs.STATE, REQUEST)
     assert [record.getMessage() for record in caplog.records] == [
         "learner l has been waiting 2 s for the replay service to answer 'state'",
         "learner l has been waiting 4 s for the replay service to answer 'state'",
@@ -189,9 +193,9 @@ def test_long_wait_is_logged_with_service_and_verb(
 
 def test_request_can_be_interrupted(client: zenoh.Session) -> None:
     stop = threading.Event()
-    asker = Asker(ZenohTransport(client), RUN, "learner l", stop)
+    learner = ReplayClient(ZenohTransport(client), RUN, "learner l", stop)
     with ThreadPoolExecutor(1) as thread:
-        future = thread.submit(lambda: asker.ask(verbs.STATE, REQUEST))
+        future = thread.submit(lambda: learner.request(verbs.STATE, REQUEST))
         stop.set()
         with pytest.raises(Interrupted, match="learner l was stopped while waiting for 'state'"):
             future.result(WAIT_S)
@@ -279,7 +283,7 @@ def test_undeclared_service_receives_no_requests(
     inbox: Inbox[Any] = Inbox(100, 1000)
     for queryable in serve(ZenohTransport(router), RUN, inbox, [STATE]):
         queryable.undeclare()
-    asker = Asker(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
+    learner = ReplayClient(ZenohTransport(client), RUN, "learner l", patience_s=0.05)
     with pytest.raises(Unreachable):
-        asker.ask(verbs.STATE, REQUEST)
+        learner.request(verbs.STATE, REQUEST)
     assert inbox.take(1, 1, 0.0) == []

@@ -1,7 +1,7 @@
 """Automatic settings: values chosen from random episodes of the environment.
 
 Good values depend on the length of episodes and on the magnitude of returns. Settings that are
-``auto`` (:data:`OPEN`) are chosen when a run is created, from random episodes. A
+``auto`` (:data:`udrl.config.AUTOMATIC`) are chosen when a run is created, from random episodes. A
 :class:`udrl.config.Config` holds the chosen values.
 """
 
@@ -15,8 +15,8 @@ import msgspec
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import CommandSampler
 from udrl.config import AUTOMATIC, Config, change
+from udrl.datasets import resolve_dataset
 from udrl.episode import Episode
-from udrl.offline import resolve_dataset
 
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500
@@ -37,7 +37,7 @@ _WARM_UP, _WARM_UP_STEPS = 50, 4_000
 _MIN_LAMBDA, _REACH = 0.95, 4.0
 
 
-def fit(config: Config, automatic: Collection[str]) -> Config:
+def resolve_automatic(config: Config, automatic: Collection[str]) -> Config:
     """Return the settings of a new run, with values for the automatic ones.
 
     This makes one environment, and only if a setting is automatic.
@@ -181,7 +181,7 @@ def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
     return sample
 
 
-def fits(scale: float, size: float) -> bool:
+def scale_fits(scale: float, size: float) -> bool:
     """Return whether a scale turns values of a magnitude into suitable network inputs."""
     return 0.0 in (size, scale) or _MIN_INPUT <= scale * size <= _MAX_INPUT
 
