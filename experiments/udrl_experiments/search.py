@@ -215,11 +215,16 @@ def _study(
         for number in range(_configurations(plan, subject.space, configurations))
     }
 
-    def finalists(root: Path) -> dict[tuple[str, Algorithm, int], list[Job]]:
+    def in_final(environment: str, algorithm: Algorithm, number: int) -> list[Job]:
         if final is None:
-            return {}
+            return []
         longer = plan._replace(max_env_steps=final.max_env_steps)
-        found: dict[tuple[str, Algorithm, int], list[Job]] = {}
+        return runs_of(environment, algorithm, number, longer)
+
+    def finalists(root: Path) -> list[Job]:
+        if final is None:
+            return []
+        found: list[Job] = []
         for environment, subject in by_environment.items():
             for algorithm in subject.algorithms:
                 scored = [
@@ -229,7 +234,7 @@ def _study(
                     and (value := _score(runs, root)) is not None
                 ]
                 best = sorted(scored, key=lambda pair: -pair[0])[: final.configurations]
-                found |= {key: runs_of(*key, longer) for _, key in best}
+                found += [job for _, key in best for job in in_final(*key)]
         return found
 
     def run_all(
@@ -240,11 +245,12 @@ def _study(
         echo: Callable[[str], None],
     ) -> None:
         run_jobs(planned, root, side_by_side, stop, echo)
-        if longer := [job for runs in finalists(root).values() for job in runs]:
+        if longer := finalists(root):
             run_jobs(longer, root, side_by_side, stop, echo)
 
     def report(folders: StudyFolders) -> str:
-        finals = finalists(folders.root)
+        # A finalist's score also counts evaluations of its longer run, so the finalists may differ
+        # from those that were run. What was run is reported.
         rows = [
             Scored(
                 environment=environment,
@@ -253,7 +259,7 @@ def _study(
                 seeds=len(runs),
                 score=_score(runs, folders.root),
                 settings=json.dumps(by_environment[environment].space.draw(algorithm, number)),
-                final_score=_score(finals.get((environment, algorithm, number), []), folders.root),
+                final_score=_score(in_final(environment, algorithm, number), folders.root),
             )
             for (environment, algorithm, number), runs in jobs.items()
         ]
