@@ -44,7 +44,7 @@ def resolve_automatic(config: Config, automatic: Collection[str]) -> Config:
 
     Args:
         config: the settings; the values of automatic ones are ignored.
-        automatic: names of the automatic settings, among :data:`udrl.config.OPEN`.
+        automatic: names of the automatic settings, among :data:`udrl.config.AUTOMATIC`.
 
     Raises:
         ConfigError: the settings are not compatible with the chosen values, or the dataset cannot
@@ -69,7 +69,7 @@ def choose(
 
     Args:
         config: the settings; the values of automatic ones are ignored.
-        automatic: names of the automatic settings, among :data:`udrl.config.OPEN`.
+        automatic: names of the automatic settings, among :data:`udrl.config.AUTOMATIC`.
         generator: runs the first commands of the warm-up.
         episodes: episodes to use instead of these.
 

@@ -60,5 +60,5 @@ class ReturnInTime:
         desired[:, 1] -= 1.0
 
     def bound(self, desired: Desired, cap: npt.NDArray[np.float64]) -> None:
-        """Cap desired returns in place, at ``cap``, float64 [rows] (section 2.3.6)."""
+        """Cap desired returns in place, at ``cap``, float64 [rows] (section 2.3.2)."""
         np.minimum(desired[:, 0], cap, out=desired[:, 0])

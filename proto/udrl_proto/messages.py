@@ -207,7 +207,7 @@ class EpisodesRequest(Message, frozen=True, kw_only=True):
 
 
 class EpisodesReply(Message, frozen=True, kw_only=True):
-    """The first requested episodes, up to 4 MB but at least one; request the rest again."""
+    """The first requested episodes, up to 4 MiB but at least one; request the rest again."""
 
     episodes: tuple[bytes, ...]
 

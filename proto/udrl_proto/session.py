@@ -150,7 +150,7 @@ def _check_audience(endpoint: str, *, insecure: bool, secure: bool) -> None:
 
 def _cannot_listen(endpoint: str, error: Exception) -> ConfigError:
     return ConfigError(
-        f"cannot listen on {endpoint!r}: {error}; is the port in use? choose another endpoint"
+        f"cannot listen on {endpoint!r}: {error}; free the port, or choose another endpoint"
     )
 
 

@@ -483,7 +483,7 @@ FAULTS = {
     "raises in reset": "reset() raised RuntimeError: no more worlds (test_acting.py, line ",
     "raises in step": "step() raised RuntimeError: the world has ended (test_acting.py, line ",
     "returns four values": "step() returned a tuple of 4, expected (observation, reward, ",
-    "observes a matrix": "step() returned as observation an array of float32, shape (2, 2), decl",
+    "observes a matrix": "step() returned observation: an array of float32, shape (2, 2), exp",
     "observes NaN": f"observations are {NOT_FINITE}",
     "observes infinity": f"observations are {NOT_FINITE}",
     "rewards nan": "step() returned the reward nan, expected a finite number",

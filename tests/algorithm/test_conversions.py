@@ -184,9 +184,9 @@ def corrupt(where: Callable[[Any], Any]) -> Any:
     ("value", "message"),
     [
         (corrupt(lambda v: v | {"map": np.zeros((4, 5), np.uint8)}),
-         r"observation\['map'\] an array of uint8, shape \(4, 5\), declared is Box"),
+         r"observation\['map'\]: an array of uint8, shape \(4, 5\), expected an element of Box"),
         (corrupt(lambda v: v | {"inventory": (3, *v["inventory"][1:])}),
-         r"observation\['inventory'\]\[0\] 3 \(int.*\), declared is Discrete\(3\)"),
+         r"observation\['inventory'\]\[0\]: 3 \(int.*\), expected an element of Discrete\(3\)"),
         (corrupt(lambda v: v | {"inventory": v["inventory"][:2]}),
          r"a dict of 'inventory', 'map', without observation\['inventory'\]\[2\]"),
         (corrupt(lambda v: {"map": v["map"]}), r"without observation\['inventory'\]\[0\]"),
@@ -201,9 +201,11 @@ def test_invalid_observation_is_rejected_with_its_leaf(value: Any, message: str)
 
 def test_action_component_out_of_range_is_rejected() -> None:
     conversion = observation_conversion(spaces.MultiDiscrete([2, 3]))
-    with pytest.raises(InvalidData, match=r"observation \[1, 3\], declared is MultiDiscrete"):
+    with pytest.raises(
+        InvalidData, match=r"observation: \[1, 3\], expected an element of MultiDiscrete"
+    ):
         conversion.one(np.array([1, 3]))
-    with pytest.raises(InvalidData, match="declared is MultiDiscrete"):
+    with pytest.raises(InvalidData, match="expected an element of MultiDiscrete"):
         conversion.one(np.array([0.5, 1.0]))
 
 
@@ -216,7 +218,7 @@ def test_action_component_out_of_range_is_rejected() -> None:
                 a=spaces.Discrete(2),
                 b=spaces.Tuple((spaces.Text(4), spaces.Sequence(spaces.Discrete(2)))),
             ),
-            r"its observation\['b'\]\[0\] is Text.*besides.*\['b'\]\[1\] is Sequence",
+            r"its observation\['b'\]\[0\] is Text.*also.*\['b'\]\[1\] is Sequence",
         ),
         (
             spaces.Dict(say=spaces.Text(4), see=spaces.Discrete(2)),

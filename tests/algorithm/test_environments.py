@@ -226,7 +226,7 @@ def test_discrete_actions_with_offset_are_shifted_to_zero(register: Register) ->
     [
         (spaces.Text(4), spaces.Discrete(2), "its observation is Text"),
         (VECTOR, spaces.Box(-np.inf, np.inf, (2,)), "has no bounds"),
-        (spaces.Text(4), spaces.Text(4), "its observation is Text.*besides, its action is Text"),
+        (spaces.Text(4), spaces.Text(4), "its observation is Text.*also, its action is Text"),
     ],
     ids=str,
 )

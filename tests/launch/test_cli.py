@@ -34,8 +34,8 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
         ),
         (
             ["train", "X-v0", "--max-env-steps", "much"],
-            "invalid value for '--max-env-steps': 'much' is not a number of steps, e.g. 500K, "
-            "10M, 1e6 or 250000",
+            "invalid value for '--max-env-steps': 'much': expected a number of steps from 1 to "
+            "2^53, e.g. 500K, 10M, 1e6 or 250000",
         ),
         (
             ["train", "X-v0", "--set", "batchsize=2"],

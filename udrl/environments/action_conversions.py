@@ -146,7 +146,7 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
         problems.append(f"its actions are {space}, for which the network would have {n:,} outputs; "
                         f"at most {_MAX_PARAMETERS:,} are supported")  # fmt: skip
     if problems:
-        raise UnsupportedEnvironment("; besides, ".join(problems))
+        raise UnsupportedEnvironment("; also, ".join(problems))
     if [path for path, _ in leaves] == [()]:
         return parts[0][1]
     return _Joined("action", space, parts)

@@ -72,7 +72,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             returned: Any = self.env.step(self.actions.back_one(action))
         except ValueError as error:
             if str(error).endswith(_OLD_STEP):  # raised by Gymnasium's wrappers
-                raise _wrong("step", "a tuple of 4", f"{_STEP}, as since Gym 0.26") from error
+                raise _wrong("step", "a tuple of 4", f"{_STEP}, required since Gym 0.26") from error
             raise
         if type(returned) is not tuple or len(returned) != 5:
             raise _wrong("step", describe(returned), _STEP)
@@ -95,7 +95,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         try:
             return self.observations.one(observation)
         except InvalidData as error:
-            raise EnvironmentFault(f"{where}() returned as {error}") from error
+            raise EnvironmentFault(f"{where}() returned {error}") from error
 
 
 def close(env: gym.Env[Any, Any]) -> None:

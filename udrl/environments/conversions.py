@@ -78,7 +78,9 @@ class Conversion(ABC):
         return self.back(np.asarray(value)[None])[0]
 
     def _fault(self, value: Any) -> InvalidData:
-        return InvalidData(f"{self.name} {describe(value)}, declared is {self.declared}")
+        return InvalidData(
+            f"{self.name}: {describe(value)}, expected an element of {self.declared}"
+        )
 
 
 class Boxed(Conversion):
@@ -194,9 +196,9 @@ class MultiIndexed(Conversion):
         shifted = array.reshape(*leading, -1).astype(np.int64) - self._start
         if ((shifted < 0) | (shifted >= self._ns)).any():
             raise InvalidData(
-                f"{self.name} {array.tolist()}, declared is {self.declared}"
+                f"{self.name}: {array.tolist()}, expected an element of {self.declared}"
                 if array.size <= _FEW
-                else f"{self.name} with an invalid index, declared is {self.declared}"
+                else f"{self.name}: an invalid index, expected an element of {self.declared}"
             )
         return shifted.astype(self.plain.dtype)
 
@@ -232,8 +234,8 @@ class _Records(Conversion):
                 found = leaf.find(value)
             except LookupError:
                 raise InvalidData(
-                    f"{self.name} {describe(value)}, without {conversion.name}, declared is "
-                    f"{self.declared}"
+                    f"{self.name}: {describe(value)}, without {conversion.name}, expected an "
+                    f"element of {self.declared}"
                 ) from None
             record[leaf.name] = (
                 conversion.convert(found, leading) if leading else conversion.one(found)
@@ -312,7 +314,7 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
         except UnsupportedEnvironment as error:
             problems.append(str(error))
     if problems:
-        raise UnsupportedEnvironment("; besides, ".join(problems))
+        raise UnsupportedEnvironment("; also, ".join(problems))
     return _Records("observation", space, parts)
 
 

@@ -195,7 +195,7 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
         )
     if observations is None or actions is None or problems:
         close(env)
-        raise UnsupportedEnvironment(f"environment {name!r}: {'; besides, '.join(problems)}")
+        raise UnsupportedEnvironment(f"environment {name!r}: {'; also, '.join(problems)}")
     return Adapter(env, observations, actions)
 
 

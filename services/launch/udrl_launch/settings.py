@@ -81,7 +81,9 @@ def read_steps(text: str) -> int:
         exponent = factors[suffix] if suffix in factors else int(suffix[1:])
         steps = round(number.scaleb(exponent))
     if not 1 <= steps <= 2**53:
-        raise ConfigError(f"{text!r} is not a number of steps, e.g. 500K, 10M, 1e6 or 250000")
+        raise ConfigError(
+            f"{text!r}: expected a number of steps from 1 to 2^53, e.g. 500K, 10M, 1e6 or 250000"
+        )
     return steps
 
 

@@ -14,7 +14,7 @@ from udrl_launch.paths import STARTED_IN, environment_of_children
 
 log = logging.getLogger("udrl")
 
-#: Exit codes that a restart would only repeat (``docs/operations.md``).
+#: Exit codes that a restart would only repeat (``docs/operations-reference.md``).
 FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
 #: Deaths of a child without progress in between after which the run fails.

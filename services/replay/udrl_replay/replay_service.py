@@ -143,7 +143,7 @@ class ReplayService:
         """
         run_id = self.run.hello.run_id
         declared = self.open()
-        log.info("replay serves run %s", run_id)
+        log.info("serving run %s", run_id)
         if self.run.progress.state == "ended":
             log.info("the run has ended; increase --max-env-steps to continue it")
         try:
