@@ -24,6 +24,22 @@ def negative_log_likelihood(space: ActionSpace, parameters: Tensor, action: Tens
     return sum(losses[1:], losses[0])
 
 
+def kl_divergence(space: ActionSpace, parameters: Tensor, others: Tensor) -> Tensor:
+    """Return the KL divergence of P from another distribution, in nats, float32 [batch].
+
+    Args:
+        space: the action space.
+        parameters: parameters of P, float32 [batch, n_parameters].
+        others: parameters of the other distribution, likewise.
+    """
+    ns = space.ns if isinstance(space, Product) else (space.n,)
+    total = parameters.new_zeros(len(parameters))
+    for p, q in zip(parameters.split(ns, dim=1), others.split(ns, dim=1), strict=True):
+        log_p, log_q = p.log_softmax(1), q.log_softmax(1)
+        total = total + (log_p.exp() * (log_p - log_q)).sum(1)
+    return total
+
+
 def of_action(space: ActionSpace, values: Tensor, action: Tensor) -> Tensor:
     """Return the values of actions, float32 [batch].
 

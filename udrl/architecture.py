@@ -31,11 +31,13 @@ FORBIDDEN = -1e9
 
 #: Part of the names of tensors that are set once and not trained.
 NORMALISER = "normaliser"
+#: Name of the factor of guidance (:mod:`udrl.guidance`).
+GUIDANCE = "guidance"
 
 
 def is_trained(name: str) -> bool:
     """Return whether the optimizer updates a tensor of this name."""
-    return NORMALISER not in name.split(".")
+    return name != GUIDANCE and NORMALISER not in name.split(".")
 
 
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:

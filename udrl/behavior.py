@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from udrl.action_losses import negative_log_likelihood
-from udrl.architecture import FORBIDDEN, layer_widths, n_features
+from udrl.architecture import FORBIDDEN, GUIDANCE, layer_widths, n_features
 from udrl.config import Config
 from udrl.custom_networks import make_custom
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
@@ -23,7 +23,7 @@ from udrl.recurrence import Memory
 from udrl.setting_groups import NetworkSettings
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
-from udrl.value import ValueFunction, relative
+from udrl.value import ValueFunction, relative, with_return
 
 
 class BehaviorFunction(nn.Module):
@@ -35,13 +35,14 @@ class BehaviorFunction(nn.Module):
 
     Attributes:
         value: value function that desired returns are relative to; None without a ``baseline``.
+        guidance: g, float32 [1] (:mod:`udrl.guidance`); None without guidance.
     """
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
         super().__init__()
         network, precision = config.network, PRECISIONS[config.arithmetic.precision]
         self._activation = ACTIVATIONS[network.activation]
-        self._actions = spec.action_space
+        self.action_space = spec.action_space
         self._mask = spec.action_mask
         self.custom: nn.Module | None = None
         self.memory: Memory | None = None
@@ -49,7 +50,9 @@ class BehaviorFunction(nn.Module):
             self.custom = make_custom(network, spec)
         else:
             self._assemble(spec, network, precision)
-        self._bound = network.advantage_bound
+        self.bound = network.advantage_bound
+        self.guidance: Tensor | None
+        self.register_buffer(GUIDANCE, torch.zeros(1) if network.is_guided else None)
         self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
     def _assemble(
@@ -70,7 +73,7 @@ class BehaviorFunction(nn.Module):
     def forward(
         self, seen: tuple[Tensor, ...], command: Tensor, states: tuple[Tensor, ...] = ()
     ) -> Tensor:
-        """Return the parameters of P(a | s, c).
+        """Return the parameters of P(a | s, c), as in acting: with guidance.
 
         Args:
             seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
@@ -85,13 +88,17 @@ class BehaviorFunction(nn.Module):
         state, *others = states or (None, None)
         if self.value is not None:
             with torch.no_grad():
-                command = relative(command, self.value(seen, others[0]), self._bound)
-        return self.forward_relative(seen, command, state)
+                command = relative(command, self.value(seen, others[0]), self.bound)
+        parameters = self.forward_relative(seen, command, state)
+        if self.guidance is None:
+            return parameters
+        lowest = self.forward_relative(seen, with_return(command, -self.bound), state)
+        return parameters + self.guidance * (parameters - lowest)
 
     def forward_relative(
         self, seen: tuple[Tensor, ...], command: Tensor, state: Tensor | None = None
     ) -> Tensor:
-        """Like :meth:`forward`, for commands already relative to V(s), if there is a baseline."""
+        """Like :meth:`forward`, as in training: for commands relative to V(s), without guidance."""
         if self.custom is not None:
             return self._masked(seen, self.custom(*seen, command))
         features = self.encode(seen, state)[0]
@@ -105,7 +112,7 @@ class BehaviorFunction(nn.Module):
         """Return parameters with a large negative number added to those of masked actions."""
         if self._mask is None:
             return parameters
-        allowed = seen[self._mask][:, -self._actions.n_parameters :].float()
+        allowed = seen[self._mask][:, -self.action_space.n_parameters :].float()
         return parameters - (allowed - 1.0) * FORBIDDEN
 
     def encode(
@@ -125,7 +132,7 @@ class BehaviorFunction(nn.Module):
             parameters: float32 [batch, n_parameters], from :meth:`forward`.
             action: a, int64 [batch], or [batch, components].
         """
-        return negative_log_likelihood(self._actions, parameters, action)
+        return negative_log_likelihood(self.action_space, parameters, action)
 
 
 #: Index of the random stream that seeds torch's generator.

@@ -163,6 +163,7 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "memory_window": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
     "advantage_bound": (lambda config: config.network.baseline != "none", "a baseline"),
+    "guidance_kl": (lambda config: config.network.baseline != "none", "a baseline"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),
 }
@@ -220,7 +221,9 @@ def read_toml(path: Path) -> dict[str, Any]:
             f"configuration file {path}: {error}; name a readable TOML file"
         ) from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"configuration file {path} is not TOML: {error}") from error
+        raise ConfigError(
+            f"configuration file {path} is not TOML: {error}; correct that line"
+        ) from error
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:

@@ -13,6 +13,7 @@ another output, ``next_state``, the state at the next step.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from itertools import pairwise
 
@@ -25,6 +26,7 @@ from onnx import TensorProto, helper, numpy_helper
 from udrl.architecture import (
     FILTER,
     FORBIDDEN,
+    GUIDANCE,
     MIN_DEVIATION,
     NORMAL_BOUND,
     NORMALISER,
@@ -137,24 +139,42 @@ class _Builder(Nodes):
     def logits(self) -> str:
         """Append the network of section 3.2; see :class:`udrl.behavior.BehaviorFunction`."""
         network = self._network
-        if network.behavior is not None:
-            logits = self._custom()
-            return logits if self._mask is None else self._masked(logits)
-        activation = _OPERATORS[network.activation]
-        first, *_ = widths = layer_widths(self._space, network)
-        features = self._encode("encoder", activation, network.hidden[0])
-        if network.memory != "none":
-            n_in = n_features(self._space, network.convolutions, network.hidden[0])
-            features = self._remember("memory", features, n_in, network.memory_size)
+        respond = self._custom
+        if network.behavior is None:
+            features = self._encode("encoder", _OPERATORS[network.activation], network.hidden[0])
+            if network.memory != "none":
+                n_in = n_features(self._space, network.convolutions, network.hidden[0])
+                features = self._remember("memory", features, n_in, network.memory_size)
+            respond = partial(self._respond, features)
         command = self._relative_command()
+        logits = respond(command)
+        if network.is_guided:
+            logits = self._guided(logits, respond(self._lowest(command)))
+        return logits if self._mask is None else self._masked(logits)
+
+    def _respond(self, features: str, command: str) -> str:
+        """Append the layers that read a command, given the features of the observation."""
+        activation = _OPERATORS[self._network.activation]
+        first, *_ = widths = layer_widths(self._space, self._network)
         gate = self.append("Sigmoid", self.layer("command", command, self._target.size, first))
         features = self.append("Mul", features, gate)
         for k, (n_in, n_out) in enumerate(pairwise(widths)):
             features = self.append(activation, self.layer(f"layers.{k}", features, n_in, n_out))
-        logits = self.layer("action", features, widths[-1], self._n_parameters)
-        return logits if self._mask is None else self._masked(logits)
+        return self.layer("action", features, widths[-1], self._n_parameters)
 
-    def _custom(self) -> str:
+    def _lowest(self, command: str) -> str:
+        """Append the command with the lowest relative return."""
+        kept = self.append("Mul", command, self.constant(np.array([[0.0, 1.0]], np.float32)))
+        lowest = np.array([[-self._network.advantage_bound, 0.0]], np.float32)
+        return self.append("Add", kept, self.constant(lowest))
+
+    def _guided(self, logits: str, lowest: str) -> str:
+        """Append the guided logits; see :mod:`udrl.guidance`."""
+        above = self.append("Sub", logits, lowest)
+        step = self.append("Mul", above, self.weight(GUIDANCE, 1))
+        return self.append("Add", logits, step)
+
+    def _custom(self, command: str) -> str:
         """Append a custom network, as exported by torch; see :mod:`udrl.custom_networks`."""
         # Imported here, because it imports torch, which no other graph needs.
         try:
@@ -165,7 +185,7 @@ class _Builder(Nodes):
                 f'install it with: pip install "udrl[train]"'
             ) from error
         model: onnx.ModelProto = exported(self._network, self._spec)
-        given = [*(name for name, _ in self._leaves), self._relative_command()]
+        given = [*(name for name, _ in self._leaves), command]
         names = dict(zip([one.name for one in model.graph.input], given, strict=True))
         for tensor in model.graph.initializer:
             if tensor.raw_data:

@@ -22,6 +22,7 @@ class Nodes:
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.tensors: list[onnx.TensorProto] = []
+        self._weights: set[str] = set()
 
     def layer(self, name: str, features: str, n_in: int, n_out: int) -> str:
         """Append a fully connected layer; its weight has torch's layout, [n_out, n_in]."""
@@ -39,8 +40,11 @@ class Nodes:
         return self.append("Slice", matrix, *where)
 
     def weight(self, name: str, *shape: int) -> str:
-        """Append a weight without values, float32."""
-        self.tensors.append(onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT))
+        """Append a weight without values, float32. Networks that share it name it again."""
+        if name not in self._weights:
+            self._weights.add(name)
+            tensor = onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT)
+            self.tensors.append(tensor)
         return name
 
     def number(self, value: float) -> str:

@@ -69,6 +69,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             labelled with the average outcome of their action (:mod:`udrl.value`).
         advantage_bound: with a ``baseline``, largest absolute value of relative desired returns, in
             mean deviations of the return.
+        guidance_kl: with a ``baseline``, minimum mean KL divergence, in nats, of the policy for the
+            highest relative return from that for the lowest (:mod:`udrl.guidance`). 0: no guidance.
     """
 
     behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -85,6 +87,12 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     desired_horizon: Literal["mean", "return"] = "mean"
     baseline: Literal["none", "value", "action_value"] = "none"
     advantage_bound: Annotated[float, Meta(gt=0, le=1000)] = 2.0
+    guidance_kl: Annotated[float, Meta(ge=0, le=100)] = 0.0
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether acting uses guidance."""
+        return self.guidance_kl > 0 and self.baseline != "none"
 
 
 class ActionSettings(SettingsGroup, frozen=True, kw_only=True):

@@ -17,6 +17,7 @@ from udrl.config import Config
 from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
+from udrl.guidance import choose_guidance
 from udrl.initialisation import draw_weights
 from udrl.segments import RankedExperience
 from udrl.spaces import Vector
@@ -189,6 +190,10 @@ def _update(
         loss = behavior.loss(batch.counted(parameters), batch.counted(batch.action))
         step(loss)
         losses += loss.detach()
+    if behavior.guidance is not None:
+        minimum = config.network.guidance_kl
+        examples = ((batch, _initial_states(batch, states)) for batch in batches.gather())
+        behavior.guidance.fill_(choose_guidance(behavior, examples, minimum))
     return float(losses)
 
 

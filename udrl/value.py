@@ -133,6 +133,11 @@ def value_loss(expected: Tensor, label: Tensor) -> Tensor:
     return error.square().mean() + (error.detach().abs() - expected[:, 1]).square().mean()
 
 
+def with_return(command: Tensor, desired_return: float) -> Tensor:
+    """Return commands, [..., 2], with another desired return."""
+    return torch.stack([torch.full_like(command[..., 0], desired_return), command[..., 1]], dim=-1)
+
+
 def relative(command: Tensor, expected: Tensor, bound: float) -> Tensor:
     """Return scaled commands, [..., 2], with the desired return relative to V(s) and D(s).
 

@@ -86,6 +86,9 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (RECORD, {"memory": "gru", "baseline": "value", "observe_previous": True}),
     (RECORD, {"baseline": "action_value", "normalise_observations": True}),
     (VECTOR, {"baseline": "value", "normalise_observations": True, "frame_stack": 2}),
+    (VECTOR, {"baseline": "value", "guidance_kl": 0.03}),
+    (RECORD, {"baseline": "action_value", "guidance_kl": 0.03, "memory": "gru"}),
+    (MASKED, {"baseline": "value", "guidance_kl": 0.03, "frame_stack": 2}),
 ]
 each_kind = pytest.mark.parametrize(("spec", "values"), KINDS)
 
@@ -138,6 +141,8 @@ def test_graph_equals_the_trained_network(
         with torch.no_grad():
             for parameter in behavior.parameters():
                 parameter.add_(0.3 * torch.randn_like(parameter))
+            if behavior.guidance is not None:
+                behavior.guidance.fill_(1.5)
     function = acting(config, behavior, spec)
     seen, command, state = probe_rows(function, 64)
     if spec.action_mask is not None:

@@ -1,0 +1,64 @@
+"""Guidance: acting goes further than the examples. Not in the paper.
+
+A single action explains little of a return, so the behavior function's response to a high desired
+return is only a little better than its usual behavior. In the agents measured, the response also
+weakens in training until commands have no effect, and then returns decline. With a
+``guidance_kl``, acting therefore extrapolates: it uses the parameters
+
+    p(s, c) + g (p(s, c) - p(s, c')),
+
+where c' is c with the lowest relative return (:mod:`udrl.value`). The learner chooses g for each
+weights version, so that the mean KL divergence of the policy for the highest relative return from
+that for the lowest is at least ``guidance_kl``. Training does not use guidance.
+
+This is classifier-free guidance (Ho and Salimans, 2022), which Frans et al. (2025) use as a policy
+improvement operator.
+"""
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from udrl.action_losses import kl_divergence
+from udrl.batches import Batch
+from udrl.behavior import BehaviorFunction
+from udrl.value import with_return
+
+#: Upper bound of g.
+_MOST = 30.0
+#: Minimum number of examples from which g is chosen.
+_EXAMPLES = 4096
+
+
+def choose_guidance(
+    behavior: BehaviorFunction,
+    batches: Iterable[tuple[Batch, Tensor | None]],
+    minimum: float,
+) -> float:
+    """Return g for a trained behavior function.
+
+    The divergence is about proportional to (1 + g)^2, which gives g from the divergence without
+    guidance.
+
+    Args:
+        behavior: the behavior function.
+        batches: batches of examples, and with a memory, its states before their windows. At least
+            4,096 examples are used, or all.
+        minimum: minimum of the mean divergence, in nats.
+    """
+    total, n = torch.zeros((), dtype=torch.float64), 0
+    with torch.no_grad():
+        for batch, states in batches:
+            highest, lowest = (
+                behavior.forward_relative(batch.seen, with_return(batch.command, level), states)
+                for level in (behavior.bound, -behavior.bound)
+            )
+            divergence = batch.counted(kl_divergence(behavior.action_space, highest, lowest))
+            total += divergence.double().sum().cpu()
+            n += len(divergence)
+            if n >= _EXAMPLES:
+                break
+    unguided = float(total) / n
+    return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MOST)
