@@ -34,7 +34,7 @@ from udrl.environments import EnvironmentSpec
 from udrl.errors import Interrupted
 from udrl.graph import acting_graph
 from udrl.spaces import Vector
-from udrl.training import untrained, use_one_thread
+from udrl.training import compute_deterministically, untrained
 from udrl.weights import encode_weights
 from udrl_launch.training_run import free_port
 from udrl_proto import PROTOCOL, key_expressions, verbs
@@ -75,7 +75,7 @@ def deliver_versions(
     endpoint: str, hello: Hello, stop: threading.Event, announced: list[Announced]
 ) -> None:
     """Deliver the same weights as every version until ``stop`` is set; record the times."""
-    use_one_thread()
+    compute_deterministically()
     state = untrained(hello.config, hello.environment)
     for parameter in state.behavior.parameters():
         parameter.grad = parameter.new_zeros(parameter.shape)

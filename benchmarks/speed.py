@@ -41,12 +41,12 @@ from udrl.config import Budget, Config, change
 from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
+from udrl.frame_stack import FrameStack
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
-from udrl.memory import FrameStack
 from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import train, untrained, use_one_thread
+from udrl.training import compute_deterministically, train, untrained
 from udrl.value import value_loss
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import status_of
@@ -103,7 +103,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.parts:
         keep_freed_memory()
-    use_one_thread()
+    compute_deterministically()
     if options.parts:
         print(json.dumps(_parts(*_recorded(options.parts))))
         return

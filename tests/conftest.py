@@ -6,7 +6,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from udrl.training import use_one_thread
+from udrl.training import compute_deterministically
 from udrl_launch import authority
 
 # Box2D's types warn on import. As an error, such a warning kills the interpreter.
@@ -22,7 +22,7 @@ hypothesis.settings.load_profile("udrl")
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
-    use_one_thread()
+    compute_deterministically()
 
 
 @pytest.fixture(scope="session")

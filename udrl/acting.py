@@ -29,8 +29,8 @@ from udrl.environments.adapter import raised
 from udrl.environments.making import Environment, make_environment
 from udrl.episode import Episode, fault
 from udrl.errors import EnvironmentFault
+from udrl.frame_stack import FrameStack
 from udrl.inference import Acting, Call
-from udrl.memory import FrameStack
 from udrl.recording import Recording
 from udrl.rows import Rows
 from udrl.spaces import parts_of
@@ -72,10 +72,10 @@ class EpisodeGenerator:
     ) -> None:
         self._rows = Rows(config, n_environments, make, first_index)
         self.spec = self._rows.spec
-        self._memory = FrameStack(self.spec.observation_space, config.network.frame_stack)
+        self._stack = FrameStack(self.spec.observation_space, config.network.frame_stack)
         # Without frame stacks, the networks' input is a view of the observations.
-        single = self._memory.length == 1
-        self._seen = self._memory.join(self._rows.observation) if single else None
+        single = self._stack.length == 1
+        self._seen = self._stack.join(self._rows.observation) if single else None
         self._target = ReturnInTime(config.network)
         self._recording = Recording(self.spec, n_environments)
         self._commands: list[Command | None] = [None] * n_environments
@@ -177,7 +177,7 @@ class EpisodeGenerator:
             return
         seen = self._seen
         if seen is None:
-            seen = self._recording.stacks(self._memory)
+            seen = self._recording.stacks(self._stack)
         for call, rows in self._calls:
             for all_rows, given in zip(seen, call.seen, strict=True):
                 all_rows.take(rows, axis=0, out=given, mode="clip")

@@ -76,7 +76,8 @@ class BehaviorFunction(nn.Module):
         """Return the parameters of P(a | s, c), as in acting: with guidance.
 
         Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
+            seen: s, as the networks see it (:mod:`udrl.frame_stack`), [batch, *shape] for each
+                leaf.
             command: (desired return, desired horizon), each scaled, float32 [batch, 2].
             states: with a memory, states of behavior and value function before the first step of
                 each window, float32 [windows, size] each. A batch then consists of windows of

@@ -12,7 +12,7 @@ network's settings::
             *observation, command = inputs
             ...
 
-``observation`` has the stacked observations (:mod:`udrl.memory`), one tensor for each leaf,
+``observation`` has the stacked observations (:mod:`udrl.frame_stack`), one tensor for each leaf,
 [batch, *shape], float32, uint8 or int32. ``command`` is (desired return, desired horizon), scaled,
 and relative to V(s) with a ``baseline``, float32 [batch, 2]. The module returns the parameters of
 P(a | s, c), float32 [batch, n_parameters]. The result must depend only on inputs and parameters (no
@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError
-from udrl.memory import FrameStack
+from udrl.frame_stack import FrameStack
 from udrl.onnx_nodes import OPSET
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import leaves_of

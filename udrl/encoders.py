@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from udrl.architecture import FILTER, NORMAL_BOUND, PADDING, STRIDE, n_features
-from udrl.memory import FrameStack
+from udrl.frame_stack import FrameStack
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Categories, Category, Image, LeafSpace, ObservationSpace, Record, Vector
 
@@ -52,7 +52,7 @@ class Encoder(nn.Module):
         self._precision = precision
 
     def forward(self, *seen: Tensor) -> Tensor:
-        """Return features, [batch, n_features], of stacked observations (:mod:`udrl.memory`)."""
+        """Return features, [batch, n_features], of observations (:mod:`udrl.frame_stack`)."""
         raise NotImplementedError
 
     def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:

@@ -27,7 +27,8 @@ class Episode:
 
     Attributes:
         command_id: id of the command, and of the episode.
-        observations: s_t, T elements of the observation space, not stacked (:mod:`udrl.memory`).
+        observations: s_t, T elements of the observation space, not stacked
+            (:mod:`udrl.frame_stack`).
         actions: a_t, T elements of the action space.
         rewards: r_t, float32 [T], rounded once, at the environment.
         terminated: whether the environment reached a terminal state.

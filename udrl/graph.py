@@ -4,7 +4,7 @@ Acting always computes this graph in ONNX Runtime; :mod:`udrl.behavior` is the s
 torch, for training. A graph without values belongs to a run and defines names and shapes of its
 weights. With the weights of a version it becomes an :class:`udrl.inference.ActingFunction`.
 
-Inputs: ``observation``, the stacked observations ([batch, *shape], :mod:`udrl.memory`); for a
+Inputs: ``observation``, the stacked observations ([batch, *shape], :mod:`udrl.frame_stack`); for a
 record one input for each leaf, with its path in the name, e.g. ``observation['inventory'][2]``; and
 ``command``, desired return and desired horizon, neither bounded nor scaled (float64 [batch, 2]).
 Output: ``logits``, the parameters of P(a | s, c), float32 [batch, n_parameters]. With a memory,
@@ -40,7 +40,7 @@ from udrl.architecture import (
 )
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidWeights
-from udrl.memory import FrameStack
+from udrl.frame_stack import FrameStack
 from udrl.onnx_nodes import OPSET, Nodes
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Bits, Categories, Category, Image, Record, leaves_of

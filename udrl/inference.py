@@ -9,8 +9,8 @@ import numpy.typing as npt
 import onnxruntime
 
 from udrl.errors import InvalidWeights
+from udrl.frame_stack import Seen
 from udrl.graph import Weights, weight_shapes, with_weights
-from udrl.memory import Seen
 from udrl.spaces import noise
 from udrl.streams import Purpose, Stream, stream_key
 
@@ -33,7 +33,7 @@ class Call(Protocol):
     """Arrays of one call, which can be reused: fill in the inputs, run, read the outputs.
 
     Attributes:
-        seen: observations as the networks see them (:mod:`udrl.memory`), [n, *shape] each.
+        seen: observations as the networks see them (:mod:`udrl.frame_stack`), [n, *shape] each.
         command: desired return and desired horizon, float64 [n, 2].
         state: state of the memory, float32 [n, size], zeros at an episode's first step; without a
             memory the size is 0.

@@ -12,8 +12,8 @@ from udrl.config import Config
 from udrl.environments.conversions import describe, nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
+from udrl.frame_stack import FrameStack
 from udrl.inference import ActingFunction, State
-from udrl.memory import FrameStack
 from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
 
@@ -54,7 +54,7 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        self._memory = FrameStack(spec.observation_space, config.network.frame_stack)
+        self._stack = FrameStack(spec.observation_space, config.network.frame_stack)
         self._rng = rng or np.random.default_rng()
         self.reset()
 
@@ -139,7 +139,7 @@ class Policy:
             state: the memory. None: empty, as at the beginning of an episode.
         """
         desired, n = _commands(desired_return, desired_horizon)
-        seen = self._memory.join(self._plain(observation, n))
+        seen = self._stack.join(self._plain(observation, n))
         if n is None:
             rows, after = self.behavior.advance(seen, desired, state)
             return rows[0].astype(np.float64), after
@@ -158,9 +158,9 @@ class Policy:
 
     def _plain(self, observation: Any, n: int | None) -> Observations:
         """Return observations as an array, [n or 1, frame_stack, *observation_shape]."""
-        space, length = self.spec.observation_space, self._memory.length
+        space, length = self.spec.observation_space, self._stack.length
         plain: Observations = np.empty((n or 1, length, *space.shape), space.dtype)
-        parts = zip(leaves_of(space), parts_of(plain), self._memory.shapes, strict=True)
+        parts = zip(leaves_of(space), parts_of(plain), self._stack.shapes, strict=True)
         rows = () if n is None else (n,)
         for leaf, part, joined in parts:
             seen = np.asarray(_find(leaf, observation))

@@ -6,7 +6,7 @@ import numpy.typing as npt
 from udrl.commands import Command, Decisions
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.memory import FrameStack, Seen
+from udrl.frame_stack import FrameStack, Seen
 from udrl.spaces import Observations
 
 _KEPT = ("observations", "actions", "rewards")
@@ -64,11 +64,11 @@ class Recording:
         self._rings["rewards"][at] = rewards
         self.round += 1
 
-    def stacks(self, memory: FrameStack) -> Seen:
+    def stacks(self, stack: FrameStack) -> Seen:
         """Return the networks' input in this round, [n, *shape] for each leaf."""
-        rounds = (self.began[:, None] + memory.times(self.round - self.began)) % self._capacity
+        rounds = (self.began[:, None] + stack.times(self.round - self.began)) % self._capacity
         rows = np.arange(len(self.began))[:, None]
-        return memory.join(self._rings["observations"][rounds, rows])
+        return stack.join(self._rings["observations"][rounds, rows])
 
     def end(self, row: int, *, terminated: bool, truncated: bool) -> Episode:
         """Return a row's episode, which ended in the last completed round."""

@@ -16,7 +16,7 @@ from udrl.config import Config
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
-from udrl.memory import FrameStack, Seen
+from udrl.frame_stack import FrameStack, Seen
 from udrl.spaces import leaves_of
 from udrl.targets import Desired, ReturnInTime
 
@@ -44,7 +44,7 @@ class Examples(NamedTuple):
     """Inputs and targets of the behavior function, one per row.
 
     Attributes:
-        seen: s_t1, as the networks see it (:mod:`udrl.memory`), [n, *shape] for each leaf.
+        seen: s_t1, as the networks see it (:mod:`udrl.frame_stack`), [n, *shape] for each leaf.
         command: desired return, which is the segment's return or its label
             (:meth:`RankedExperience.label`), and desired horizon in steps, float64 [n, 2].
         action: a_t1, n elements of the action space.
@@ -99,7 +99,7 @@ class Experience:
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
         seen, acted = spec.observation_space, spec.action_space
         self._leaves = leaves_of(seen)
-        self._memory = FrameStack(seen, config.network.frame_stack)
+        self._stack = FrameStack(seen, config.network.frame_stack)
         self._observations = np.empty((0, *seen.shape), seen.dtype)
         self._actions = np.empty((0, *acted.shape), acted.dtype)
         self._earned = np.empty(0)  # P[t]: rewards earned before step t
@@ -196,7 +196,7 @@ class RankedExperience:
         self._slots = slots
         self.labels: Numbers | None = None
         self.expected: npt.NDArray[np.float32] | None = None
-        self.shapes = experience._memory.shapes
+        self.shapes = experience._stack.shapes
         self.leaves = experience._leaves
         self.action_shape = experience._actions.shape[1:]
         self.lengths: Indices = experience._lengths[slots]
@@ -272,10 +272,10 @@ class RankedExperience:
     def _observed(self, slot: Indices, t: Indices) -> Seen:
         """Return what the network sees at times t: single observations, or stacks of them."""
         held = self._experience
-        memory = held._memory
-        if memory.length == 1:
-            return memory.join(held._observations[self._row(slot, t)])
-        return memory.join(held._observations[self._row(slot[:, None], memory.times(t))])
+        stack = held._stack
+        if stack.length == 1:
+            return stack.join(held._observations[self._row(slot, t)])
+        return stack.join(held._observations[self._row(slot[:, None], stack.times(t))])
 
     def _row(self, slot: Indices, t: Indices) -> Indices:
         page = self._experience._page_table[slot, t // _PAGE]

@@ -66,7 +66,7 @@ def weights_of(behavior: BehaviorFunction) -> Weights:
     return {n: t.detach().cpu().numpy().copy() for n, t in behavior.state_dict().items()}
 
 
-def use_one_thread() -> None:
+def compute_deterministically() -> None:
     """Make torch compute deterministically, in one thread."""
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
@@ -89,7 +89,7 @@ def exact_arithmetic() -> Iterator[None]:
             os.environ.get(_WORKSPACE),
         )
         _found_settings.append(found)
-        use_one_thread()
+        compute_deterministically()
     try:
         yield
     finally:

@@ -57,7 +57,8 @@ class _Expectation(nn.Module):
         """Return the outputs, and with a memory, its state after each window.
 
         Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
+            seen: s, as the networks see it (:mod:`udrl.frame_stack`), [batch, *shape] for each
+                leaf.
             state: with a memory, its state before each window, float32 [windows, VALUE_WIDTH].
 
         Returns:
@@ -116,7 +117,8 @@ class Critic(_Expectation):
         """Return Q(s, a), float32 [batch].
 
         Args:
-            seen: s, as the networks see it (:mod:`udrl.memory`), [batch, *shape] for each leaf.
+            seen: s, as the networks see it (:mod:`udrl.frame_stack`), [batch, *shape] for each
+                leaf.
             action: a, int64 [batch], or [batch, components].
             state: with a memory, its state before each window, float32 [windows, VALUE_WIDTH].
         """

@@ -5,7 +5,6 @@ commands that the policy ignores.
 """
 
 import contextlib
-import os
 import threading
 import time
 from collections.abc import Iterator
@@ -18,11 +17,12 @@ import torch
 from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.atomic_files import replacing
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue, change
 from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import summarise
-from udrl.memory import FrameStack
+from udrl.frame_stack import FrameStack
 from udrl.numerics import resolve_arithmetic
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments.protocol import BaselineAlgorithm
@@ -189,10 +189,9 @@ def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> l
 
 
 def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:
-    part = path.with_name(path.name + ".part")
     metadata = {"state": msgspec.json.encode(state).decode()}
-    safetensors.torch.save_file(tensors, part, metadata)
-    os.replace(part, path)
+    with replacing(path) as unfinished:
+        safetensors.torch.save_file(tensors, unfinished, metadata)
 
 
 def _load(path: Path) -> tuple[_State, dict[str, Tensor]]:

@@ -5,11 +5,11 @@ Lines are distinguishable in greyscale and with colour blindness (:mod:`udrl_sho
 
 import itertools
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from udrl.atomic_files import replacing
 from udrl.errors import ConfigError
 from udrl_experiments.records import Obtained, agent_name
 from udrl_experiments.statistics import CurvePoint
@@ -126,10 +126,11 @@ def save(figure: "Figure", path: Path) -> list[Path]:
     # By default, Matplotlib writes its version, the time and random ids.
     for suffix, omitted in ((".png", "Software"), (".svg", "Date")):
         picture = path.with_name(path.name + suffix)
-        part = path.with_name(picture.name + ".part")
-        with rc_context({"svg.hashsalt": "udrl", "svg.fonttype": "none"}):
-            figure.savefig(part, format=suffix[1:], dpi=130, metadata={omitted: None})
-        os.replace(part, picture)
+        with (
+            replacing(picture) as unfinished,
+            rc_context({"svg.hashsalt": "udrl", "svg.fonttype": "none"}),
+        ):
+            figure.savefig(unfinished, format=suffix[1:], dpi=130, metadata={omitted: None})
         saved.append(picture)
     return saved
 

@@ -13,13 +13,14 @@ from pathlib import Path
 import click
 import msgspec
 
+from udrl.atomic_files import write_atomically
 from udrl.config import Budget
 from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
 from udrl_experiments.jobs import ERROR_PREFIX, Job, read_job
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
-from udrl_inspect.csv_tables import put, read, write
+from udrl_inspect.csv_tables import read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training_run import train
@@ -96,7 +97,7 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
             exploration_steps=job.exploration_steps or None,
         )
     done = {"max_env_steps": job.max_env_steps, **provenance()}
-    put(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")
+    write_atomically(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")
 
 
 def _evaluations(job: Job, run_dir: Path, status: Status) -> list[EvaluationRecord]:

@@ -15,12 +15,13 @@ from pathlib import Path
 
 import msgspec
 
+from udrl.atomic_files import write_atomically
 from udrl.config import Config, Configured, FlatSettings, flat
 from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import Machine
 from udrl_experiments.records import EvaluationRecord, agent_name
-from udrl_inspect.csv_tables import put, read
+from udrl_inspect.csv_tables import read
 
 #: Message of an interrupted study.
 INTERRUPTED = "stopped; resume with the same command and --resume"
@@ -234,14 +235,14 @@ def copy_finished(
         echo(f"copied from {finished}: {job.described}")
         job.folder(root).mkdir(parents=True, exist_ok=True)
         for name in RECORDS:
-            put(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
+            write_atomically(job.folder(root) / name, (job.folder(finished) / name).read_bytes())
 
 
 def _start(job: Job, root: Path) -> tuple[subprocess.Popen[bytes], int]:
     """Start a process for a run; return it, and the size of the log so far in bytes."""
     folder = job.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
-    put(folder / "job.json", msgspec.json.format(msgspec.json.encode(job)))
+    write_atomically(folder / "job.json", msgspec.json.format(msgspec.json.encode(job)))
     with (folder / "log.txt").open("ab") as output:
         size = output.tell()
         process = subprocess.Popen(  # noqa: S603 - our own program

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Config
 from udrl.environments.making import Environment, make_environment
+from udrl.frame_stack import Seen
 from udrl.inference import Call
-from udrl.memory import Seen
 from udrl.streams import Purpose, Stream, stream_key
 from udrl_experiments.protocol import BaselineAlgorithm
 

@@ -13,6 +13,7 @@ import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
+from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
 from udrl.config import AUTOMATIC, Config, build, change, flat, preset
 from udrl.errors import ConfigError
@@ -33,7 +34,7 @@ from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import complete
-from udrl_inspect.csv_tables import put, write
+from udrl_inspect.csv_tables import write
 from udrl_launch.settings import gather
 from udrl_replay.creation import as_toml
 
@@ -331,7 +332,7 @@ def _write_preset(
     text = f"# Configuration {best.configuration}: score {value:.1f}, seeds: {best.seeds}.\n"
     text += "".join(f"{name} = {as_toml(value)}\n" for name, value in values.items())
     path = folder / f"{algorithm.lower()}-{_file_name(environment)}.toml"
-    put(path, text.encode())
+    write_atomically(path, text.encode())
     return f"# {path}\n{text}"
 
 

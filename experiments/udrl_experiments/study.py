@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import msgspec
 
+from udrl.atomic_files import write_atomically
 from udrl.errors import ConfigError, InvalidData
 from udrl.strategies import make_strategy
 from udrl_experiments.jobs import Job, copy_finished, run_jobs
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
-from udrl_inspect.csv_tables import put
 
 
 class StudyFolders(NamedTuple):
@@ -146,7 +146,7 @@ def _write_plan(study: Study, folders: StudyFolders, *, resume: bool) -> None:
                 )
     folders.folder.mkdir(parents=True, exist_ok=True)
     about = {"study": study.name, **provenance(), "runs": study.jobs}
-    put(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
+    write_atomically(file, msgspec.json.format(msgspec.json.encode(about)) + b"\n")
 
 
 def read_study(file: Path) -> list[Job]:

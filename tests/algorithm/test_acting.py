@@ -27,9 +27,9 @@ from udrl.environments import (
 from udrl.environments.making import adapt
 from udrl.episode import Episode
 from udrl.errors import EnvironmentFault
+from udrl.frame_stack import Seen
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
-from udrl.memory import Seen
 from udrl.replay import Entry, ReplayBuffer
 from udrl.streams import Purpose, stream_key
 from udrl.training import weights_of

@@ -17,9 +17,9 @@ from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import InvalidWeights
+from udrl.frame_stack import Seen
 from udrl.graph import acting_graph, weight_shapes
 from udrl.inference import ActingFunction, Call, is_exact_in_batch, probe_rows, probe_weights
-from udrl.memory import Seen
 from udrl.spaces import (
     Bits,
     Categories,

@@ -21,7 +21,13 @@ from udrl.inference import ActingFunction
 from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
-from udrl.training import TrainingState, exact_arithmetic, train, untrained, use_one_thread
+from udrl.training import (
+    TrainingState,
+    compute_deterministically,
+    exact_arithmetic,
+    train,
+    untrained,
+)
 
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=3), action_space=Categorical(n=4), max_episode_steps=90
@@ -286,7 +292,7 @@ def test_training_sets_and_restores_the_number_of_threads(
 
 
 def test_learner_computes_deterministically_in_one_thread() -> None:
-    use_one_thread()
+    compute_deterministically()
     assert torch.get_num_threads() == 1
     assert torch.are_deterministic_algorithms_enabled()
 
@@ -319,4 +325,4 @@ def test_exact_arithmetic_ends_with_its_last_user(
         assert not torch.are_deterministic_algorithms_enabled()
         assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
     finally:
-        use_one_thread()
+        compute_deterministically()

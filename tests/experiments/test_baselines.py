@@ -20,7 +20,7 @@ from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue, build, read_toml
 from udrl.environments.making import make_environment, specify
 from udrl.errors import ConfigError, InvalidData
-from udrl.memory import FrameStack
+from udrl.frame_stack import FrameStack
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, run

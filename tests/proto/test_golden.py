@@ -16,8 +16,8 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config
 from udrl.environments import EnvironmentSpec
+from udrl.frame_stack import Seen
 from udrl.inference import Commands, Logits
-from udrl.memory import Seen
 from udrl.streams import Stream
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Message

@@ -29,14 +29,14 @@ def store(stack: ExitStack, tmp_path: Path) -> Store:
 def test_new_file_has_its_facts(tmp_path: Path) -> None:
     with closing(Store.create(tmp_path, answer=42)) as store:
         assert store.fact("answer", int) == 42
-    assert not list(tmp_path.glob("*.new"))
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_failed_creation_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def rename(self: Path, target: Path) -> Path:
+    def replace(self: Path, target: Path) -> Path:
         raise OSError("no space left")
 
-    monkeypatch.setattr(Path, "rename", rename)
+    monkeypatch.setattr(Path, "replace", replace)
     with pytest.raises(StoreError, match=r"no space left; use a writable directory"):
         Store.create(tmp_path)
     with pytest.raises(StoreError, match="holds no run"):

@@ -6,6 +6,7 @@ paper's toy example) and ``Obedience-v0`` (following the command is trivial).
 """
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from udrl.environments.making import (
     Environment,
@@ -18,22 +19,25 @@ from udrl.environments.sparse import RewardAtEnd
 
 __all__ = ["Environment", "EnvironmentSpec", "limit_steps", "make_environment", "specify"]
 
-if "LunarLanderSparse-v3" not in gym.registry:
-    gym.register(
+_DOOM = "udrl.environments.doom:Doom"
+_SPECS = (
+    EnvSpec(
         "LunarLanderSparse-v3",
         entry_point="gymnasium.envs.box2d.lunar_lander:LunarLander",
         max_episode_steps=1000,
         additional_wrappers=(RewardAtEnd.wrapper_spec(),),
-    )
-    _DOOM = "udrl.environments.doom:Doom"
-    gym.register("Doom-v0", entry_point=_DOOM)
-    gym.register(
+    ),
+    EnvSpec("Doom-v0", entry_point=_DOOM),
+    EnvSpec(
         "TakeCover-v0",
         entry_point=_DOOM,
         max_episode_steps=2100,
         kwargs={"scenario": "take_cover", "max_return": 2100.0},
-    )
-    gym.register("Figure2-v0", entry_point="udrl.environments.figure2:Figure2", max_episode_steps=2)
-    gym.register(
+    ),
+    EnvSpec("Figure2-v0", entry_point="udrl.environments.figure2:Figure2", max_episode_steps=2),
+    EnvSpec(
         "Obedience-v0", entry_point="udrl.environments.obedience:Obedience", max_episode_steps=16
-    )
+    ),
+)
+for _spec in _SPECS:
+    gym.registry.setdefault(_spec.id, _spec)

@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import TypeVar
 
 import msgspec
 
@@ -19,8 +18,6 @@ from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Stat
 FRESH_S = 1.0
 #: Most pages of history in one update; the rest follows with the next.
 _PAGES = 20
-
-Answer = TypeVar("Answer")
 
 
 class Obeyed(msgspec.Struct, frozen=True, kw_only=True):

@@ -3,23 +3,16 @@
 import csv
 import io
 import math
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 
+from udrl.atomic_files import write_atomically
 from udrl.errors import InvalidData
 
 Row = TypeVar("Row", bound=msgspec.Struct)
-
-
-def put(path: Path, content: bytes) -> None:
-    """Write a file atomically."""
-    aside = path.with_name(path.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, path)
 
 
 def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
@@ -28,7 +21,7 @@ def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(kind.__struct_fields__)
     writer.writerows(msgspec.structs.astuple(row) for row in rows)
-    put(path, text.getvalue().encode())
+    write_atomically(path, text.getvalue().encode())
 
 
 def read(path: Path, kind: type[Row]) -> list[Row]:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from udrl.atomic_files import write_atomically
 from udrl.commands import Command
 from udrl.errors import ConfigError, InvalidData, StoreError
 from udrl.evaluation import summarise
@@ -28,7 +29,6 @@ from udrl.setting_groups import Temperature
 from udrl.strategies import nearest
 from udrl.targets import ReturnInTime
 from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
-from udrl_inspect.csv_tables import put
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
@@ -283,7 +283,7 @@ def save_report(run_dir: Path, report: ObedienceReport) -> Path:
     """
     path = run_dir / FILE
     try:
-        put(path, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+        write_atomically(path, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
     except OSError as error:
         raise StoreError(f"{path}: {error.strerror}; make the directory writable") from error
     return path

@@ -14,7 +14,7 @@ import click
 from udrl.errors import UdrlError
 from udrl.version import __version__
 from udrl_launch import output
-from udrl_launch.paths import find_modules_of_the_user
+from udrl_launch.paths import extend_module_path
 
 #: The commands of this package and the modules that hold them, in the order of the help.
 _COMMANDS = {
@@ -46,7 +46,7 @@ def main() -> NoReturn:
     # Before NumPy is imported: its threads wait for each other by spinning, on cores that other
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    find_modules_of_the_user()
+    extend_module_path()
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
     try:

@@ -38,7 +38,7 @@ def new_run_dir(name: str) -> Path:
         raise ConfigError(f"{runs}: {error}; choose another directory with --run-dir") from error
 
 
-def find_modules_of_the_user() -> None:
+def extend_module_path() -> None:
     """Append the parent's module search path and the working directory to our own."""
     given = os.environ.get(_MODULE_PATH, "").split(os.pathsep)
     for folder in [*filter(None, given), str(STARTED_IN)]:
@@ -46,7 +46,7 @@ def find_modules_of_the_user() -> None:
             sys.path.append(folder)
 
 
-def environment_of_children() -> dict[str, str]:
+def child_environment_variables() -> dict[str, str]:
     """Return environment variables for a child, so that it finds the same modules."""
     found = [str(Path(folder).absolute()) for folder in sys.path]
     return os.environ | {_MODULE_PATH: os.pathsep.join(found)}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from udrl.errors import RunFailed
-from udrl_launch.paths import STARTED_IN, environment_of_children
+from udrl_launch.paths import STARTED_IN, child_environment_variables
 
 log = logging.getLogger("udrl")
 
@@ -65,7 +65,7 @@ class Child:
                     str(os.getpid()),
                 ],
                 cwd=STARTED_IN,
-                env=environment_of_children(),
+                env=child_environment_variables(),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,

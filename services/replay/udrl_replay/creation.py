@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from udrl.acting import EpisodeGenerator
+from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
 from udrl.config import Budget, Config, flat
 from udrl.cost import slow_training_warning
@@ -167,11 +168,9 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
             if value is not None and value != {}:
                 lines.append(f"{name} = {as_toml(value)}")
     path = run_dir / "config.toml"
-    unfinished = path.with_suffix(".new")
     try:
-        # Written to another file and renamed: a full disk must not destroy the old budget.
-        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        unfinished.replace(path)
+        # A full disk must not destroy the old budget.
+        write_atomically(path, ("\n".join(lines) + "\n").encode())
     except OSError as error:
         what_to_do = remedy(error, "free some disk space, or use a writable directory")
         raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error

@@ -15,6 +15,7 @@ from typing import Any, Self, TypeVar
 
 import msgspec
 
+from udrl.atomic_files import replacing
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl_replay.remedies import remedy
 from udrl_replay.schema import SCHEMA, SEALED, TABLES, Value, marks, seal
@@ -146,12 +147,11 @@ class Database:
                         f"{run_dir} holds a run already; add --resume (in Python: "
                         f"resume=True) to resume it, or use another --run-dir"
                     )
-                # Written to another file and renamed, so that a run's file is always complete.
-                unfinished = path.with_suffix(".new")
-                unfinished.unlink(missing_ok=True)
-                with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
-                    _begin(db, {"schema": SCHEMA, **facts})
-                unfinished.rename(path)
+                # Atomic, so that a run's file is always complete.
+                with replacing(path) as unfinished:
+                    unfinished.unlink(missing_ok=True)
+                    with closing(sqlite3.connect(unfinished, isolation_level=None)) as db:
+                        _begin(db, {"schema": SCHEMA, **facts})
                 _sync(run_dir)
         except (OSError, sqlite3.Error) as error:
             raise _unusable(run_dir, error) from error

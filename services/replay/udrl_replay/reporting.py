@@ -7,6 +7,7 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
+from udrl.atomic_files import write_atomically
 from udrl.commands import episodes_due
 from udrl.digests import replay_digest
 from udrl.strategies import Best
@@ -81,10 +82,8 @@ def write_weights(run_dir: Path, store: Store, version: int) -> None:
     if found is None:
         return
     path = run_dir / "weights.safetensors"
-    unfinished = path.with_suffix(".new")
     try:
-        unfinished.write_bytes(found.weights)
-        unfinished.replace(path)
+        write_atomically(path, found.weights)
     except OSError as error:
         raise unwritable(path, error) from error
     log.info("the weights are in %s", path)

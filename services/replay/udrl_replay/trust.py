@@ -56,7 +56,9 @@ class Trust:
         run.progress.duplicate += 1
         verdict = run.auditor.compare(arrival.actor, command_id, arrival.digest)
         if verdict is None and command_id in run.auditor.open:
-            log.warning("actors differ on command %d; a third will decide who lied", command_id)
+            log.warning(
+                "two actors differ on command %d; a third run decides which is wrong", command_id
+            )
         elif verdict is None:
             run.progress.agreed += 1
         elif verdict.liar is None:

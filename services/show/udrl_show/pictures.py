@@ -1,9 +1,9 @@
 """Creating and saving matplotlib figures."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from udrl.atomic_files import replacing
 from udrl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -54,10 +54,9 @@ def save(figure: "Figure", picture: Path) -> None:
     Raises:
         ConfigError: the file cannot be written.
     """
-    aside = picture.with_name(f"{picture.name}.part")
     try:
         picture.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(aside, format=picture.suffix[1:], dpi=130)
-        os.replace(aside, picture)
+        with replacing(picture) as unfinished:
+            figure.savefig(unfinished, format=picture.suffix[1:], dpi=130)
     except OSError as error:
         raise ConfigError(f"{picture}: {error.strerror}; choose a writable file") from error

@@ -1,0 +1,29 @@
+"""Atomic writes: a reader sees either the old or the new content of a file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; the file there then replaces ``path``.
+
+    If the block raises, ``path`` is unchanged.
+
+    Raises:
+        OSError: the file cannot be renamed, e.g. because it was not written.
+    """
+    unfinished = path.with_name(f"{path.name}.part")
+    yield unfinished
+    unfinished.replace(path)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file.
+
+    Raises:
+        OSError: the file cannot be written; an existing file is unchanged.
+    """
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(content)
