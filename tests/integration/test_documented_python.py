@@ -18,7 +18,7 @@ from udrl.training import untrained
 
 ROOT = Path(__file__).parents[2]
 BLOCKS = re.findall(
-    r"```python\n(.*?)```", (ROOT / "docs" / "watching.md").read_text(encoding="utf-8"), re.DOTALL
+    r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(encoding="utf-8"), re.DOTALL
 )
 
 
