@@ -119,7 +119,7 @@ def _meaning(option: click.Option, command: click.Command) -> Iterator[str]:
     default = option.to_info_dict()["default"]
     if option.required:
         yield "Required."
-    elif default is not None and not option.is_flag:
+    elif default not in (None, ()) and not option.is_flag:
         values = default if isinstance(default, tuple | list) else [default]
         yield f"Default: {', '.join(f'`{value}`' for value in values)}."
     # Commands that look at a run have options of the same names with other meanings.

@@ -130,7 +130,7 @@ def _run(
 
 
 @study.command()
-@click.argument("names", nargs=-1, metavar="[STUDY]...")
+@click.argument("names", nargs=-1, metavar="STUDY...")
 @_FOLDER
 def show(names: tuple[str, ...], folder: Path) -> int:
     """Show the progress of studies, run by run.

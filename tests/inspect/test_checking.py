@@ -64,9 +64,17 @@ def test_unsupported_environment_is_rejected() -> None:
         check(build(Config, {"environment": register(Plain, max_steps=None)}))
 
 
+def test_command_checks_the_settings_of_a_preset() -> None:
+    arguments = ["check", "MountainCar-v0", "--preset", "CartPole-v1", "--set", "seed=3"]
+    result = CliRunner().invoke(cli, arguments, standalone_mode=False)
+    train = "udrl train MountainCar-v0 --preset CartPole-v1 --set=seed=3"
+    assert f"verdict       supported; train with: {train}" in result.stdout
+    assert "settings " not in result.stdout, "a preset leaves nothing to choose"
+
+
 def test_command_prints_lines_or_json() -> None:
     result = CliRunner().invoke(cli, ["check", "CartPole-v1"], standalone_mode=False)
-    assert "repeats       yes, from its seed" in result.stdout
+    assert "reproducible  yes, from its seed" in result.stdout
     assert "verdict       supported; train with: udrl train CartPole-v1" in result.stdout
     result = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(result.stdout)["max_episode_steps"] == 500

@@ -11,32 +11,36 @@ from udrl_launch import completions
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
 from udrl_launch.settings import gather
-from udrl_launch.subcommands.options import FILE
+from udrl_launch.subcommands.settings_options import origin_options
 
 
 @click.command()
 @click.argument("env", shell_complete=completions.environments)
-@click.option("--config", "file", type=FILE, metavar="FILE", help="Read settings from a TOML file.")
-@click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
-              shell_complete=completions.settings,
-              help="Set any setting, e.g. --set batch_size=512. May be repeated.")  # fmt: skip
+@origin_options
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def check(env: str, file: Path | None, assignments: tuple[str, ...], as_json: bool) -> int:
+def check(
+    env: str,
+    preset_name: str | None,
+    file: Path | None,
+    assignments: tuple[str, ...],
+    as_json: bool,
+) -> int:
     """Check whether an environment can be trained on.
 
     Also reports its spaces, random returns, speed and memory, and the settings chosen for it.
 
     Example: udrl check your_package.your_module:YourEnv-v0
     """
-    settings = gather(env, file=file, assignments=assignments, options={})
+    settings = gather(env, preset_name=preset_name, file=file, assignments=assignments, options={})
     found = check_environment(settings.config, settings.automatic)
     if as_json:
         print_json(found)
         return 0
     for name, text in _lines(found):
         print_text(text, f"{name:<13} ")
-    given = [f"--set={assignment}" for assignment in assignments]
+    given = ["--preset", preset_name] if preset_name else []
     given += ["--config", shown(file)] if file else []
+    given += [f"--set={assignment}" for assignment in assignments]
     # Not wrapped, so that it can be copied.
     click.echo(
         f"{'verdict':<13} supported; train with: {shlex.join(['udrl', 'train', env, *given])}"
@@ -54,19 +58,19 @@ def _lines(found: Check) -> list[tuple[str, str]]:
         ("actions", f"{found.declared_actions}; read as {found.actions}"),
         ("episodes", limit),
         (
-            "at random",
+            "random play",
             f"mean return {found.return_mean:.4g} ({found.return_min:.4g} to "
             f"{found.return_max:.4g}), mean length {found.length_mean:.4g} steps, in "
             f"{found.episodes} episodes",
         ),
-        ("repeats", "yes, from its seed" if found.repeats else "NO"),
+        ("reproducible", "yes, from its seed" if found.repeats else "NO"),
         (
             "speed",
             f"{1 / found.step_s:,.0f} steps/s in one process; reset "
             f"{1000 * found.reset_s:.3g} ms, creation {found.make_s:.2g} s",
         ),
         (
-            "size",
+            "memory",
             f"{found.step_bytes:,} bytes per step; about {found.memory_mib:g} MiB per environment",
         ),
     ]

@@ -16,18 +16,30 @@ from udrl_replay.creation import exists
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
+#: Options for the origins of settings.
+ORIGINS = (
+    click.option("--preset", "preset_name", metavar="NAME", shell_complete=completions.presets,
+                 help=f"Settings that ship with udrl: {', '.join(preset_names())}; or none. "
+                 "Default: the preset named after ENV, else any."),
+    click.option("--config", "file", type=FILE, metavar="FILE",
+                 help="Read settings from a TOML file."),
+    click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+                 shell_complete=completions.settings,
+                 help="Set any setting, e.g. --set batch_size=512. May be repeated."),
+)  # fmt: skip
+
+
+def origin_options(command: Command) -> Command:
+    """Add the options for the origins of settings."""
+    for option in reversed(ORIGINS):
+        command = option(command)
+    return command
+
+
 def settings_options(command: Command) -> Command:
     """Add the options for settings."""
     options = (
-        click.option("--preset", "preset_name", metavar="NAME",
-                     shell_complete=completions.presets,
-                     help=f"Settings that ship with udrl: {', '.join(preset_names())}; or none. "
-                     "Default: the preset named after ENV, else any."),
-        click.option("--config", "file", type=FILE, metavar="FILE",
-                     help="Read settings from a TOML file."),
-        click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
-                     shell_complete=completions.settings,
-                     help="Set any setting, e.g. --set batch_size=512. May be repeated."),
+        *ORIGINS,
         click.option("--from-dataset", "dataset", metavar="NAME",
                      help="Start from the episodes of a Minari dataset instead of random ones."),
         click.option("--seed", type=int, metavar="N", help="Random seed of the run."),
