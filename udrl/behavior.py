@@ -42,8 +42,7 @@ class BehaviorFunction(nn.Module):
         super().__init__()
         network, precision = config.network, PRECISIONS[config.arithmetic.precision]
         self._activation = ACTIVATIONS[network.activation]
-        self.action_space = spec.action_space
-        self._mask = spec.action_mask
+        self.spec = spec
         self.custom: nn.Module | None = None
         self.memory: Memory | None = None
         if network.behavior is not None:
@@ -111,9 +110,9 @@ class BehaviorFunction(nn.Module):
 
     def _masked(self, seen: tuple[Tensor, ...], parameters: Tensor) -> Tensor:
         """Return parameters with a large negative number added to those of masked actions."""
-        if self._mask is None:
+        if self.spec.action_mask is None:
             return parameters
-        allowed = seen[self._mask][:, -self.action_space.n_parameters :].float()
+        allowed = seen[self.spec.action_mask][:, -self.spec.action_space.n_parameters :].float()
         return parameters - (allowed - 1.0) * FORBIDDEN
 
     def encode(
@@ -133,7 +132,7 @@ class BehaviorFunction(nn.Module):
             parameters: float32 [batch, n_parameters], from :meth:`forward`.
             action: a, int64 [batch], or [batch, components].
         """
-        return negative_log_likelihood(self.action_space, parameters, action)
+        return negative_log_likelihood(self.spec.action_space, parameters, action)
 
 
 #: Index of the random stream that seeds torch's generator.

@@ -55,7 +55,7 @@ def choose_guidance(
                 behavior.forward_relative(batch.seen, with_return(batch.command, level), states)
                 for level in (behavior.bound, -behavior.bound)
             )
-            divergence = batch.counted(kl_divergence(behavior.action_space, highest, lowest))
+            divergence = batch.counted(kl_divergence(behavior.spec.action_space, highest, lowest))
             total += divergence.double().sum().cpu()
             n += len(divergence)
             if n >= _EXAMPLES:

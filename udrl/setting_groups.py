@@ -180,6 +180,8 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
             and reward, so that the agent does not only learn to repeat its actions.
         return_lambda: with a ``baseline``, lambda of the lambda-returns that label examples. 1: the
             observed return. 0: one reward and the value after it.
+        reset_every: versions after which all networks begin anew from their initial weights, with
+            :data:`udrl.training.RESET_ROUNDS` times the updates. None: never, as in the paper.
     """
 
     segments: Literal["trailing", "all"] = "trailing"
@@ -189,6 +191,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
     memory_window: Annotated[int, Meta(ge=1, le=65_536)] = 32
     drop_previous: Annotated[float, Meta(ge=0, le=1)] = 0.25
     return_lambda: Annotated[float, Meta(ge=0, le=1)] = 0.95
+    reset_every: PositiveInt | None = None
 
 
 class EvaluationSettings(SettingsGroup, frozen=True, kw_only=True):

@@ -35,7 +35,7 @@ class TrainingState:
         behavior: B(s, c; theta).
         critic: critic, if ``baseline`` is ``action_value``.
         optimizer: optimizer of both networks.
-        loss: mean cross-entropy, in nats, over the updates of this version; NaN for version 0.
+        loss: mean cross-entropy, in nats, over the last round of updates; NaN for version 0.
     """
 
     version: int
@@ -54,6 +54,8 @@ class TrainingState:
         return trainable_parameters(self.behavior, self.critic)
 
 
+#: Rounds of updates after a reset (``reset_every``). Fewer rounds learn the buffer less well.
+RESET_ROUNDS = 24
 #: Settings found by each active :func:`exact_arithmetic`, in order of entry.
 _found_settings: list[tuple[bool, bool, str | None]] = []
 _settings_lock = threading.Lock()
@@ -142,17 +144,35 @@ def trainable_parameters(
 def train(state: TrainingState, experience: RankedExperience, config: Config) -> None:
     """Advance ``state`` by one version, on the buffer after iteration ``state.version``.
 
-    The examples are drawn with the random stream (seed, training, new version).
+    The examples are drawn with the random streams (seed, training, new version, round).
     """
-    version = state.version + 1
-    stream = Stream(stream_key(config.seed, Purpose.TRAINING, version))
-    draw = draw_examples(stream, experience, config)
+    version, every = state.version + 1, config.training.reset_every
+    rounds = 1
+    if every is not None and version % every == 0:
+        _reset(state, config)
+        rounds = RESET_ROUNDS
     if version == 1 and config.network.normalise_observations:
         _normalise(state, experience)
-    with _threads(config.arithmetic.training_threads):
-        losses = _update(state, experience, draw, config)
+    for k in range(rounds):
+        stream = Stream(stream_key(config.seed, Purpose.TRAINING, version, k))
+        draw = draw_examples(stream, experience, config)
+        with _threads(config.arithmetic.training_threads):
+            losses = _update(state, experience, draw, config)
+        state.loss = losses / config.training.n_updates_per_iter
     state.version = version
-    state.loss = losses / config.training.n_updates_per_iter
+
+
+def _reset(state: TrainingState, config: Config) -> None:
+    """Give all networks their initial weights, and begin with a new optimizer state.
+
+    Networks that are trained for long learn worse from new data than new ones do (Nikishin et al.,
+    2022). The normalisation of observations remains.
+    """
+    initial = untrained(config, state.behavior.spec).parameters()
+    with torch.no_grad():
+        for name, parameter in state.parameters().items():
+            parameter.copy_(initial[name])
+    state.optimizer.state.clear()
 
 
 def _normalise(state: TrainingState, experience: RankedExperience) -> None:

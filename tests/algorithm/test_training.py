@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch.nn import functional
 
+from udrl import training
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.actions import Categorical
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config, build
+from udrl.config import Config, build, change
 from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.figure2 import A1, A2, A3
@@ -22,6 +23,7 @@ from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import (
+    RESET_ROUNDS,
     TrainingState,
     compute_deterministically,
     exact_arithmetic,
@@ -326,3 +328,49 @@ def test_exact_arithmetic_ends_with_its_last_user(
         assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
     finally:
         compute_deterministically()
+
+
+# Resets.
+
+
+def trained(versions: int, **values: Any) -> TrainingState:
+    """The state after some versions on the same buffer."""
+    config = settings(**values)
+    state, experience = untrained(config, SPEC), ranked(config, EPISODES)
+    for _ in range(versions):
+        train(state, experience, config)
+    return state
+
+
+def test_versions_between_resets_are_not_affected() -> None:
+    assert digest(trained(2, reset_every=3)) == digest(trained(2))
+    assert digest(trained(3, reset_every=3)) != digest(trained(3))
+
+
+@pytest.mark.parametrize("baseline", ["none", "action_value"])
+def test_reset_begins_from_the_initial_weights(
+    baseline: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reset with one round is version 1 of a network that draws that version's examples."""
+    monkeypatch.setattr(training, "RESET_ROUNDS", 1)
+    values = {"baseline": baseline, "reset_every": 3}
+    config = settings(**values)
+    new = untrained(config, SPEC)
+    new.version = 2
+    train(new, ranked(config, EPISODES), change(config, reset_every=None))
+    found = trained(3, **values)
+    assert digest(found) == digest(new)
+    steps = {float(s["step"]) for s in found.optimizer.state.values()}
+    assert steps == {float(s["step"]) for s in new.optimizer.state.values()}
+
+
+def test_reset_makes_more_updates() -> None:
+    (steps,) = {float(s["step"]) for s in trained(2, reset_every=2).optimizer.state.values()}
+    assert steps == 6 * RESET_ROUNDS
+
+
+def test_reset_keeps_the_normalisation_of_observations() -> None:
+    state = trained(2, reset_every=2, normalise_observations=True)
+    mean = state.weights["encoder.normaliser.mean"]
+    steps = np.concatenate([episode.observations for episode in EPISODES])
+    np.testing.assert_allclose(mean, steps.mean(axis=0), rtol=1e-4)

@@ -16,7 +16,7 @@ CASES = [
     (small, 4000),
     (toy, 400),
     (partial(small, n_episodes_per_iter=2, n_steps_per_iter=300, last_few=2), 4000),
-    (partial(small, baseline="value", guidance_kl=0.05), 4000),
+    (partial(small, baseline="value", guidance_kl=0.05, reset_every=4), 4000),
 ]
 
 
