@@ -148,7 +148,7 @@ def test_run_of_another_protocol_is_reported(hosted: Hosted) -> None:
             query.reply("udrl/999/future/hello", b"whatever that will be")
 
     queryable = hosted.session.declare_queryable("udrl/999/future/hello", answer)
-    with pytest.raises(ConfigError, match="protocol 999, this program speaks 3"):
+    with pytest.raises(ConfigError, match="protocol 999, this program speaks 4"):
         find_run(hosted.session, "future", 5)
     queryable.undeclare()
 
