@@ -271,7 +271,9 @@ def _study(
             for algorithm in subject.algorithms
         )
 
-    return Study(name, [run for runs in jobs.values() for run in runs], report, run_all, ("ray",))
+    planned = [run for runs in jobs.values() for run in runs]
+    possible = [run for key in jobs for run in in_final(*key)]
+    return Study(name, planned, report, run_all, needs=("ray",), possible=possible)
 
 
 def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:

@@ -38,6 +38,8 @@ class Study(NamedTuple):
         run_jobs: runs the jobs; see :func:`udrl_experiments.jobs.run_jobs`.
         needs: modules that the study needs, in addition to those of its runs.
         shares_runs: whether the study uses runs of other studies.
+        possible: longer runs that the study may choose later. They are copied if they are finished
+            elsewhere.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Study(NamedTuple):
     )
     needs: Sequence[str] = ()
     shares_runs: bool = True
+    possible: Sequence[Job] = ()
 
 
 def run_study(
@@ -84,7 +87,8 @@ def run_study(
     folders = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         sources = [one if study.shares_runs else one / study.name for one in runs_from]
-        copy_finished(study.jobs, folders.root, sources, echo)
+        for jobs in (study.jobs, study.possible):
+            copy_finished(jobs, folders.root, sources, echo)
         _write_plan(study, folders, resume=resume)
         study.run_jobs(study.jobs, folders.root, side_by_side, stop, echo)
         summary = study.report(folders)

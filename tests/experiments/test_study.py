@@ -171,6 +171,29 @@ def test_runs_are_taken_from_other_folders(
     assert output == "2.0"
 
 
+def test_longer_runs_are_taken_from_other_folders_if_finished(tmp_path: Path) -> None:
+    longer = msgspec.structs.replace(job(1), max_env_steps=500)
+    here, done = tmp_path / "here", '{"max_env_steps": 500}'
+    for run, finished in ((longer, done), (job(2), '{"max_env_steps": 100}')):
+        folder = run.folder(tmp_path / "other")
+        folder.mkdir(parents=True)
+        row = EvaluationRecord(
+            environment="CartPole-v1", algorithm="UDRL", variant="", seed=1, env_steps=100,
+            wall_s=1.0, mean=2.0, std=3.0, episodes=4,
+        )  # fmt: skip
+        write(folder / "evaluations.csv", EvaluationRecord, [row])
+        (folder / "job.json").write_bytes(msgspec.json.encode(run))
+        (folder / "done.json").write_text(finished)
+    possible = [longer, msgspec.structs.replace(job(2), max_env_steps=500)]
+    study = Study("try", [job(1), job(2)], lambda _: "", lambda *_: None, possible=possible)
+    run_study(
+        study, here, side_by_side=1, resume=False, stop=threading.Event(),
+        echo=lambda text: None, runs_from=[tmp_path / "other"],
+    )  # fmt: skip
+    assert [one.done(here) for one in possible] == [True, False]
+    assert [job(seed).done(here) for seed in (1, 2)] == [True, True]
+
+
 def test_source_without_runs_creates_no_study(world: World, tmp_path: Path) -> None:
     study = Study("try", [job(1)], world.report, lambda *_: None)
     with pytest.raises(ConfigError, match=r"--runs-from .*nowhere: expected a folder of studies"):
