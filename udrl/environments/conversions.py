@@ -94,11 +94,11 @@ class Boxed(Conversion):
         self._is_reshaped = self._shape != plain.shape
 
     def back(self, values: Array) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         return values.astype(self.declared.dtype).reshape(-1, *self._shape)
 
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Plain."""
+        """Return plain elements, [*leading, *shape]."""
         array = value if type(value) is np.ndarray else as_array(self.name, value)
         if array.shape != leading + self._shape:
             raise self._fault(value)
@@ -126,13 +126,13 @@ class _Images(Boxed):
         self._is_reshaped = False
 
     def back(self, values: Array) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         if self._is_flat:
             return values[:, 0]
         return np.moveaxis(values, -3, -1) if self._is_last else values
 
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Plain."""
+        """Return plain elements, [*leading, *shape]."""
         array = super().convert(value, leading)
         if self._is_flat:
             return np.expand_dims(array, len(leading))
@@ -156,15 +156,15 @@ class Indexed(Conversion):
         return super().one(value)
 
     def back_one(self, value: Any) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         return super().back_one(value) if self._back is None else self._back[value]
 
     def back(self, values: Array) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         return values.astype(self.declared.dtype) + self._start
 
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Plain."""
+        """Return plain elements, [*leading, *shape]."""
         array = as_array(self.name, value)
         if array.dtype.kind not in "iu" or array.size != np.prod(leading, dtype=int):
             raise self._fault(value)
@@ -184,12 +184,12 @@ class MultiIndexed(Conversion):
         self._ns = np.asarray(declared.nvec).reshape(-1)
 
     def back(self, values: Array) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         numbers = values.astype(self.declared.dtype) + self._start
         return numbers.astype(self.declared.dtype).reshape(-1, *self.declared.shape)
 
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Plain."""
+        """Return plain elements, [*leading, *shape]."""
         array = as_array(self.name, value)
         if array.dtype.kind not in "biu" or array.shape != leading + self.declared.shape:
             raise self._fault(value)
@@ -217,17 +217,17 @@ class _Records(Conversion):
         self._parts = [(leaf, c) for leaf, (_, c) in zip(leaves, parts, strict=True)]
 
     def back(self, values: Array) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         return nested(self.declared, iter([c.back(values[leaf.name]) for leaf, c in self._parts]))
 
     def back_one(self, value: Any) -> Any:
-        """As declared."""
+        """Return elements of the declared space."""
         return nested(
             self.declared, iter([c.back_one(value[leaf.name]) for leaf, c in self._parts])
         )
 
     def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Plain."""
+        """Return plain elements, [*leading, *shape]."""
         record: Array = np.empty(leading, self.plain.dtype)
         for leaf, conversion in self._parts:
             try:
