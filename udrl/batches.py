@@ -180,15 +180,17 @@ class Batches:
         self._scales = np.array(ReturnInTime(config.network).scales)
         self._bound = config.network.advantage_bound
 
-    def gather(self, *, hide: bool = False) -> Iterator[Batch]:
-        """Yield the batches of all updates.
+    def gather(self, *, hide: bool = False, most: int | None = None) -> Iterator[Batch]:
+        """Yield the batches of all updates, or of the first ones.
 
         Args:
             hide: whether to hide the previous action and reward, from the examples drawn for it.
+            most: maximum number of batches. None: all.
         """
         draw = self._draw
-        for first in range(0, len(draw.segments.rank), self._at_once):
-            part = slice(first, first + self._at_once)
+        end = len(draw.segments.rank[:most])
+        for first in range(0, end, self._at_once):
+            part = slice(first, min(first + self._at_once, end))
             n = self._fill(Segments(*(s[part] for s in draw.segments)))
             if hide and draw.hidden is not None:
                 for k in self._previous:

@@ -28,8 +28,8 @@ from udrl.value import with_return
 
 #: Upper bound of g.
 _MOST = 30.0
-#: Minimum number of examples from which g is chosen.
-_EXAMPLES = 4096
+#: Number of examples from which g is chosen; the last batch may exceed it.
+EXAMPLES = 4096
 
 
 def choose_guidance(
@@ -44,8 +44,7 @@ def choose_guidance(
 
     Args:
         behavior: the behavior function.
-        batches: batches of examples, and with a memory, its states before their windows. At least
-            4,096 examples are used, or all.
+        batches: batches of examples, and with a memory, its states before their windows.
         minimum: minimum of the mean divergence, in nats.
     """
     total, n = torch.zeros((), dtype=torch.float64), 0
@@ -58,7 +57,5 @@ def choose_guidance(
             divergence = batch.counted(kl_divergence(behavior.spec.action_space, highest, lowest))
             total += divergence.double().sum().cpu()
             n += len(divergence)
-            if n >= _EXAMPLES:
-                break
     unguided = float(total) / n
     return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MOST)

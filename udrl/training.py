@@ -1,6 +1,7 @@
 """Section 2.3.3: weights version v is version v-1 after a fixed number of Adam updates."""
 
 import contextlib
+import math
 import os
 import threading
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from udrl.config import Config
 from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
 from udrl.graph import Weights
-from udrl.guidance import choose_guidance
+from udrl.guidance import EXAMPLES, choose_guidance
 from udrl.initialisation import draw_weights
 from udrl.segments import RankedExperience
 from udrl.spaces import Vector
@@ -212,7 +213,8 @@ def _update(
         losses += loss.detach()
     if behavior.guidance is not None:
         minimum = config.network.guidance_kl
-        examples = ((batch, _initial_states(batch, states)) for batch in batches.gather())
+        most = math.ceil(EXAMPLES / config.training.batch_size)
+        examples = ((b, _initial_states(b, states)) for b in batches.gather(most=most))
         behavior.guidance.fill_(choose_guidance(behavior, examples, minimum))
     return float(losses)
 

@@ -1,6 +1,5 @@
 """Guidance: acting goes further than the examples, by a chosen divergence."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -68,15 +67,6 @@ def test_strong_response_is_not_guided() -> None:
 
 def test_guidance_is_bounded() -> None:
     assert choose_guidance(behavior(response=0.0), [(examples(10), None)], 0.05) == 30.0
-
-
-def test_only_as_many_examples_are_used_as_needed() -> None:
-    def batches() -> Iterator[tuple[Batch, None]]:
-        yield examples(4000), None
-        yield examples(96), None
-        raise AssertionError("4,096 examples are enough")
-
-    assert choose_guidance(behavior(), batches(), 0.05) > 0
 
 
 def test_padding_does_not_count() -> None:

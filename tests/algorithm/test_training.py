@@ -11,6 +11,7 @@ from torch.nn import functional
 from udrl import training
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.actions import Categorical
+from udrl.batches import Batches, draw_examples
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, build, change
 from udrl.digests import arrays_digest
@@ -328,6 +329,18 @@ def test_exact_arithmetic_ends_with_its_last_user(
         assert "CUBLAS_WORKSPACE_CONFIG" not in os.environ
     finally:
         compute_deterministically()
+
+
+def test_only_the_first_batches_can_be_gathered() -> None:
+    config = settings()
+    experience = ranked(config, EPISODES)
+    draw = draw_examples(Stream(bytes(16)), experience, config)
+    batches = Batches(draw, experience, config)
+    every = [batch.seen[0].clone() for batch in batches.gather()]
+    first = [batch.seen[0].clone() for batch in batches.gather(most=2)]
+    assert len(every) == 6
+    assert len(first) == 2
+    assert all(torch.equal(a, b) for a, b in zip(first, every, strict=False))
 
 
 # Resets.
