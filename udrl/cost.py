@@ -48,7 +48,7 @@ def slow_training_warning(config: Config, spec: EnvironmentSpec) -> str:
     if any(isinstance(leaf.space, Image) for leaf in leaves_of(seen)):
         remedies = (
             "n_updates_per_iter, batch_size or convolutions, or make the images smaller "
-            "(gymnasium.wrappers.ResizeObservation)"
+            """(--set 'wrappers=["udrl.environments:Downsample(height=60, width=80)"]')"""
         )
     return (
         f"every iteration will train for about {seconds / 60:.0f} minutes on a CPU "

@@ -56,7 +56,7 @@ def test_large_images_are_warned_of_with_the_remedy() -> None:
     warning = slow_training_warning(settings(), screen)
     assert "every iteration will train for about 12 minutes" in warning
     assert "100 updates of 768 examples of" in warning
-    assert "ResizeObservation" in warning
+    assert """wrappers=["udrl.environments:Downsample(height""" in warning
     assert slow_training_warning(settings(n_updates_per_iter=5), screen) == ""
     assert slow_training_warning(settings(device="cuda"), screen) == ""
     assert slow_training_warning(settings(), spec(Vector(size=8))) == ""

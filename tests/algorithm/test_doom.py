@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
 from udrl.actions import Categorical
@@ -26,7 +23,6 @@ from udrl.config import Config, build
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.doom import Doom
-from udrl.environments.downsampling import AreaAverage
 from udrl.errors import UnsupportedEnvironment
 from udrl.spaces import Image
 
@@ -236,47 +232,3 @@ def test_broken_vizdoom_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Area averaging.
-
-
-def area_average(image: npt.NDArray[np.uint8], height: int, width: int) -> list[list[int]]:
-    """The area average as exact fractions."""
-
-    def share(i: int, size: int, j: int, to_size: int) -> Fraction:
-        low = max(Fraction(i, size), Fraction(j, to_size))
-        return max(Fraction(0), min(Fraction(i + 1, size), Fraction(j + 1, to_size)) - low)
-
-    def pixel(row: int, column: int) -> int:
-        total = sum(
-            int(image[y, x])
-            * share(y, image.shape[0], row, height)
-            * share(x, image.shape[1], column, width)
-            for y in range(image.shape[0])
-            for x in range(image.shape[1])
-        )
-        return int(total * height * width + Fraction(1, 2))
-
-    return [[pixel(row, column) for column in range(width)] for row in range(height)]
-
-
-@settings(deadline=None, max_examples=40)
-@given(st.data())
-def test_area_average_is_exact(data: st.DataObject) -> None:
-    height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
-    to_height, to_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
-    pixels = data.draw(st.binary(min_size=height * width, max_size=height * width))
-    image = np.frombuffer(pixels, np.uint8).reshape(height, width)
-    found = AreaAverage(height, width, to_height, to_width)(image)
-    assert found.tolist() == area_average(image, to_height, to_width)
-
-
-def test_area_average_of_colours_and_of_large_images() -> None:
-    rng = np.random.default_rng(1)
-    image = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
-    found = AreaAverage(480, 640, 60, 80)(image)
-    blocks = image.astype(np.int64).reshape(60, 8, 80, 8, 3).sum(axis=(1, 3))
-    assert np.array_equal(found, (2 * blocks + 64) // 128)
-
-
-def test_area_average_of_more_pixels_than_32_bits_can_sum() -> None:
-    image = np.full((2100, 2100), 255, np.uint8)
-    assert AreaAverage(2100, 2100, 2, 3)(image).tolist() == [[255] * 3] * 2

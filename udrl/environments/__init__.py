@@ -8,6 +8,7 @@ paper's toy example) and ``Obedience-v0`` (following the command is trivial).
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from udrl.environments.downsampling import Downsample
 from udrl.environments.making import (
     Environment,
     EnvironmentSpec,
@@ -17,7 +18,14 @@ from udrl.environments.making import (
 )
 from udrl.environments.sparse import RewardAtEnd
 
-__all__ = ["Environment", "EnvironmentSpec", "limit_steps", "make_environment", "specify"]
+__all__ = [
+    "Downsample",
+    "Environment",
+    "EnvironmentSpec",
+    "limit_steps",
+    "make_environment",
+    "specify",
+]
 
 _DOOM = "udrl.environments.doom:Doom"
 _SPECS = (

@@ -113,12 +113,12 @@ class Boxed(Conversion):
 
 
 class _Images(Boxed):
-    """Converts images. Spaces do not declare the channel dimension: it is the smallest."""
+    """Converts images."""
 
     def __init__(self, name: str, declared: spaces.Box) -> None:
-        shape = declared.shape
-        self._is_flat = len(shape) == 2
-        self._is_last = len(shape) == 3 and shape[0] > min(shape)
+        shape, axis = declared.shape, channel_axis(declared)
+        self._is_flat = axis is None
+        self._is_last = axis == 2
         moved = (1, *shape) if self._is_flat else shape
         if self._is_last:
             moved = (shape[2], *shape[:2])
@@ -268,6 +268,21 @@ def leaves_within(
         yield from leaves_within(child, (*path, key))
 
 
+def is_image(space: spaces.Space[Any]) -> bool:
+    """Return whether a space is one of images: a ``Box`` of bytes with two or three dimensions."""
+    return isinstance(space, spaces.Box) and len(space.shape) in (2, 3) and space.dtype == np.uint8
+
+
+def channel_axis(space: spaces.Box) -> int | None:
+    """Return which dimension of an image has its channels, 0 or 2; None: there are only two.
+
+    Spaces do not declare it: it is the smallest.
+    """
+    if len(space.shape) == 2:
+        return None
+    return 2 if space.shape[0] > min(space.shape) else 0
+
+
 def as_array(name: str, value: Any) -> Array:
     """Return a value as an array.
 
@@ -332,7 +347,7 @@ def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
             return MultiIndexed(name, space, Categories(ns=tuple(space.nvec.reshape(-1).tolist())))
         case spaces.MultiBinary() if np.prod(space.shape) > 0:
             return Boxed(name, space, Bits(size=int(np.prod(space.shape))))
-        case spaces.Box() if len(space.shape) in (2, 3) and space.dtype == np.uint8:
+        case spaces.Box() if is_image(space):
             if min(space.shape) > 0:
                 return _Images(name, space)
         case spaces.Box() if np.prod(space.shape) > 0:

@@ -1,11 +1,103 @@
 """Downsampling of images by area averaging, with the same bits on every machine."""
 
+from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
+
+from udrl.environments.conversions import channel_axis, is_image, leaves_within
+from udrl.errors import UnsupportedEnvironment
 
 Image = npt.NDArray[np.uint8]
+
+
+class Downsample(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Downsamples the images of observations, also those in a ``Dict`` or ``Tuple``.
+
+    Values that are not in the environment's space are returned unchanged, and then refused by
+    :class:`udrl.environments.adapter.Adapter`.
+
+    Args:
+        env: any environment.
+        height, width: size of the images in pixels, at most that of the environment's images.
+
+    Raises:
+        UnsupportedEnvironment: there is no image, or this size does not fit.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], height: int, width: int) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, height=height, width=width)
+        gym.ObservationWrapper.__init__(self, env)
+        if height < 1 or width < 1:
+            raise UnsupportedEnvironment(
+                f"{height} x {width} pixels after downsampling; expected at least 1 x 1"
+            )
+        self._size = height, width
+        self._averages: dict[tuple[int, ...], AreaAverage] = {}
+        if not any(is_image(leaf) for _, leaf in leaves_within(env.observation_space)):
+            raise UnsupportedEnvironment(
+                f"its observations are {env.observation_space}, without an image; expected a Box "
+                f"of uint8 with two or three dimensions"
+            )
+        self.observation_space = self._smaller_space(env.observation_space)
+
+    def observation(self, observation: Any) -> Any:
+        """Return the observation with smaller images."""
+        return self._smaller(self.env.observation_space, observation)
+
+    def _smaller_space(self, space: spaces.Space[Any]) -> spaces.Space[Any]:
+        match space:
+            case spaces.Dict():
+                return spaces.Dict([(k, self._smaller_space(s)) for k, s in space.spaces.items()])
+            case spaces.Tuple():
+                return spaces.Tuple([self._smaller_space(inner) for inner in space.spaces])
+            case spaces.Box() if is_image(space):
+                return self._smaller_image(space)
+        return space
+
+    def _smaller_image(self, space: spaces.Box) -> spaces.Box:
+        axis, (height, width) = channel_axis(space), self._size
+        size = tuple(n for i, n in enumerate(space.shape) if i != axis)
+        if size[0] < height or size[1] < width:
+            raise UnsupportedEnvironment(
+                f"an image has {size[0]} x {size[1]} pixels; expected at least {height} x {width}, "
+                f"the size after downsampling; choose a smaller one"
+            )
+        shape = list(self._size)
+        if axis is not None:
+            shape.insert(axis, space.shape[axis])
+        smaller = spaces.Box(0, 255, tuple(shape), np.uint8)
+        if channel_axis(smaller) != axis:
+            raise UnsupportedEnvironment(
+                f"an image would have {height} x {width} pixels; expected more than its "
+                f"{shape[axis or 0]} channels; choose a larger size"
+            )
+        self._averages[space.shape] = AreaAverage(size[0], size[1], height, width)
+        return smaller
+
+    def _smaller(self, space: spaces.Space[Any], value: Any) -> Any:
+        match space:
+            case spaces.Dict() if isinstance(value, Mapping):
+                return {
+                    key: self._smaller(space[key], inner) if key in space.spaces else inner
+                    for key, inner in value.items()
+                }
+            case spaces.Tuple() if isinstance(value, tuple) and len(value) == len(space):
+                pairs = zip(space.spaces, value, strict=True)
+                return tuple(self._smaller(inner, part) for inner, part in pairs)
+            case spaces.Box() if is_image(space) and _is_element(value, space):
+                average = self._averages[space.shape]
+                if channel_axis(space) == 0:
+                    return np.moveaxis(average(np.moveaxis(value, 0, -1)), -1, 0)
+                return average(value)
+        return value
+
+
+def _is_element(value: Any, space: spaces.Box) -> bool:
+    return isinstance(value, np.ndarray) and space.contains(value)
 
 
 class AreaAverage:
