@@ -109,7 +109,7 @@ class Simulation:
         # Commands that wait for a version; those that no actor has; the number of commands that
         # are neither waiting nor done.
         self._awaiting: dict[int, list[CommandId]] = defaultdict(list)
-        self._undealt: list[CommandId] = []
+        self._unassigned: list[CommandId] = []
         self._in_play = 0
         self._left: dict[int, int] = {}
         self._ends: list[float] = []
@@ -145,8 +145,8 @@ class Simulation:
     def _answered(self, actor: Actor) -> None:
         actor.asking = False
         share = math.ceil(self._in_play / len(self._actors)) - actor.held
-        for _ in range(min(len(self._undealt), actor.free, share)):
-            iteration, index = command = heapq.heappop(self._undealt)
+        for _ in range(min(len(self._unassigned), actor.free, share)):
+            iteration, index = command = heapq.heappop(self._unassigned)
             actor.running[command] = self._lengths[min(iteration, self._last)][index]
             actor.free -= 1
             actor.held += 1
@@ -177,7 +177,7 @@ class Simulation:
                 self._replay_free = stored
                 delay = stored - self._now + self._costs.sync
                 self._at(delay, "arrived", (actor, command[0]))
-        if self._undealt:
+        if self._unassigned:
             self._ask(actor)
         self._step(actor)
 
@@ -216,7 +216,7 @@ class Simulation:
 
     def _delivered(self, version: int) -> None:
         for command in self._awaiting.pop(version, []):
-            heapq.heappush(self._undealt, command)
+            heapq.heappush(self._unassigned, command)
             self._in_play += 1
         for actor in self._actors:
             self._ask(actor)

@@ -19,7 +19,7 @@ from udrl_launch.subcommands.settings_options import gather_settings
 from udrl_proto import replay_client, verbs
 from udrl_proto.access import RIGHTS
 from udrl_proto.messages import Hello
-from udrl_replay import auditing, dealing, quarantine, replay_service
+from udrl_replay import auditing, dispatching, quarantine, replay_service
 from udrl_replay.schema import SCHEMA
 from udrl_replay.store import Store
 
@@ -148,13 +148,13 @@ def plain(page: str) -> str:
         (OPERATIONS, f"retries for {replay_client.PATIENCE_S:.0f} s"),
         (OPERATIONS, f"has died {WORDS[supervisor._MOST_DEATHS]} times without progress"),
         (OPERATIONS, f"At most {auditing.MOST_OPEN} audits are open"),
-        (OPERATIONS, f"delivered {WORDS[quarantine.OFFENCES]} episodes that were malformed"),
+        (OPERATIONS, f"or {WORDS[quarantine.OFFENCES]} episodes that were malformed"),
         (
             "docs/operations-reference.md",
             f"died {WORDS[supervisor._MOST_DEATHS]} times without progress",
         ),
-        ("docs/protocol.md", f"sends nothing for {dealing.SILENCE_S:.0f} s"),
-        ("docs/protocol.md", f"{dealing.MOST_ACTORS:,} actors have joined"),
+        ("docs/protocol.md", f"sends nothing for {dispatching.SILENCE_S:.0f} s"),
+        ("docs/protocol.md", f"{dispatching.MOST_ACTORS:,} actors have joined"),
         ("docs/protocol.md", f"exit code 7 after {WORDS[replay_client._JOINS]} times"),
         (
             "docs/protocol.md",
@@ -164,8 +164,8 @@ def plain(page: str) -> str:
             "proto/README.md",
             f"has up to {WORDS[outbox._THREADS]} `episode` or `failure` requests in flight",
         ),
-        ("proto/README.md", f"sends nothing for {dealing.SILENCE_S:.0f} s"),
-        ("proto/README.md", f"{dealing.MOST_ACTORS:,} actors have joined"),
+        ("proto/README.md", f"sends nothing for {dispatching.SILENCE_S:.0f} s"),
+        ("proto/README.md", f"{dispatching.MOST_ACTORS:,} actors have joined"),
     ],
 )
 def test_numbers_in_pages_match_the_code(page: str, phrase: str) -> None:

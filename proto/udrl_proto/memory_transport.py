@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 
-from udrl_proto.transport import Answer, Presence, Query
+from udrl_proto.transport import EncodedReply, Presence, Query
 
 
 class Exchange:
@@ -11,7 +11,7 @@ class Exchange:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.answering: dict[str, Callable[[Query], None]] = {}
+        self.queryables: dict[str, Callable[[Query], None]] = {}
         self.subscribed: list[tuple[str, Callable[[bytes], None]]] = []
         self.watching: list[tuple[str, Callable[[Presence], None]]] = []
         self.here: list[str] = []
@@ -34,21 +34,21 @@ class MemoryTransport:
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
 
-    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[EncodedReply]:
         """Yield the reply to a query, if there is one in time."""
-        receive = self._exchange.answering.get(key)
+        receive = self._exchange.queryables.get(key)
         if receive is None:
             return
         query = _MemoryQuery(data)
         receive(query)
         query.completed.wait(timeout_s)
-        if query.answer is not None:
-            yield query.answer
+        if query.sent is not None:
+            yield query.sent
 
-    def answer(self, key: str, receive: Callable[[Query], None]) -> "_Declared":
+    def declare_queryable(self, key: str, receive: Callable[[Query], None]) -> "_Declared":
         """Call ``receive`` for each query on a key."""
-        self._exchange.answering[key] = receive
-        return _Declared(lambda: self._exchange.answering.pop(key))
+        self._exchange.queryables[key] = receive
+        return _Declared(lambda: self._exchange.queryables.pop(key))
 
     def publish(self, key: str, data: bytes) -> None:
         """Send to all subscribers."""
@@ -103,15 +103,15 @@ class _Declared:
 class _MemoryQuery:
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self.answer: Answer | None = None
+        self.sent: EncodedReply | None = None
         self.completed = threading.Event()
 
     @property
     def data(self) -> bytes:
         return self._data
 
-    def reply(self, answer: Answer) -> None:
-        self.answer = answer
+    def reply(self, reply: EncodedReply) -> None:
+        self.sent = reply
         self.completed.set()
 
     def drop(self) -> None:

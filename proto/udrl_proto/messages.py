@@ -132,8 +132,8 @@ class CommandsRequest(Message, frozen=True, kw_only=True):
 
     Attributes:
         wanted: number of commands that the actor can start now.
-        running: ids of all commands that the actor holds and has not delivered. A command dealt to
-            it that is missing here is considered lost and dealt again.
+        running: ids of all commands that the actor holds and has not delivered. A command that was
+            assigned to it and is missing here is considered lost and assigned again.
         spare_cores: estimated number of idle cores of its machine.
         env_steps_per_s: rate over the last seconds.
         weights_version: newest weights version that the actor has.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol
 
 
-class Answer(NamedTuple):
+class EncodedReply(NamedTuple):
     """A reply to a query.
 
     Attributes:
@@ -40,7 +40,7 @@ class Query(Protocol):
         """The request."""
         ...
 
-    def reply(self, answer: Answer) -> None:
+    def reply(self, reply: EncodedReply) -> None:
         """Send the reply. It may be lost; the sender of the query then retries."""
         ...
 
@@ -60,11 +60,11 @@ class Declaration(Protocol):
 class Transport(Protocol):
     """One service's access to the keys of a run (:mod:`udrl_proto.key_expressions`)."""
 
-    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[EncodedReply]:
         """Yield the replies to a query that arrive within ``timeout_s`` seconds."""
         ...
 
-    def answer(self, key: str, receive: Callable[[Query], None]) -> Declaration:
+    def declare_queryable(self, key: str, receive: Callable[[Query], None]) -> Declaration:
         """Call ``receive`` for each query on a key, on the transport's threads."""
         ...
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import zenoh
 
-from udrl_proto.transport import Answer, Declaration, Presence, Query
+from udrl_proto.transport import Declaration, EncodedReply, Presence, Query
 
 log = logging.getLogger("udrl")
 
@@ -24,7 +24,7 @@ class ZenohTransport:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
 
-    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[Answer]:
+    def query(self, key: str, data: bytes, timeout_s: float) -> Iterator[EncodedReply]:
         """Yield the replies to a query; Zenoh's own errors are ignored."""
         for reply in self._session.get(
             key,
@@ -34,13 +34,13 @@ class ZenohTransport:
             congestion_control=zenoh.CongestionControl.BLOCK,
         ):
             if reply.ok is not None:
-                yield Answer(reply.ok.payload.to_bytes(), is_problem=False)
+                yield EncodedReply(reply.ok.payload.to_bytes(), is_problem=False)
             elif reply.err is not None and reply.err.encoding == _OURS:
                 found = reply.err.payload.to_bytes()
                 if found != b"Timeout":
-                    yield Answer(found, is_problem=True)
+                    yield EncodedReply(found, is_problem=True)
 
-    def answer(self, key: str, receive: Callable[[Query], None]) -> Declaration:
+    def declare_queryable(self, key: str, receive: Callable[[Query], None]) -> Declaration:
         """Declare a queryable."""
         return self._session.declare_queryable(
             key, lambda query: receive(_ZenohQuery(key, query)), complete=True
@@ -84,13 +84,13 @@ class _ZenohQuery:
         payload: Any = self._query.payload
         return b"" if payload is None else bytes(payload.to_bytes())
 
-    def reply(self, answer: Answer) -> None:
+    def reply(self, reply: EncodedReply) -> None:
         try:
             with self._query:
-                if answer.is_problem:
-                    self._query.reply_err(answer.data, encoding=_OURS)
+                if reply.is_problem:
+                    self._query.reply_err(reply.data, encoding=_OURS)
                 else:
-                    self._query.reply(self._key, answer.data)
+                    self._query.reply(self._key, reply.data)
         except zenoh.ZError as error:
             log.debug("a reply on %s could not be sent: %s", self._key, error)
 

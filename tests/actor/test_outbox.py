@@ -203,6 +203,8 @@ def test_rejected_episode_is_discarded(
 
 
 def test_other_refusals_are_raised(scripted: Scripted, client: ReplayClient) -> None:
-    scripted.answers(verbs.EPISODE, lambda _: Problem(code="quarantined", message="it lied"))
-    with pytest.raises(Refused, match="it lied"):
+    scripted.answers(
+        verbs.EPISODE, lambda _: Problem(code="quarantined", message="a false episode")
+    )
+    with pytest.raises(Refused, match="a false episode"):
         deliver(client, JOIN, episode(7))

@@ -90,16 +90,16 @@ def test_changed_environment_is_detected_on_resume(
     assert "has changed" in status.inexact_reason
 
 
-def test_liar_is_reported_before_a_changed_environment(
+def test_false_episode_is_reported_before_a_changed_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(Changing, tmp_path / "run")
     with closing(Store(tmp_path / "run")) as store, store.transaction():
         progress = store.fact("progress", RunProgress)
-        progress.deceived, progress.problem = True, "actor a1 lied"
+        progress.deceived, progress.problem = True, "actor a1 delivered a false episode"
         store.set_fact("progress", progress)
     monkeypatch.setattr(Changing, "today", 10.0)
-    with pytest.raises(Deceived, match="actor a1 lied"):
+    with pytest.raises(Deceived, match="actor a1 delivered a false episode"):
         train(Changing, tmp_path / "run", resume=True, max_env_steps=800)
 
 

@@ -42,7 +42,7 @@ from udrl_proto.messages import (
     WeightsRequest,
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
-from udrl_proto.transport import Answer
+from udrl_proto.transport import EncodedReply
 from udrl_replay.creation import create
 from udrl_replay.replay_service import ReplayService
 
@@ -66,15 +66,15 @@ class Query:
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self.answers: list[Answer] = []
+        self.replies: list[EncodedReply] = []
         self.dropped = False
 
     @property
     def data(self) -> bytes:
         return self._data
 
-    def reply(self, answer: Answer) -> None:
-        self.answers.append(answer)
+    def reply(self, reply: EncodedReply) -> None:
+        self.replies.append(reply)
 
     def drop(self) -> None:
         self.dropped = True
@@ -109,20 +109,20 @@ class World:
         """Send any bytes, check all invariants, and return the reply."""
         query = Query(data)
         accepted = self.service.run.progress.accepted
-        self._exchange.answering[key_expressions.key(self._run_id, verb)](query)
+        self._exchange.queryables[key_expressions.key(self._run_id, verb)](query)
         self.service.answer_waiting(0.0)
         assert not query.dropped
-        (answer,) = query.answers
+        (sent,) = query.replies
         self._check_ledgers()
-        if answer.is_problem:
-            return decode(answer.data, Problem)
+        if sent.is_problem:
+            return decode(sent.data, Problem)
         if self.service.run.progress.accepted > accepted:
             self._check_accepted(data)
         reply: type[Message] = verbs.BY_NAME[verb].reply
-        return decode(answer.data, reply, 1 << 30)
+        return decode(sent.data, reply, 1 << 30)
 
     def _check_ledgers(self) -> None:
-        progress, outstanding = self.service.run.progress, self.service.run.dealer.outstanding
+        progress, outstanding = self.service.run.progress, self.service.run.dispatcher.outstanding
         assert progress.issued == progress.accepted + progress.cancelled + len(outstanding)
         assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
 
@@ -158,9 +158,9 @@ def valid_requests() -> list[tuple[str, bytes]]:
     def ask(verb: str, request: Message | bytes) -> Message:
         data = request if isinstance(request, bytes) else encode(request)
         requests.append((verb, data))
-        answer = world.send_raw(verb, data)
-        assert not isinstance(answer, Problem), answer
-        return answer
+        reply = world.send_raw(verb, data)
+        assert not isinstance(reply, Problem), reply
+        return reply
 
     def act() -> None:
         request = CommandsRequest(actor="actor-1", wanted=4)
@@ -207,7 +207,7 @@ def valid_requests() -> list[tuple[str, bytes]]:
         ask(verbs.WEIGHTS.name, WeightsRequest(version="latest"))
         act()
         act()
-    held = next(iter(world.service.run.dealer.outstanding))
+    held = next(iter(world.service.run.dispatcher.outstanding))
     ask(verbs.FAILURE.name, FailureMessage(actor="actor-1", command_id=held, error="no fuel"))
     ask(verbs.STATUS.name, StatusRequest())
     ask(verbs.HISTORY.name, HistoryRequest(after=-1))
@@ -233,15 +233,15 @@ class Target:
     #: Inputs after which a new run is created, so that no state is unreachable for long.
     PERIOD = 5000
 
-    def __init__(self, questions: list[tuple[str, bytes]]) -> None:
-        self._questions = questions
+    def __init__(self, requests: list[tuple[str, bytes]]) -> None:
+        self._requests = requests
         self._world: World | None = None
         self._left = 0
         self.accepted = self.refused = 0
 
     def seeds(self) -> list[bytes]:
         """Return initial inputs: a byte for the verb, then the payload."""
-        return [bytes([NAMES.index(verb)]) + data for verb, data in self._questions]
+        return [bytes([NAMES.index(verb)]) + data for verb, data in self._requests]
 
     def __call__(self, data: bytes) -> None:
         """Send one input."""
@@ -250,8 +250,8 @@ class Target:
         self._left -= 1
         assert self._world is not None
         verb = NAMES[(data[0] if data else 0) % len(NAMES)]
-        answer = self._world.send_raw(verb, data[1:])
-        if isinstance(answer, Problem):
+        reply = self._world.send_raw(verb, data[1:])
+        if isinstance(reply, Problem):
             self.refused += 1
         else:
             self.accepted += 1
@@ -263,7 +263,7 @@ class Target:
         self._left = self.PERIOD
         # Runs start at the beginning and at three later states, in turn.
         skip = (self.accepted + self.refused) // self.PERIOD % 4
-        for verb, data in self._questions[: len(self._questions) * skip // 4]:
+        for verb, data in self._requests[: len(self._requests) * skip // 4]:
             self._world.send_raw(verb, data)
 
     def close(self) -> None:

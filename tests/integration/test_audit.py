@@ -33,31 +33,31 @@ def test_honest_actors_agree_and_the_result_is_unchanged(run: Callable[..., Stat
     assert digests(audited) == digests(run(toy(lead=2), BUDGET))
 
 
-def test_liar_fails_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    liars: list[str] = []
+def test_false_episode_fails_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    false_actors: list[str] = []
     lock = threading.Lock()
 
-    def lie(episode: Episode, actor: str) -> bytes:
+    def deliver_false(episode: Episode, actor: str) -> bytes:
         with lock:
-            if not liars:
-                liars.append(actor)
-        if actor == liars[0]:
+            if not false_actors:
+                false_actors.append(actor)
+        if actor == false_actors[0]:
             episode = replace(episode, rewards=episode.rewards + 1)
         return encode_episode(episode, actor)
 
-    monkeypatch.setattr(udrl_actor.outbox, "encode_episode", lie)
+    monkeypatch.setattr(udrl_actor.outbox, "encode_episode", deliver_false)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
     def run_training(*, resume: bool) -> None:
         train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
               resume=resume)  # fmt: skip
 
-    with pytest.raises(UdrlError, match=r"lied|quarantined"):
+    with pytest.raises(UdrlError, match=r"false episode|quarantined"):
         run_training(resume=False)
     status = status_of(tmp_path / "run")
     assert status.state == "failed"
-    assert [actor.id for actor in status.quarantined] == liars
-    assert f"actor {liars[0]} lied" in status.problem
+    assert [actor.id for actor in status.quarantined] == false_actors
+    assert f"actor {false_actors[0]} delivered a false episode" in status.problem
     assert_conserved(status)
-    with pytest.raises(Deceived, match=liars[0]):
+    with pytest.raises(Deceived, match=false_actors[0]):
         run_training(resume=True)

@@ -7,7 +7,7 @@ from udrl_proto import key_expressions
 from udrl_proto.codec import decode, encode
 from udrl_proto.memory_transport import Exchange, MemoryTransport
 from udrl_proto.messages import Message, Problem
-from udrl_proto.transport import Answer, Query
+from udrl_proto.transport import EncodedReply, Query
 from udrl_proto.verbs import Verb
 
 
@@ -34,9 +34,9 @@ class Scripted:
             request = decode(query.data, verb.request, verb.limit)
             self.received.append((verb.name, request))
             answer = script(request)
-            query.reply(Answer(encode(answer), is_problem=isinstance(answer, Problem)))
+            query.reply(EncodedReply(encode(answer), is_problem=isinstance(answer, Problem)))
 
-        self.transport.answer(key_expressions.key(self._run_id, verb.name), receive)
+        self.transport.declare_queryable(key_expressions.key(self._run_id, verb.name), receive)
 
     def publish(self, name: str, message: Message) -> None:
         """Publish a message."""

@@ -13,7 +13,6 @@ import zenoh
 
 from udrl.errors import Interrupted, InvalidMessage, Refused, Unreachable
 from udrl_proto import key_expressions, replay_client, verbs
-from udrl_proto.answering import Question, serve
 from udrl_proto.codec import SMALL, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
@@ -24,8 +23,9 @@ from udrl_proto.messages import (
     StateRequest,
 )
 from udrl_proto.replay_client import ReplayClient
+from udrl_proto.serving import ReceivedRequest, serve
 from udrl_proto.session import connect
-from udrl_proto.transport import Answer, Transport
+from udrl_proto.transport import EncodedReply, Transport
 from udrl_proto.zenoh_transport import ZenohTransport
 
 RUN = "run"
@@ -34,16 +34,16 @@ ANSWER = StateReply(version=3, weights=b"w", optimizer=b"o")
 WAIT_S = 10.0
 STATE = dataclasses.replace(verbs.STATE, limit=100)
 
-Questions = Inbox[Question]
+Received = Inbox[ReceivedRequest]
 Ask = Callable[..., Future[StateReply]]
 
 
 @pytest.fixture
-def inbox(router: zenoh.Session) -> Questions:
+def inbox(router: zenoh.Session) -> Received:
     """Requests that arrive at a service on the router."""
-    questions: Questions = Inbox(100, 1000)
-    serve(ZenohTransport(router), RUN, questions, [STATE])
-    return questions
+    inbox: Received = Inbox(100, 1000)
+    serve(ZenohTransport(router), RUN, inbox, [STATE])
+    return inbox
 
 
 @pytest.fixture
@@ -67,8 +67,8 @@ def ask(learner: ReplayClient) -> Iterator[Ask]:
 
 
 def first(inbox: Inbox[Any]) -> Any:
-    (question,) = inbox.take(1, 1, WAIT_S)
-    return question
+    (received,) = inbox.take(1, 1, WAIT_S)
+    return received
 
 
 def answer_each(session: zenoh.Session, *answers: Callable[[zenoh.Query], None]) -> None:
@@ -84,25 +84,25 @@ def answer(query: zenoh.Query) -> None:
         query.reply(key_expressions.key(RUN, "state"), encode(ANSWER))
 
 
-def test_reply_is_returned(inbox: Questions, ask: Ask) -> None:
+def test_reply_is_returned(inbox: Received, ask: Ask) -> None:
     future = ask()
-    question = first(inbox)
-    assert (question.verb, question.request) == (STATE, REQUEST)
-    question.answer(ANSWER)
+    received = first(inbox)
+    assert (received.verb, received.request) == (STATE, REQUEST)
+    received.reply(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_request_may_be_encoded_in_advance(inbox: Questions, ask: Ask) -> None:
+def test_request_may_be_encoded_in_advance(inbox: Received, ask: Ask) -> None:
     future = ask(encode(REQUEST))
-    question = first(inbox)
-    assert question.request == REQUEST
-    question.answer(ANSWER)
+    received = first(inbox)
+    assert received.request == REQUEST
+    received.reply(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
-def test_problem_is_raised_with_its_code(inbox: Questions, ask: Ask) -> None:
+def test_problem_is_raised_with_its_code(inbox: Received, ask: Ask) -> None:
     future = ask()
-    first(inbox).answer(Problem(code="rewind", message="version 3 is next"))
+    first(inbox).reply(Problem(code="rewind", message="version 3 is next"))
     with pytest.raises(Refused, match="version 3 is next") as caught:
         future.result(WAIT_S)
     assert caught.value.code == "rewind"
@@ -128,7 +128,7 @@ def test_timeout_doubles_while_there_is_no_reply(monkeypatch: pytest.MonkeyPatch
     attempts: list[float] = []
 
     class SilentTransport:
-        def query(self, key: str, data: bytes, timeout_s: float) -> list[Answer]:
+        def query(self, key: str, data: bytes, timeout_s: float) -> list[EncodedReply]:
             nonlocal now
             now += timeout_s
             attempts.append(timeout_s)
@@ -201,16 +201,16 @@ def test_request_can_be_interrupted(client: zenoh.Session) -> None:
             future.result(WAIT_S)
 
 
-def test_reply_of_another_type_is_rejected(inbox: Questions, ask: Ask) -> None:
+def test_reply_of_another_type_is_rejected(inbox: Received, ask: Ask) -> None:
     future = ask()
-    first(inbox).answer(Acknowledged())
+    first(inbox).reply(Acknowledged())
     with pytest.raises(InvalidMessage, match=r"StateReply: .* `version`"):
         future.result(WAIT_S)
 
 
-def test_reply_above_its_size_limit_is_rejected(inbox: Questions, ask: Ask) -> None:
+def test_reply_above_its_size_limit_is_rejected(inbox: Received, ask: Ask) -> None:
     future = ask(limit=10)
-    first(inbox).answer(ANSWER)
+    first(inbox).reply(ANSWER)
     with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
         future.result(WAIT_S)
 
@@ -227,13 +227,13 @@ def test_reply_above_its_size_limit_is_rejected(inbox: Questions, ask: Ask) -> N
     ],
 )
 def test_invalid_request_reaches_the_service_as_an_error(
-    payload: bytes, complaint: str, inbox: Questions, ask: Ask
+    payload: bytes, complaint: str, inbox: Received, ask: Ask
 ) -> None:
     future = ask(payload)
-    question = first(inbox)
-    assert isinstance(question.request, InvalidMessage)
-    assert complaint in str(question.request)
-    question.answer(Problem(code="invalid", message=str(question.request)))
+    received = first(inbox)
+    assert isinstance(received.request, InvalidMessage)
+    assert complaint in str(received.request)
+    received.reply(Problem(code="invalid", message=str(received.request)))
     with pytest.raises(Refused, match=complaint):
         future.result(WAIT_S)
 
@@ -243,9 +243,9 @@ def test_request_is_prepared_before_it_is_queued(router: zenoh.Session, ask: Ask
     prepare = {"state": lambda request: request.learner.upper()}
     serve(ZenohTransport(router), RUN, inbox, [STATE], prepare)
     future = ask()
-    question = first(inbox)
-    assert question.request == "L"
-    question.answer(ANSWER)
+    received = first(inbox)
+    assert received.request == "L"
+    received.reply(ANSWER)
     assert future.result(WAIT_S) == ANSWER
 
 
@@ -262,18 +262,18 @@ def test_request_to_a_full_inbox_is_retried(router: zenoh.Session, ask: Ask) -> 
     inbox = FullAtFirst(100, 1000)
     serve(ZenohTransport(router), RUN, inbox, [STATE])
     future = ask()
-    first(inbox).answer(ANSWER)
+    first(inbox).reply(ANSWER)
     assert future.result(WAIT_S) == ANSWER
     assert inbox.refused == 1
 
 
 def test_reply_to_a_closed_client_is_discarded(
-    inbox: Questions, router: zenoh.Session, endpoint: str
+    inbox: Received, router: zenoh.Session, endpoint: str
 ) -> None:
     with connect(endpoint, patience_s=5.0) as client:
         client.get(key_expressions.key(RUN, "state"), payload=encode(REQUEST))
-        question = first(inbox)
-    question.answer(ANSWER)
+        received = first(inbox)
+    received.reply(ANSWER)
     assert inbox.take(1, 1, 0.0) == []
 
 

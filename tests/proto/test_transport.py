@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from udrl_proto.memory_transport import Exchange, MemoryTransport
-from udrl_proto.transport import Answer, Presence, Query, Transport
+from udrl_proto.transport import EncodedReply, Presence, Query, Transport
 from udrl_proto.zenoh_transport import ZenohTransport
 from whole_run import wait_for
 
@@ -31,33 +31,35 @@ def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
         yield ZenohTransport(router), ZenohTransport(client)
 
 
-def ask(client: Transport, data: bytes = b"?", timeout_s: float = WAIT_S) -> list[Answer]:
+def ask(client: Transport, data: bytes = b"?", timeout_s: float = WAIT_S) -> list[EncodedReply]:
     return list(client.query(KEY, data, timeout_s))
 
 
 @pytest.mark.parametrize("is_problem", [False, True])
 def test_request_is_answered(ends: Ends, is_problem: bool) -> None:
     service, client = ends
-    service.answer(KEY, lambda query: query.reply(Answer(query.data + b"!", is_problem)))
-    wait_for(lambda: ask(client) == [Answer(b"?!", is_problem)], "the reply")
+    service.declare_queryable(
+        KEY, lambda query: query.reply(EncodedReply(query.data + b"!", is_problem))
+    )
+    wait_for(lambda: ask(client) == [EncodedReply(b"?!", is_problem)], "the reply")
 
 
 def test_request_may_be_answered_from_another_thread(ends: Ends) -> None:
     service, client = ends
     waiting: queue.Queue[Query] = queue.Queue()
-    service.answer(KEY, waiting.put)
+    service.declare_queryable(KEY, waiting.put)
 
     def answer() -> None:
-        waiting.get(timeout=WAIT_S).reply(Answer(b"late", is_problem=False))
+        waiting.get(timeout=WAIT_S).reply(EncodedReply(b"late", is_problem=False))
 
     threading.Thread(target=answer, daemon=True).start()
-    wait_for(lambda: ask(client) == [Answer(b"late", is_problem=False)], "the reply")
+    wait_for(lambda: ask(client) == [EncodedReply(b"late", is_problem=False)], "the reply")
 
 
 def test_undeclared_key_and_dropped_query_get_no_reply(ends: Ends) -> None:
     service, client = ends
     assert ask(client) == []
-    declared = service.answer(KEY, lambda query: query.drop())
+    declared = service.declare_queryable(KEY, lambda query: query.drop())
     assert ask(client) == []
     declared.undeclare()
     assert ask(client) == []
@@ -66,7 +68,7 @@ def test_undeclared_key_and_dropped_query_get_no_reply(ends: Ends) -> None:
 def test_unanswered_request_times_out(ends: Ends) -> None:
     service, client = ends
     hanging: list[Query] = []
-    service.answer(KEY, hanging.append)
+    service.declare_queryable(KEY, hanging.append)
     wait_for(lambda: ask(client, timeout_s=0.1) == [] and hanging, "the request")
     hanging[0].drop()
 

@@ -214,9 +214,9 @@ def work(run: StoredRun) -> None:
     with run.store.transaction():
         if run.awaits_version() is not None:
             run.add_version(train_next(run), 0.0)
-        for item in list(run.dealer.outstanding.values()):
+        for item in list(run.dispatcher.outstanding.values()):
             command = item.command
-            wanted = command.id in run.dealer.outstanding
+            wanted = command.id in run.dispatcher.outstanding
             if wanted and command.weights_version <= run.progress.latest_version:
                 run.accept(arrive(episode(command, weights_of(run, command))), 0.0)
         run.save()

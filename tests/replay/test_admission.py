@@ -74,12 +74,12 @@ def test_commands_of_a_refused_actor_go_to_others(make_run: MakeRun) -> None:
     one = Admission(run)
     for name in ("a", "b"):
         one.join(request("actor", name, f"of {name}"), 0.0)
-        assert run.dealer.deal(run.dealer.actors[name].request, 0, 0.0) == []
-    held = run.dealer.deal(replace(run.dealer.actors["b"].request, wanted=1), 0, 0.0)
+        assert run.dispatcher.assign(run.dispatcher.actors[name].request, 0, 0.0) == []
+    held = run.dispatcher.assign(replace(run.dispatcher.actors["b"].request, wanted=1), 0, 0.0)
     with run.store.transaction():
         one.note_accepted("actor", "a")
     assert refusal(lambda: one.check("actor", "b")) == "other_numerics"
-    again = run.dealer.deal(replace(run.dealer.actors["a"].request, wanted=9), 0, 0.0)
+    again = run.dispatcher.assign(replace(run.dispatcher.actors["a"].request, wanted=9), 0, 0.0)
     assert held[0] in again
 
 
@@ -111,9 +111,9 @@ def test_quarantined_actors_and_too_many_actors_are_refused(
     run = make_run()
     one = Admission(run)
     with run.store.transaction():
-        run.quarantined.add("liar", "it lied")
-    with pytest.raises(Refused, match="it lied"):
-        one.join(join("liar"), 0.0)
+        run.quarantined.add("wrong_actor", "a false episode")
+    with pytest.raises(Refused, match="a false episode"):
+        one.join(join("wrong_actor"), 0.0)
     monkeypatch.setattr(admission, "MOST_ACTORS", 1)
     one.join(join("a"), 0.0)
     assert refusal(lambda: one.join(join("b"), 0.0)) == "too_many_actors"

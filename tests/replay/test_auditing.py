@@ -1,4 +1,4 @@
-"""Audits and quarantine: only lying actors are identified, and results do not change."""
+"""Audits and quarantine: only false episodes have consequences, and results do not change."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -56,10 +56,10 @@ def test_two_equal_episodes_end_the_audit() -> None:
     assert (auditor.open, auditor.versions) == ({}, set())
 
 
-@pytest.mark.parametrize(("digests", "liar"), [("xyx", "b"), ("xyy", "a")])
-def test_third_episode_decides_between_two(digests: str, liar: str) -> None:
+@pytest.mark.parametrize(("digests", "wrong_actor"), [("xyx", "b"), ("xyy", "a")])
+def test_third_episode_decides_between_two(digests: str, wrong_actor: str) -> None:
     made = zip("abc", (d.encode() for d in digests), strict=True)
-    assert audited(*made) == Verdict(liar)
+    assert audited(*made) == Verdict(wrong_actor)
 
 
 def test_three_different_episodes_decide_nothing() -> None:
@@ -107,15 +107,15 @@ def test_open_audits_are_bounded() -> None:
 # Audits in a run.
 
 
-def deliver(run: StoredRun, name: str, made: Command, *, lies: bool = False) -> str:
+def deliver(run: StoredRun, name: str, made: Command, *, is_false: bool = False) -> str:
     with run.store.transaction():
-        reply = run.accept(arrive(episode(made, weights_of(run, made), lies), name), 0.0)
+        reply = run.accept(arrive(episode(made, weights_of(run, made), is_false), name), 0.0)
         run.save()
     return reply
 
 
 def ask(run: StoredRun, name: str, wanted: int = 1) -> list[Command]:
-    return run.deal(CommandsRequest(actor=name, wanted=wanted), 0.0)
+    return run.assign(CommandsRequest(actor=name, wanted=wanted), 0.0)
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def audited_run(make_run: Callable[..., StoredRun]) -> StoredRun:
     run = make_run()
     run.auditor = Auditor(1.0)
     for name in "abc":
-        run.dealer.join(join(name), 0.0)
+        run.dispatcher.join(join(name), 0.0)
     return run
 
 
@@ -146,36 +146,44 @@ def test_audits_do_not_change_the_result(
     assert progress.delivered == progress.accepted + progress.duplicate + progress.rejected
 
 
-def test_liar_stops_the_run_even_after_a_restart(audited_run: StoredRun, tmp_path: Path) -> None:
+def test_actor_with_a_false_episode_stops_the_run_even_after_a_restart(
+    audited_run: StoredRun, tmp_path: Path
+) -> None:
     run = audited_run
     (made,) = ask(run, "a")
-    assert deliver(run, "a", made, lies=True) == "accepted"
+    assert deliver(run, "a", made, is_false=True) == "accepted"
     for name in "bc":
         assert ask(run, name) == [made], "audits precede other commands"
         assert deliver(run, name, made) == "duplicate"
     assert run.progress.state == "failed"
-    assert "actor a lied: its episode of command 0 differs" in run.progress.problem
+    assert (
+        "actor a delivered a false episode: its episode of command 0 differs"
+        in run.progress.problem
+    )
     assert "Since iteration 0" in run.progress.problem
     assert set(run.quarantined.reasons) == {"a"}
     run.store.close()
-    with closing(Store(tmp_path)) as store, pytest.raises(Deceived, match="actor a lied"):
+    with (
+        closing(Store(tmp_path)) as store,
+        pytest.raises(Deceived, match="actor a delivered a false episode"),
+    ):
         StoredRun(store, run.budget)
     assert Deceived.exit_code == 10
 
 
-def test_lying_auditor_is_quarantined_and_the_run_continues(
+def test_auditor_with_a_false_episode_is_quarantined_and_the_run_continues(
     audited_run: StoredRun, reopened: Callable[..., StoredRun]
 ) -> None:
     run = audited_run
     (made,) = ask(run, "a")
     deliver(run, "a", made)
     ask(run, "b")
-    deliver(run, "b", made, lies=True)
+    deliver(run, "b", made, is_false=True)
     ask(run, "c")
     deliver(run, "c", made)
     assert run.progress.state == "running"
     assert set(run.quarantined.reasons) == {"b"}
-    assert "b" not in run.dealer.actors
+    assert "b" not in run.dispatcher.actors
     (other,) = ask(run, "a")
     with pytest.raises(Refused, match="quarantined") as refused:
         deliver(run, "b", other)
@@ -183,25 +191,25 @@ def test_lying_auditor_is_quarantined_and_the_run_continues(
     assert set(reopened(run).quarantined.reasons) == {"b"}
 
 
-def test_liar_that_delivered_before_the_first_audit_stops_the_run(
+def test_false_episode_of_before_the_first_audit_stops_the_run(
     make_run: Callable[..., StoredRun], reopened: Callable[..., StoredRun]
 ) -> None:
     run = make_run()
-    run.dealer.join(join("b"), 0.0)
+    run.dispatcher.join(join("b"), 0.0)
     (earlier,) = ask(run, "b")
     deliver(run, "b", earlier)
     run = reopened(run)
     run.auditor = Auditor(1.0)
     for name in "abc":
-        run.dealer.join(join(name), 0.0)
+        run.dispatcher.join(join(name), 0.0)
     (made,) = ask(run, "a")
     deliver(run, "a", made)
     ask(run, "b")
-    deliver(run, "b", made, lies=True)
+    deliver(run, "b", made, is_false=True)
     ask(run, "c")
     deliver(run, "c", made)
     assert run.progress.deceived
-    assert "actor b lied" in run.progress.problem
+    assert "actor b delivered a false episode" in run.progress.problem
 
 
 def test_nondeterministic_environment_leads_to_no_quarantine(audited_run: StoredRun) -> None:
@@ -223,7 +231,7 @@ def test_repeated_offender_is_quarantined(make_run: Callable[..., StoredRun]) ->
     work(run)  # the warm-up
     with run.store.transaction():
         run.add_version(train_next(run), 0.0)
-    run.dealer.join(join("a"), 0.0)
+    run.dispatcher.join(join("a"), 0.0)
     (made,) = ask(run, "a")
     unknown = command(999)  # of the warm-up, which had fewer
     for _ in range(OFFENCES):
@@ -233,6 +241,6 @@ def test_repeated_offender_is_quarantined(make_run: Callable[..., StoredRun]) ->
     with pytest.raises(Refused, match="quarantined"):
         deliver(run, "a", made)
     assert run.progress.rejected == OFFENCES + 1
-    run.dealer.join(join("b"), 0.0)
+    run.dispatcher.join(join("b"), 0.0)
     assert ask(run, "b") == [made], "its commands must be reassigned"
     assert deliver(run, "b", made) == "accepted"

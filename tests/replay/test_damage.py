@@ -318,7 +318,7 @@ def test_writer_killed_at_any_time_loses_nothing_acknowledged(tmp_path: Path) ->
         with closing(Store(tmp_path)) as store:
             run = StoredRun(store, Budget(max_env_steps=3000))
             assert run.progress.accepted >= acknowledged
-            assert run.progress.issued == run.progress.accepted + len(run.dealer.outstanding)
+            assert run.progress.issued == run.progress.accepted + len(run.dispatcher.outstanding)
             assert run.progress.state == "running"
     with closing(Store(tmp_path)) as store:
         run = StoredRun(store, Budget(max_env_steps=3000))

@@ -27,13 +27,13 @@ def test_offences_are_counted_by_actor_in_bounded_memory(store: Store) -> None:
 def test_quarantine_is_stored_with_its_reason(store: Store) -> None:
     quarantine = Quarantine(store)
     assert "a" not in quarantine
-    quarantine.add("a", "it lied")
+    quarantine.add("a", "a false episode")
     again = Quarantine(store)
     assert "a" in again
     assert not again.count("a"), "later offences must not count"
     refusal = again.refusal("a")
     assert refusal.code == "quarantined"
-    assert "it lied" in str(refusal)
+    assert "a false episode" in str(refusal)
 
 
 def test_number_of_stored_quarantines_is_bounded(store: Store) -> None:

@@ -79,12 +79,12 @@ def test_status_lists_actors_by_their_last_request(make_run: MakeRun) -> None:
     work(run)
     work(run)
     for name in ("b", "a"):
-        run.dealer.join(join(name, environments=4), 10.0)
+        run.dispatcher.join(join(name, environments=4), 10.0)
     request = CommandsRequest(actor="a", wanted=2, env_steps_per_s=12.34, weights_version=1)
-    dealt = run.dealer.deal(request, run.progress.latest_version, 11.0)
+    assigned = run.dispatcher.assign(request, run.progress.latest_version, 11.0)
     seen = shown(run, now=13.5)
     first, second = seen.actors
-    assert (first.id, first.environments, first.running) == ("a", 4, len(dealt))
+    assert (first.id, first.environments, first.running) == ("a", 4, len(assigned))
     assert (first.env_steps_per_s, first.last_seen_s) == (12.3, 2.5)
     assert first.weights_lag == run.progress.latest_version - 1
     assert (second.id, second.running, second.last_seen_s) == ("b", 0, 3.5)
@@ -93,7 +93,7 @@ def test_status_lists_actors_by_their_last_request(make_run: MakeRun) -> None:
 
 def test_status_counts_duplicates_and_rejected_episodes(make_run: MakeRun) -> None:
     run = make_run()
-    command = next(iter(run.dealer.outstanding.values())).command
+    command = next(iter(run.dispatcher.outstanding.values())).command
     for _ in range(3):
         run.accept(arrive(episode(command, b"")), 0.0)
     run.progress.delivered += 1
@@ -290,12 +290,12 @@ def test_contents_have_the_buffer_and_the_commands_drawn_from_it(make_run: MakeR
     best = run.buffer.best(run.config.commands.last_few)
     mean = math.fsum(e.episode_return for e in best) / len(best)
     assert found.desired_return == pytest.approx(mean)
-    dealt = [
+    assigned = [
         (o.command.desired_return, o.command.desired_horizon)
-        for o in run.dealer.outstanding.values() if o.command.kind == "explore"
+        for o in run.dispatcher.outstanding.values() if o.command.kind == "explore"
     ]  # fmt: skip
-    assert dealt
-    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == dealt
+    assert assigned
+    assert list(zip(found.desired_returns, found.desired_horizons, strict=True)) == assigned
     assert set(found.versions) == set(run.store.versions_kept())
 
 

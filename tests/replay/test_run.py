@@ -84,18 +84,18 @@ class RunMachine(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from("abc"))
     def actor_joins(self, name: str) -> None:
-        self.run.dealer.join(join(name), self.now)
+        self.run.dispatcher.join(join(name), self.now)
 
     @rule(name=st.sampled_from("abc"), dies=st.booleans())
     def actor_leaves(self, name: str, dies: bool) -> None:
-        self.run.dealer.remove_actor(name)
+        self.run.dispatcher.remove_actor(name)
         if dies:
             self.held = {key: item for key, item in self.held.items() if key[0] != name}
 
-    @precondition(lambda self: self.run.dealer.actors)
+    @precondition(lambda self: self.run.dispatcher.actors)
     @rule(pick=st.integers(0, 2), wanted=st.integers(1, 4), arrives=st.integers(0, 4).map(bool))
     def actor_asks(self, pick: int, wanted: int, arrives: bool) -> None:
-        name = sorted(self.run.dealer.actors)[pick % len(self.run.dealer.actors)]
+        name = sorted(self.run.dispatcher.actors)[pick % len(self.run.dispatcher.actors)]
         self.now += 1.0
         request = CommandsRequest(
             actor=name,
@@ -103,10 +103,10 @@ class RunMachine(RuleBasedStateMachine):
             running=tuple(i for owner, i in self.held if owner == name),
             spare_cores=2.0,
         )
-        dealt = self.run.deal(request, self.now)
-        assert len(dealt) <= wanted
-        for command in dealt:
-            assert command.id in self.run.dealer.outstanding
+        assigned = self.run.assign(request, self.now)
+        assert len(assigned) <= wanted
+        for command in assigned:
+            assert command.id in self.run.dispatcher.outstanding
             weights = weights_of(self.run, command)
             if arrives:
                 self.held[name, command.id] = command, weights
@@ -126,7 +126,7 @@ class RunMachine(RuleBasedStateMachine):
             return
         del self.held[key]
         expected = "duplicate" if command_id in self.accepted else "rejected"
-        if command_id in self.run.dealer.outstanding:
+        if command_id in self.run.dispatcher.outstanding:
             expected = "accepted"
             self.note_accepted(command, weights, arrival)
         assert self.deliver(arrival) == expected
@@ -140,11 +140,11 @@ class RunMachine(RuleBasedStateMachine):
             latest = self.run.progress.latest_version
             able = [
                 item.command
-                for item in self.run.dealer.outstanding.values()
+                for item in self.run.dispatcher.outstanding.values()
                 if item.command.weights_version <= latest
             ]
             for command in able[::share]:
-                if command.id in self.run.dealer.outstanding:
+                if command.id in self.run.dispatcher.outstanding:
                     weights = weights_of(self.run, command)
                     arrival = arrive(episode(command, weights))
                     self.note_accepted(command, weights, arrival)
@@ -275,7 +275,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def weights_that_commands_name_are_kept(self) -> None:
-        outstanding = [item.command for item in self.run.dealer.outstanding.values()]
+        outstanding = [item.command for item in self.run.dispatcher.outstanding.values()]
         for command in [*outstanding, *self.run.store.commands(cancelled=True)]:
             if command.weights_version <= self.run.progress.latest_version:
                 weights_of(self.run, command)
@@ -348,7 +348,7 @@ MakeRun = Callable[..., StoredRun]
 
 
 def outstanding(run: StoredRun) -> list[Command]:
-    return [item.command for item in run.dealer.outstanding.values()]
+    return [item.command for item in run.dispatcher.outstanding.values()]
 
 
 def deliver(run: StoredRun, command: Command, other: bool = False) -> str:
@@ -371,8 +371,8 @@ def work_until_final_evaluation(run: StoredRun) -> None:
 def fail(run: StoredRun, command_id: int, *actors: str) -> None:
     """Let actors get a command and fail on it, one after the other."""
     for name in actors:
-        run.dealer.join(join(name), 0.0)
-        run.dealer.deal(
+        run.dispatcher.join(join(name), 0.0)
+        run.dispatcher.assign(
             CommandsRequest(actor=name, wanted=0, running=(command_id,)),
             run.progress.latest_version,
             0.0,
@@ -419,11 +419,11 @@ def test_different_episode_of_a_command_is_a_duplicate_and_marks_the_run(make_ru
 def test_episode_above_max_steps_is_rejected_and_stays_outstanding(make_run: MakeRun) -> None:
     run = make_run()
     command = next(c for c in outstanding(run) if len(episode(c, b"").rewards) > 1)
-    run.dealer.outstanding[command.id].command = replace(command, max_steps=1)
+    run.dispatcher.outstanding[command.id].command = replace(command, max_steps=1)
     with pytest.raises(Refused, match=r"steps, its command allows 1"):
         deliver(run, command)
     assert run.progress.rejected == 1
-    assert command.id in run.dealer.outstanding
+    assert command.id in run.dispatcher.outstanding
 
 
 def test_warm_up_that_exhausts_the_budget_ends_the_run(make_run: MakeRun) -> None:
@@ -629,9 +629,9 @@ def test_failed_final_evaluation_is_retried(make_run: MakeRun, reopened: MakeRun
 def vanish(run: StoredRun, *actors: str) -> set[int]:
     """Let actors get commands and vanish, one after the other; return the last one's commands."""
     for name in actors:
-        run.dealer.join(join(name), 0.0)
+        run.dispatcher.join(join(name), 0.0)
         request = CommandsRequest(actor=name, wanted=100)
-        held = run.dealer.deal(request, run.progress.latest_version, 0.0)
+        held = run.dispatcher.assign(request, run.progress.latest_version, 0.0)
         with run.store.transaction():
             run.remove_actor(name)
             run.save()

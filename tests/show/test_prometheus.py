@@ -25,7 +25,7 @@ FULL = msgspec.structs.replace(
                     weights_version=5, weights_lag=1, running=3, reruns=2, failures=1,
                     last_seen_s=0.5),
     ),
-    quarantined=(Quarantined(id="liar", why="lied"),),
+    quarantined=(Quarantined(id="wrong_actor", why="a false episode"),),
     final_evaluation=STATUS.evaluation,
 )  # fmt: skip
 

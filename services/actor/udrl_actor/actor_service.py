@@ -15,7 +15,7 @@ from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class
 from udrl.version import __version__
-from udrl_actor.courier import Courier
+from udrl_actor.command_fetcher import CommandFetcher
 from udrl_actor.outbox import Outbox, deliver
 from udrl_proto import key_expressions, verbs
 from udrl_proto.messages import Hello, JoinRequest
@@ -32,7 +32,7 @@ _MAKING_S = 300.0
 
 
 class ActorService:
-    """Runs the commands that one run deals to this actor.
+    """Runs the commands that one run assigns to this actor.
 
     Args:
         transport: reaches the run.
@@ -93,15 +93,15 @@ class ActorService:
             token = self._transport.declare_presence(
                 key_expressions.alive(run_id, "actor", self._name)
             )
-            courier = Courier(self._transport, self._hello, join, client, self._stop)
+            fetcher = CommandFetcher(self._transport, self._hello, join, client, self._stop)
 
             def deliver_one(outcome: Episode | Failure) -> None:
-                courier.note_acknowledged(deliver(client, join, outcome))
+                fetcher.note_acknowledged(deliver(client, join, outcome))
 
-            outbox = Outbox(f"outbox of {self._name}", deliver_one, courier.fail)
-            courier.start()
+            outbox = Outbox(f"outbox of {self._name}", deliver_one, fetcher.fail)
+            fetcher.start()
             try:
-                self._act(generator, courier, outbox)
+                self._act(generator, fetcher, outbox)
             finally:
                 outbox.close()
         except Interrupted as interruption:
@@ -112,19 +112,19 @@ class ActorService:
                 token.undeclare()
             generator.close()
 
-    def _act(self, generator: EpisodeGenerator, courier: Courier, outbox: Outbox) -> None:
+    def _act(self, generator: EpisodeGenerator, fetcher: CommandFetcher, outbox: Outbox) -> None:
         """Step environments; pause while as many episodes as environments await delivery."""
         self._arm()
         outcomes: list[Episode | Failure] = []
         steps = running = 0
         armed = time.monotonic()
-        while not (courier.ended or self._stop.is_set()):
-            if courier.error is not None:
-                raise courier.error
+        while not (fetcher.ended or self._stop.is_set()):
+            if fetcher.error is not None:
+                raise fetcher.error
             busy = running and len(outbox) < self._environments
-            if outcomes or courier.has_assignments or not busy:
+            if outcomes or fetcher.has_assignments or not busy:
                 outbox.put(outcomes)
-                assignments = courier.take(generator.free, steps, wait_s=0.0 if busy else 0.5)
+                assignments = fetcher.take(generator.free, steps, wait_s=0.0 if busy else 0.5)
                 steps = 0
                 failures = [generator.start(*assignment) for assignment in assignments]
                 outcomes = [f for f in failures if f is not None]
@@ -138,7 +138,7 @@ class ActorService:
             if self._hang_s is not None and now - armed > self._hang_s * _REARM_PART:
                 self._arm()
                 armed = now
-        courier.join(timeout=5.0)
+        fetcher.join(timeout=5.0)
 
     def _make(self, config: Config) -> Environment:
         """Create an environment, which may take longer than a step: simulators have to start."""

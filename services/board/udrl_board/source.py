@@ -31,7 +31,7 @@ from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 
-Answer = TypeVar("Answer")
+Found = TypeVar("Found")
 Wanted = int | Literal["latest", "best"]
 
 #: Seconds that a reply may take.
@@ -196,7 +196,7 @@ class Served:
             self._line = None
             self._stack.close()
 
-    def _query(self, query: Callable[[ReplayClient], Answer]) -> Answer:
+    def _query(self, query: Callable[[ReplayClient], Found]) -> Found:
         with self._lock:
             client, _ = self._connected()
             try:
@@ -278,7 +278,7 @@ class Directory:
                 self._served[1].close()
                 self._served = None
 
-    def _query(self, query: Callable[[Source], Answer]) -> Answer:
+    def _query(self, query: Callable[[Source], Found]) -> Found:
         served = None if self._is_silent() else self._service()
         if served is not None:
             try:

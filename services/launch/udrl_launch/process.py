@@ -80,7 +80,7 @@ def keep_freed_memory() -> None:
 def switch_threads_soon() -> float:
     """Shorten the interpreter's switch interval; return the previous one in seconds.
 
-    An actor's courier needs the interpreter while the loop steps environments: at the default of
+    An actor's fetcher needs the interpreter while the loop steps environments: at the default of
     5 ms a query takes 5 ms instead of 0.2.
     """
     before = sys.getswitchinterval()

@@ -1,1 +1,1 @@
-"""The replay service: keeps the top-k episodes, deals commands, paces the run; has the store."""
+"""The replay service: keeps the top-k episodes, assigns commands, paces the run; has the store."""

@@ -10,7 +10,7 @@ import msgspec
 
 from udrl.errors import Refused
 from udrl_proto.messages import JoinRequest, Role
-from udrl_replay.dealing import MOST_ACTORS
+from udrl_replay.dispatching import MOST_ACTORS
 from udrl_replay.run import StoredRun
 
 #: Most learners remembered; the one whose last join is oldest is forgotten first.
@@ -21,7 +21,7 @@ class Admission:
     """Admits services to a run or refuses them.
 
     Args:
-        run: the run; its dealer knows the actors.
+        run: the run; its dispatcher knows the actors.
     """
 
     def __init__(self, run: StoredRun) -> None:
@@ -53,13 +53,13 @@ class Admission:
             return
         if request.id in run.quarantined:
             raise run.quarantined.refusal(request.id)
-        if len(run.dealer.actors) >= MOST_ACTORS:
+        if len(run.dispatcher.actors) >= MOST_ACTORS:
             raise Refused(
                 "too_many_actors",
                 f"{MOST_ACTORS} actors have joined, the maximum; use fewer actors with more "
                 f"environments each (--envs)",
             )
-        run.dealer.join(request, now)
+        run.dispatcher.join(request, now)
 
     def check(self, role: Role, name: str) -> None:
         """Check that a service has joined, before it is given or delivers something.
@@ -87,7 +87,7 @@ class Admission:
             run.mark_inexact(f"{role} {name} is of another numerics class")
 
     def remove_service(self, role: str, name: str) -> None:
-        """Remove a service; an actor's commands are dealt again."""
+        """Remove a service; an actor's commands are assigned again."""
         if role == "actor":
             self._run.remove_actor(name)
         elif role == "learner":
@@ -96,7 +96,7 @@ class Admission:
     def _class_of(self, role: Role, name: str) -> str | None:
         if role == "learner":
             return self._learners.get(name)
-        actor = self._run.dealer.actors.get(name)
+        actor = self._run.dispatcher.actors.get(name)
         return actor.join.numerics_class if actor else None
 
     def _compare_environments(self, request: JoinRequest) -> None:

@@ -3,7 +3,7 @@
 An episode is a pure function of its command, so another actor of the same numerics class must
 deliver the same bytes. A random share of commands is run again by a second actor; if the two
 episodes differ, a third actor decides. The commands are chosen with the machine's entropy, not the
-run's streams, so that a lying actor cannot predict them. Audits never change a result.
+run's streams, so that an actor cannot predict them. Audits never change a result.
 """
 
 import random
@@ -43,10 +43,11 @@ class Verdict(NamedTuple):
     """The result of an audit with three actors.
 
     Attributes:
-        liar: the actor whose episode differs from the two that agree; None: all three differ.
+        wrong_actor: the actor whose episode differs from the two that agree; None: all three
+            differ.
     """
 
-    liar: str | None
+    wrong_actor: str | None
 
 
 @dataclass

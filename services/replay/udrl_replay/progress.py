@@ -17,7 +17,7 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         state: ``running`` up to the last iteration N; ``finishing`` while the weights of version N
             are trained and evaluated; then ``ended``. ``failed``: a command failed too often, or
-            an actor lied.
+            an actor delivered a false episode.
         iteration: last completed iteration; -1: the warm-up is not complete.
         env_steps: steps of the warm-up and exploratory episodes of completed iterations.
         eval_env_steps: steps of the evaluation episodes, those of the final evaluation included.
@@ -32,7 +32,8 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         inexact_reason: why it does not; empty if it does.
         problem: why the run failed.
         ended_because: why the run ended, or :data:`STOPPED`.
-        deceived: whether the run failed because it learned from episodes of an actor that lied.
+        deceived: whether the run failed because it learned from episodes of an actor that
+            delivered false ones.
         audit: share of the episodes that are audited.
         agreed: number of audits in which both episodes were equal.
     """

@@ -21,7 +21,6 @@ from udrl.errors import InvalidData, InvalidMessage, Refused
 from udrl.graph import critic_shapes, weight_shapes
 from udrl.weights import decode_weights, optimizer_shapes
 from udrl_proto import key_expressions, verbs
-from udrl_proto.answering import Question, serve
 from udrl_proto.codec import PAGE, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
@@ -51,6 +50,7 @@ from udrl_proto.messages import (
     WeightsRequest,
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
+from udrl_proto.serving import ReceivedRequest, serve
 from udrl_proto.text import printable
 from udrl_proto.transport import Declaration, Presence, Transport
 from udrl_replay.admission import Admission
@@ -112,7 +112,7 @@ class ReplayService:
         self._run_dir = run_dir
         self._metrics = MetricsFile(run_dir, store)
         self._metrics.update(self.run.progress.iteration)
-        self._inbox: Inbox[Question | Presence] = Inbox(_INBOX, _INBOX_BYTES)
+        self._inbox: Inbox[ReceivedRequest | Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
         self._waits = Waits()
         self._here: set[tuple[str, str]] = set()
@@ -208,14 +208,14 @@ class ReplayService:
 
     def answer_waiting(self, timeout_s: float) -> None:
         """Reply to the waiting requests; wait up to ``timeout_s`` seconds for the first."""
-        self._answer(self._inbox.take(_GROUP, _GROUP_BYTES, timeout_s))
+        self._reply_to_all(self._inbox.take(_GROUP, _GROUP_BYTES, timeout_s))
 
-    def _answer(self, group: list[Question | Presence]) -> None:
+    def _reply_to_all(self, group: list[ReceivedRequest | Presence]) -> None:
         now = time.monotonic()
         run = self.run
         before = run.progress.iteration
-        answers: list[tuple[Question, Message]] = []
-        silent = run.dealer.silent_actors({name for _, name in self._here}, now)
+        replies: list[tuple[ReceivedRequest, Message]] = []
+        silent = run.dispatcher.silent_actors({name for _, name in self._here}, now)
         if not group and not silent:
             return
         with self._store.transaction():
@@ -227,33 +227,33 @@ class ReplayService:
                 if isinstance(item, Presence):
                     self._note_presence(item, now)
                 else:
-                    answers.append((item, self._reply(item, now)))
+                    replies.append((item, self._reply(item, now)))
             if msgspec.json.encode(run.progress) != snapshot:
                 run.save()
         self._metrics.update(run.progress.iteration)
-        for question, reply in answers:
-            question.answer(reply)
+        for received, reply in replies:
+            received.reply(reply)
         if run.progress.iteration != before:
             news = encode(Progress(iteration=run.progress.iteration))
             self._transport.publish(
                 key_expressions.key(run.hello.run_id, key_expressions.PROGRESS), news
             )
 
-    def _reply(self, question: Question, now: float) -> Message:
-        request: Any = question.request
+    def _reply(self, received: ReceivedRequest, now: float) -> Message:
+        request: Any = received.request
         if isinstance(request, Malformed):
-            self.run.trust.count_offence(request.actor, str(request.error))
+            self.run.enforcement.count_offence(request.actor, str(request.error))
             request = request.error
         if isinstance(request, InvalidData):
-            if question.verb.name == verbs.EPISODE.name:
+            if received.verb.name == verbs.EPISODE.name:
                 self.run.progress.delivered += 1
                 self.run.progress.rejected += 1
-            log.warning("invalid %s: %s", question.verb.name, printable(request))
+            log.warning("invalid %s: %s", received.verb.name, printable(request))
             return Problem(code="invalid", message=str(request)[:4000])
         try:
-            return self._handlers[question.verb.name](request, now)
+            return self._handlers[received.verb.name](request, now)
         except Refused as error:
-            log.warning("refused %s: %s", question.verb.name, printable(error))
+            log.warning("refused %s: %s", received.verb.name, printable(error))
             return Problem(code=error.code, message=str(error)[:4000])
 
     def _note_presence(self, presence: Presence, now: float) -> None:
@@ -271,7 +271,7 @@ class ReplayService:
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
         self._waits.begin(who, on, why, now)
-        return Wait(on=f"{on}: {why}", retry_after_s=self.run.dealer.retry_after_s())
+        return Wait(on=f"{on}: {why}", retry_after_s=self.run.dispatcher.retry_after_s())
 
     # One method per verb. Each returns the reply, or raises Refused.
 
@@ -290,7 +290,7 @@ class ReplayService:
         if request.actor in run.quarantined:
             raise run.quarantined.refusal(request.actor)
         self._admission.check("actor", request.actor)
-        commands = run.deal(request, now)
+        commands = run.assign(request, now)
         if commands:
             self._waits.end(who)
             newest = max(c.weights_version for c in commands)
@@ -300,7 +300,7 @@ class ReplayService:
         if request.running:
             self._waits.end(who)
             return CommandsReply(
-                wait=Wait(on="nothing: it has work", retry_after_s=run.dealer.retry_after_s())
+                wait=Wait(on="nothing: it has work", retry_after_s=run.dispatcher.retry_after_s())
             )
         return CommandsReply(wait=self._wait(who, *self._what_actors_wait_for(), now))
 
@@ -340,7 +340,7 @@ class ReplayService:
             )
         if not run.is_trainable(request.version):
             if request.version > following:  # prefetched: the version before is not delivered
-                retry_after_s = run.dealer.retry_after_s()
+                retry_after_s = run.dispatcher.retry_after_s()
                 return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
             here = [n for r, n in self._here if r == "actor"]
             why = f"iteration {request.version - 1}" + ("" if here else ": no actor is connected")

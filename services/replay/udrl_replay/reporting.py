@@ -137,7 +137,7 @@ class Waits:
 
 def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
-    progress, dealer, config = run.progress, run.dealer, run.config
+    progress, dispatcher, config = run.progress, run.dispatcher, run.config
     returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
     latest = run.store.version(progress.latest_version)
     rate = throughput.per_second(now)
@@ -156,7 +156,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
             failures=actor.failures,
             last_seen_s=round(now - actor.last_seen, 3),
         )
-        for name, actor in sorted(dealer.actors.items())
+        for name, actor in sorted(dispatcher.actors.items())
     )
     return Status(
         run_id=run.hello.run_id,
@@ -176,7 +176,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
             issued=progress.issued,
             accepted=progress.accepted,
             cancelled=progress.cancelled,
-            outstanding=len(dealer.outstanding),
+            outstanding=len(dispatcher.outstanding),
         ),
         episodes=EpisodeLedger(
             delivered=progress.delivered,
@@ -250,7 +250,9 @@ def contents(run: RunState) -> Contents:
     shown = entries[:: -max(1, -(-len(entries) // MOST_SHOWN))][::-1]
     best = Best.of(run.buffer.best(config.commands.last_few)) if entries else None
     evaluated = best and ReturnInTime(config.network).initial(best.mean, best.horizon)
-    commands = [o.command for o in run.dealer.outstanding.values() if o.command.kind == "explore"]
+    commands = [
+        o.command for o in run.dispatcher.outstanding.values() if o.command.kind == "explore"
+    ]
     return Contents(
         iteration=max(run.progress.iteration, 0),
         returns=tuple(e.episode_return for e in shown),

@@ -56,7 +56,7 @@ def resume(
             with store.transaction():
                 store.set_fact("hello", hello)
         progress = store.fact("progress", RunProgress)
-        # The episodes of a run with a liar are not the environment's.
+        # The episodes of a run with a false episode are not the environment's.
         if check_environment and progress.exact and not progress.deceived:
             _check_environment(store, hello, allow_inexact=allow_inexact)
     return store

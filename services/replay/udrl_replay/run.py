@@ -20,11 +20,11 @@ from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import IterationStatus
 from udrl_proto.text import printable
 from udrl_replay.arrival import Arrival
-from udrl_replay.dealing import SUSPICIOUS
+from udrl_replay.dispatching import SUSPICIOUS
+from udrl_replay.enforcement import Enforcement
 from udrl_replay.progress import STOPPED
 from udrl_replay.run_state import RunState
 from udrl_replay.store import EvaluationRow, Store, Version
-from udrl_replay.trust import Trust
 from udrl_replay.versions import is_known
 
 log = logging.getLogger("udrl")
@@ -39,13 +39,13 @@ class StoredRun(RunState):
         audit: share of the episodes that are audited, 0 to 1.
 
     Raises:
-        Deceived: the run has failed because an actor lied.
+        Deceived: the run has failed because an actor delivered a false episode.
     """
 
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
         super().__init__(store, budget, audit)
         self.sampler = CommandSampler(self.config, self.hello.environment)
-        self.trust = Trust(self, self.remove_actor)
+        self.enforcement = Enforcement(self, self.remove_actor)
         self._evaluated = {
             weights_version(e.iteration, self.config.lead)
             for e in store.evaluations(-1, self.progress.iteration)
@@ -89,26 +89,26 @@ class StoredRun(RunState):
                 is too long.
         """
         self.progress.delivered += 1
-        self.dealer.note_seen(arrival.actor, now)
+        self.dispatcher.note_seen(arrival.actor, now)
         command_id = arrival.entry.id
         if arrival.actor in self.quarantined:
             self.progress.rejected += 1
             raise self.quarantined.refusal(arrival.actor)
-        item = self.dealer.outstanding.get(command_id)
+        item = self.dispatcher.outstanding.get(command_id)
         if item is None:
             if self.auditor.is_assigned(arrival.actor, command_id):
-                return self.trust.compare(arrival)
+                return self.enforcement.compare(arrival)
             return self._accept_again(arrival)
         if arrival.entry.length > item.command.max_steps:
-            self.trust.count_offence(
+            self.enforcement.count_offence(
                 arrival.actor, f"an episode longer than command {command_id} allows"
             )
             raise self.reject(
                 f"episode {command_id} has {arrival.entry.length} steps, its command allows "
                 f"{item.command.max_steps}"
             )
-        self.trust.record_delivery(item.command, arrival)
-        self.dealer.remove_command(command_id, now)
+        self.enforcement.record_delivery(item.command, arrival)
+        self.dispatcher.remove_command(command_id, now)
         self.store.add_episode(arrival.entry, arrival.digest, arrival.body)
         self.progress.accepted += 1
         self._advance()
@@ -133,7 +133,7 @@ class StoredRun(RunState):
             return "duplicate"
         if index >= FINAL_EVALUATION or iteration > self.progress.iteration:
             raise self.reject(f"command {command_id} is cancelled or unknown; drop the episode")
-        self.trust.count_offence(
+        self.enforcement.count_offence(
             arrival.actor, f"an episode of command {command_id}, which was never issued"
         )
         raise self.reject(f"command {command_id} was never issued; drop the episode")
@@ -145,10 +145,10 @@ class StoredRun(RunState):
         closed = self.progress.state == "ended" and iteration == self.progress.iteration > 0
         return closed and index < FINAL_EVALUATION + self.config.evaluation.eval_episodes
 
-    def deal(self, request: CommandsRequest, now: float) -> list[Command]:
-        """Deal commands to an actor that has joined, audits first."""
-        again, rest = self.trust.assign(request)
-        return again + self.dealer.deal(rest, self.progress.latest_version, now)
+    def assign(self, request: CommandsRequest, now: float) -> list[Command]:
+        """Assign commands to an actor that has joined, audits first."""
+        again, rest = self.enforcement.assign(request)
+        return again + self.dispatcher.assign(rest, self.progress.latest_version, now)
 
     def reject(self, why: str) -> Refused:
         """Count a rejected episode and return the refusal to raise."""
@@ -157,13 +157,13 @@ class StoredRun(RunState):
 
     def fail(self, failure: FailureMessage) -> None:
         """Note that a command failed in an actor's environment."""
-        if not self.dealer.holds(failure.actor, failure.command_id):
-            return  # a repetition, or the command has been dealt to another actor
+        if not self.dispatcher.holds(failure.actor, failure.command_id):
+            return  # a repetition, or the command has been assigned to another actor
         self.progress.env_failures += 1
         error = printable(failure.error)
         log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, error)
-        self.dealer.note_failure(failure.command_id, failure.actor)
-        if self.dealer.is_hopeless(failure.command_id):
+        self.dispatcher.note_failure(failure.command_id, failure.actor)
+        if self.dispatcher.is_hopeless(failure.command_id):
             self._give_up(
                 failure.command_id,
                 f"command {failure.command_id} failed three times: {error}",
@@ -172,14 +172,14 @@ class StoredRun(RunState):
     def remove_actor(self, actor: str) -> None:
         """Remove an actor that is gone; a command that it held may be the cause."""
         self.auditor.remove_actor(actor)
-        for item in self.dealer.remove_actor(actor):
+        for item in self.dispatcher.remove_actor(actor):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:
                 log.warning(
                     "command %d was held by %d actors that vanished and is now run alone",
                     command_id, SUSPICIOUS,
                 )  # fmt: skip
-            if self.dealer.is_hopeless(command_id):
+            if self.dispatcher.is_hopeless(command_id):
                 self._give_up(
                     command_id,
                     f"command {command_id} ended three actors that ran nothing else: its "
@@ -199,7 +199,7 @@ class StoredRun(RunState):
         """Complete iterations in order, as far as all their episodes have arrived."""
         while self.progress.state == "running":
             following = self.progress.iteration + 1
-            if self.dealer.outstanding_in(following):
+            if self.dispatcher.outstanding_in(following):
                 return
             self._complete(following)
 
@@ -284,7 +284,7 @@ class StoredRun(RunState):
 
     def _issue(self, commands: list[Command]) -> None:
         self.store.add_commands(commands)
-        self.dealer.add(commands)
+        self.dispatcher.add(commands)
         self.progress.issued += len(commands)
 
     # The end, and resuming after it.
@@ -307,7 +307,7 @@ class StoredRun(RunState):
     def _begin_final_evaluation(self, why: str) -> None:
         """End at iteration N, now complete: cancel later commands and wait for version N."""
         self.progress.state, self.progress.ended_because = "finishing", why
-        self._cancel(list(self.dealer.outstanding))
+        self._cancel(list(self.dispatcher.outstanding))
         self.store.remove_versions(self.progress.iteration)
         self.progress.latest_version = min(self.progress.latest_version, self.progress.iteration)
         self._keep_needed_weights()
@@ -323,7 +323,7 @@ class StoredRun(RunState):
 
     def _end_if_evaluated(self) -> None:
         final = self.progress.iteration
-        if self.dealer.outstanding:
+        if self.dispatcher.outstanding:
             return
         commands = self._final_commands()
         entries = [p.entry for p in self.store.pending(final)]
@@ -339,7 +339,7 @@ class StoredRun(RunState):
 
     def _cancel(self, ids: list[int]) -> None:
         for i in ids:
-            self.dealer.remove_command(i)
+            self.dispatcher.remove_command(i)
         self.store.mark_commands(ids, cancelled=True)
         self.progress.cancelled += len(ids)
 
@@ -347,16 +347,16 @@ class StoredRun(RunState):
         """Undo the end of the run, to continue with a larger budget."""
         final = self.progress.iteration
         final_ids = [c.id for c in self._final_commands()]
-        unfinished = [i for i in final_ids if i in self.dealer.outstanding]
+        unfinished = [i for i in final_ids if i in self.dispatcher.outstanding]
         for i in unfinished:
-            self.dealer.remove_command(i)
+            self.dispatcher.remove_command(i)
         self.progress.cancelled += len(unfinished)
         self.store.remove_commands(final_ids)
         self.store.remove_episodes(p.entry.id for p in self.store.pending(final))
         again = self.store.commands(cancelled=True)
         self.store.mark_commands((c.id for c in again), cancelled=False)
         self.progress.cancelled -= len(again)
-        self.dealer.add(again)
+        self.dispatcher.add(again)
         self.progress.state = "running"
 
     def _clear_failure(self) -> None:

@@ -8,7 +8,7 @@ from udrl.config import Budget
 from udrl.replay import ReplayBuffer
 from udrl_proto.messages import Hello
 from udrl_replay.auditing import Auditor
-from udrl_replay.dealing import Dealer
+from udrl_replay.dispatching import Dispatcher
 from udrl_replay.progress import RunProgress
 from udrl_replay.quarantine import Quarantine
 from udrl_replay.store import Store
@@ -29,7 +29,7 @@ class RunState:
         progress: counters and state.
         buffer: the replay buffer after the last completed iteration.
         digests: digests of the buffer's episodes, by id.
-        dealer: the outstanding commands and the actors.
+        dispatcher: the outstanding commands and the actors.
         auditor: the open audits.
         quarantined: the quarantined actors.
     """
@@ -40,14 +40,14 @@ class RunState:
         self.hello = store.fact("hello", Hello)
         self.config = self.hello.config
         self.progress = store.fact("progress", RunProgress)
-        self.dealer = Dealer()
+        self.dispatcher = Dispatcher()
         self.auditor = Auditor(audit)
         self.quarantined = Quarantine(store)
         held = store.buffer(self.progress.iteration)
         self.buffer = ReplayBuffer(self.config.buffer, (p.entry for p in held))
         self.digests = {p.entry.id: p.digest for p in held}
         arrived = store.pending_ids()
-        self.dealer.add(c for c in self.open_commands() if c.id not in arrived)
+        self.dispatcher.add(c for c in self.open_commands() if c.id not in arrived)
         self._began = time.monotonic() - self.progress.wall_s
 
     def open_commands(self) -> list[Command]:

@@ -112,7 +112,7 @@ class StatusCollector:
                 False,
             ),
             ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
-            ("udrl_actor_reruns", "reruns", "Commands that had been dealt before.", True),
+            ("udrl_actor_reruns", "reruns", "Commands that had been assigned before.", True),
             ("udrl_actor_failures", "failures", "Commands that failed.", True),
             ("udrl_actor_last_seen_seconds", "last_seen_s", "Time since its last message.", False),
         ):

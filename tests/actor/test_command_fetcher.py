@@ -1,4 +1,4 @@
-"""The courier with a scripted replay service."""
+"""The fetcher with a scripted replay service."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ from udrl.inference import probe_weights
 from udrl.spaces import Vector
 from udrl.streams import Purpose, stream_key
 from udrl.weights import encode_weights
-from udrl_actor.courier import Assignment, Courier
+from udrl_actor.command_fetcher import Assignment, CommandFetcher
 from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto.messages import (
     CommandsReply,
@@ -62,8 +62,8 @@ def command(number: int, version: int = 0) -> Command:
     )
 
 
-class Deals:
-    """Deals commands in reply to one request after another; then there are none."""
+class Assigns:
+    """Assigns commands in reply to one request after another; then there are none."""
 
     def __init__(self, *answers: Message) -> None:
         self._answers = list(answers)
@@ -83,31 +83,31 @@ def replay() -> Scripted:
 
 
 @pytest.fixture
-def start(replay: Scripted) -> Iterator[Callable[..., Courier]]:
+def start(replay: Scripted) -> Iterator[Callable[..., CommandFetcher]]:
     stop = threading.Event()
-    started: list[Courier] = []
+    started: list[CommandFetcher] = []
 
-    def begin(*answers: Message) -> Courier:
-        replay.answers(verbs.COMMANDS, Deals(*answers))
+    def begin(*answers: Message) -> CommandFetcher:
+        replay.answers(verbs.COMMANDS, Assigns(*answers))
         client = ReplayClient(replay.transport, HELLO.run_id, "actor a", stop)
-        courier = Courier(replay.transport, HELLO, JOIN, client, stop)
-        courier.start()
-        started.append(courier)
-        return courier
+        fetcher = CommandFetcher(replay.transport, HELLO, JOIN, client, stop)
+        fetcher.start()
+        started.append(fetcher)
+        return fetcher
 
     yield begin
     stop.set()
-    for courier in started:
-        courier.join(DEADLINE_S)
-        assert not courier.is_alive()
+    for fetcher in started:
+        fetcher.join(DEADLINE_S)
+        assert not fetcher.is_alive()
 
 
-def take(courier: Courier, n: int) -> list[Assignment]:
+def take(fetcher: CommandFetcher, n: int) -> list[Assignment]:
     """Take until ``n`` assignments have arrived."""
     assignments: list[Assignment] = []
 
     def more() -> bool:
-        assignments.extend(courier.take(n - len(assignments), 0, wait_s=0.5))
+        assignments.extend(fetcher.take(n - len(assignments), 0, wait_s=0.5))
         return len(assignments) == n
 
     wait_for(more, "assignments", DEADLINE_S)
@@ -115,10 +115,10 @@ def take(courier: Courier, n: int) -> list[Assignment]:
 
 
 def test_commands_are_assigned_with_their_weights(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
-    courier = start(CommandsReply(commands=(command(1), command(2, version=3))))
-    random, acting = take(courier, 2)
+    fetcher = start(CommandsReply(commands=(command(1), command(2, version=3))))
+    random, acting = take(fetcher, 2)
     assert (random.command, random.behavior) == (command(1), None)
     assert acting.command == command(2, version=3)
     assert acting.behavior is not None
@@ -127,73 +127,73 @@ def test_commands_are_assigned_with_their_weights(
 
 
 def test_published_weights_are_not_requested(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
-    courier = start()
-    courier.take(1, 0, wait_s=0.0)
+    fetcher = start()
+    fetcher.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS), "a request", DEADLINE_S)
     replay.publish(key_expressions.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
-    replay.answers(verbs.COMMANDS, Deals(CommandsReply(commands=(command(1, version=3),))))
-    (assignment,) = take(courier, 1)
+    replay.answers(verbs.COMMANDS, Assigns(CommandsReply(commands=(command(1, version=3),))))
+    (assignment,) = take(fetcher, 1)
     assert assignment.behavior is not None
     assert replay.requests(verbs.WEIGHTS) == []
 
 
 def test_actor_joins_a_restarted_service_again(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
     unknown = Problem(code="join_first", message="who is that?")
-    courier = start(unknown, CommandsReply(commands=(command(1),)))
-    assert [assignment.command.id for assignment in take(courier, 1)] == [1]
+    fetcher = start(unknown, CommandsReply(commands=(command(1),)))
+    assert [assignment.command.id for assignment in take(fetcher, 1)] == [1]
     assert replay.requests(verbs.JOIN) == [JOIN]
 
 
 def test_command_with_deleted_weights_is_dropped(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
     gone = Problem(code="unknown_version", message="weights version 3 is not kept")
     replay.answers(verbs.WEIGHTS, lambda _: gone)
-    courier = start(CommandsReply(commands=(command(1, version=3), command(2))))
-    assert [assignment.command.id for assignment in take(courier, 1)] == [2]
+    fetcher = start(CommandsReply(commands=(command(1, version=3), command(2))))
+    assert [assignment.command.id for assignment in take(fetcher, 1)] == [2]
     # The next request no longer lists it as running.
-    courier.take(1, 0, wait_s=0.0)
+    fetcher.take(1, 0, wait_s=0.0)
     wait_for(
         lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next request", DEADLINE_S
     )
 
 
 def test_acknowledged_command_is_no_longer_running(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
-    courier = start(CommandsReply(commands=(command(1), command(2))))
-    take(courier, 2)
-    courier.take(1, 1, wait_s=0.0)
-    courier.note_acknowledged(1)
+    fetcher = start(CommandsReply(commands=(command(1), command(2))))
+    take(fetcher, 2)
+    fetcher.take(1, 1, wait_s=0.0)
+    fetcher.note_acknowledged(1)
     wait_for(
         lambda: replay.requests(verbs.COMMANDS)[-1].running == (2,), "the next request", DEADLINE_S
     )
 
 
 def test_refusal_is_raised_in_the_acting_loop(
-    replay: Scripted, start: Callable[..., Courier]
+    replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:
-    courier = start(Problem(code="quarantined", message="it lied"))
-    courier.take(1, 0, wait_s=0.0)
-    wait_for(lambda: courier.error, "the error", DEADLINE_S)
-    assert isinstance(courier.error, Refused)
-    assert courier.error.code == "quarantined"
+    fetcher = start(Problem(code="quarantined", message="a false episode"))
+    fetcher.take(1, 0, wait_s=0.0)
+    wait_for(lambda: fetcher.error, "the error", DEADLINE_S)
+    assert isinstance(fetcher.error, Refused)
+    assert fetcher.error.code == "quarantined"
 
 
-def test_error_of_the_outbox_ends_the_courier(start: Callable[..., Courier]) -> None:
-    courier, error = start(), Refused("quarantined", "it lied")
-    courier.fail(error)
-    courier.join(DEADLINE_S)
-    assert courier.error is error
+def test_error_of_the_outbox_ends_the_fetcher(start: Callable[..., CommandFetcher]) -> None:
+    fetcher, error = start(), Refused("quarantined", "a false episode")
+    fetcher.fail(error)
+    fetcher.join(DEADLINE_S)
+    assert fetcher.error is error
 
 
-def test_end_of_the_run_ends_the_courier(start: Callable[..., Courier]) -> None:
-    courier = start(CommandsReply(ended=True))
-    courier.take(1, 0, wait_s=DEADLINE_S)
-    courier.join(DEADLINE_S)
-    assert courier.ended
-    assert courier.error is None
+def test_end_of_the_run_ends_the_fetcher(start: Callable[..., CommandFetcher]) -> None:
+    fetcher = start(CommandsReply(ended=True))
+    fetcher.take(1, 0, wait_s=DEADLINE_S)
+    fetcher.join(DEADLINE_S)
+    assert fetcher.ended
+    assert fetcher.error is None

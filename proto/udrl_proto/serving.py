@@ -14,12 +14,12 @@ from udrl_proto import key_expressions
 from udrl_proto.codec import decode, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
-from udrl_proto.transport import Answer, Declaration, Query, Transport
+from udrl_proto.transport import Declaration, EncodedReply, Query, Transport
 from udrl_proto.verbs import VERBS, AnyVerb
 
 
 @dataclass(frozen=True)
-class Question:
+class ReceivedRequest:
     """A decoded query that waits for its reply.
 
     Attributes:
@@ -31,9 +31,10 @@ class Question:
     request: Message | InvalidData
     _query: Query
 
-    def answer(self, reply: Message) -> None:
+    def reply(self, message: Message) -> None:
         """Send the reply; a :class:`Problem` is sent as an error reply."""
-        self._query.reply(Answer(encode(reply), is_problem=isinstance(reply, Problem)))
+        is_problem = isinstance(message, Problem)
+        self._query.reply(EncodedReply(encode(message), is_problem=is_problem))
 
 
 def serve(
@@ -67,11 +68,12 @@ def serve(
                 request = prepared(decode(data, verb.request, verb.limit))
             except InvalidData as error:
                 request = error
-            if not inbox.put(Question(verb, request, query), len(data), bulk=verb.is_bulk):
+            if not inbox.put(ReceivedRequest(verb, request, query), len(data), bulk=verb.is_bulk):
                 query.drop()
 
         return receive
 
     return [
-        transport.answer(key_expressions.key(run_id, verb.name), receiver(verb)) for verb in verbs
+        transport.declare_queryable(key_expressions.key(run_id, verb.name), receiver(verb))
+        for verb in verbs
     ]

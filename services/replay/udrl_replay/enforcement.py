@@ -9,19 +9,19 @@ import msgspec
 from udrl.commands import Command
 from udrl_proto.messages import CommandsRequest
 from udrl_replay.arrival import Arrival
-from udrl_replay.dealing import MAX_DEALT
+from udrl_replay.dispatching import MAX_ASSIGNED
 from udrl_replay.quarantine import OFFENCES
 from udrl_replay.run_state import RunState
 
 log = logging.getLogger("udrl")
 
 
-class Trust:
+class Enforcement:
     """Audits and quarantines the actors of a run.
 
     Args:
         run: the run with its auditor and quarantine.
-        remove_actor: removes an actor, whose commands are dealt again.
+        remove_actor: removes an actor, whose commands are assigned again.
     """
 
     def __init__(self, run: RunState, remove_actor: Callable[[str], None]) -> None:
@@ -32,10 +32,10 @@ class Trust:
 
     def assign(self, request: CommandsRequest) -> tuple[list[Command], CommandsRequest]:
         """Return commands to audit, and the request reduced by their number."""
-        actor = self._run.dealer.actors[request.actor]
+        actor = self._run.dispatcher.actors[request.actor]
         again = self._run.auditor.assign(
             actor.join.id, actor.join.numerics_class, request.running,
-            min(request.wanted, MAX_DEALT),
+            min(request.wanted, MAX_ASSIGNED),
         )  # fmt: skip
         actor.reruns += len(again)
         return again, msgspec.structs.replace(request, wanted=request.wanted - len(again))
@@ -46,8 +46,8 @@ class Trust:
         if name not in self._entered:
             self._entered[name] = command.iteration
             run.store.set_fact("entered", self._entered)
-        if name in run.dealer.actors:
-            numerics_class = run.dealer.actors[name].join.numerics_class
+        if name in run.dispatcher.actors:
+            numerics_class = run.dispatcher.actors[name].join.numerics_class
             run.auditor.maybe_audit(command, name, numerics_class, arrival.digest)
 
     def compare(self, arrival: Arrival) -> Literal["duplicate"]:
@@ -61,7 +61,7 @@ class Trust:
             )
         elif verdict is None:
             run.progress.agreed += 1
-        elif verdict.liar is None:
+        elif verdict.wrong_actor is None:
             run.auditor.stop()
             run.progress.audit = 0.0
             run.mark_inexact(
@@ -70,19 +70,20 @@ class Trust:
                 f"audits are stopped"
             )
         else:
-            self._quarantine_liar(verdict.liar, command_id)
+            self._quarantine_wrong_actor(verdict.wrong_actor, command_id)
         return "duplicate"
 
-    def _quarantine_liar(self, liar: str, command_id: int) -> None:
+    def _quarantine_wrong_actor(self, actor: str, command_id: int) -> None:
         why = f"its episode of command {command_id} differs from those of two other actors"
-        self.quarantine(liar, why)
+        self.quarantine(actor, why)
         progress = self._run.progress
-        if liar in self._entered and progress.state not in ("ended", "failed"):
+        if actor in self._entered and progress.state not in ("ended", "failed"):
             progress.state = "failed"
             progress.deceived = True
             progress.problem = (
-                f"actor {liar} lied: {why}. Since iteration {self._entered[liar]} the run has "
-                f"learned from its episodes; start a new run without it, in another --run-dir"
+                f"actor {actor} delivered a false episode: {why}. Since iteration "
+                f"{self._entered[actor]} the run has learned from its episodes; start a "
+                f"new run without it, in another --run-dir"
             )
             log.error("%s", progress.problem)
 
@@ -92,6 +93,6 @@ class Trust:
             self.quarantine(actor, f"it delivered {OFFENCES} invalid episodes, the last: {what}")
 
     def quarantine(self, actor: str, why: str) -> None:
-        """Quarantine an actor; its commands are dealt again."""
+        """Quarantine an actor; its commands are assigned again."""
         self._run.quarantined.add(actor, why)
         self._remove_actor(actor)

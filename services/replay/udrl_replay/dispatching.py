@@ -1,4 +1,4 @@
-"""Dealing commands: evenly among actors, and again if an actor is gone or too slow.
+"""Assigning commands: evenly among actors, and again if an actor is gone or too slow.
 
 This state is only in memory. Every request for commands lists those that the actor holds, so a
 restarted replay service knows them again after one request of each actor.
@@ -22,7 +22,7 @@ from udrl_proto.messages import CommandsRequest, JoinRequest
 #: Multiple of the expected duration after which a command is a straggler.
 STRAGGLER = 3.0
 #: Most commands in one reply, to keep the message small.
-MAX_DEALT = 4096
+MAX_ASSIGNED = 4096
 #: Seconds of silence after which an actor without a liveliness token is forgotten.
 SILENCE_S = 30.0
 #: Most actors that may have joined at once; each costs a little memory.
@@ -36,8 +36,8 @@ class Outstanding:
     """A command without an episode.
 
     Attributes:
-        holders: names of the actors that hold it, and the time it was dealt to each, seconds.
-        was_dealt: whether it was ever dealt to an actor.
+        holders: names of the actors that hold it, and the time it was assigned to each, seconds.
+        was_assigned: whether it was ever assigned to an actor.
         failures: names of the actors that reported a failure, one entry per failure.
         vanished: names of the actors that vanished while they held it, and whether it was run
             alone then.
@@ -45,7 +45,7 @@ class Outstanding:
 
     command: Command
     holders: dict[str, float] = field(default_factory=dict)
-    was_dealt: bool = False
+    was_assigned: bool = False
     failures: list[str] = field(default_factory=list)
     vanished: dict[str, bool] = field(default_factory=dict)
 
@@ -62,7 +62,7 @@ class Actor:
     Attributes:
         last_seen: time of its last message, seconds.
         holds: ids of the commands that it holds.
-        reruns: number of commands dealt to it that had been dealt before, to any actor.
+        reruns: number of commands assigned to it that had been assigned before, to any actor.
         failures: number of commands that failed in its environments.
     """
 
@@ -74,13 +74,13 @@ class Actor:
     failures: int = 0
 
 
-class Dealer:
-    """Deals outstanding commands to the actors that have joined."""
+class Dispatcher:
+    """Assigns outstanding commands to the actors that have joined."""
 
     def __init__(self) -> None:
         self.outstanding: dict[int, Outstanding] = {}
         self.actors: dict[str, Actor] = {}
-        self._undealt: list[int] = []  # a heap; may hold ids that are no longer undealt
+        self._unassigned: list[int] = []  # a heap; may hold ids that are no longer unassigned
         self._of_iteration: Counter[int] = Counter()
         self._of_version: Counter[int] = Counter()
         self._duration_s = 0.0
@@ -91,7 +91,7 @@ class Dealer:
             self.outstanding[command.id] = Outstanding(command)
             self._of_iteration[command.iteration] += 1
             self._of_version[command.weights_version] += 1
-            heapq.heappush(self._undealt, command.id)
+            heapq.heappush(self._unassigned, command.id)
 
     def remove_command(self, command_id: int, now: float | None = None) -> None:
         """Remove an outstanding command; if it is done, ``now`` serves to measure its duration."""
@@ -122,7 +122,7 @@ class Dealer:
         self.actors[request.id] = Actor(request, now, asked)
 
     def remove_actor(self, name: str) -> list[Outstanding]:
-        """Remove an actor and return the commands that it held, which are dealt again."""
+        """Remove an actor and return the commands that it held, which are assigned again."""
         actor = self.actors.pop(name, None)
         held = [] if actor is None else [self.outstanding[i] for i in sorted(actor.holds)]
         for item in held:
@@ -145,10 +145,10 @@ class Dealer:
     def _put_back(self, command_id: int, name: str) -> None:
         item = self.outstanding.get(command_id)
         if item is not None and item.holders.pop(name, None) is not None and not item.holders:
-            heapq.heappush(self._undealt, command_id)
+            heapq.heappush(self._unassigned, command_id)
 
-    def deal(self, request: CommandsRequest, latest_version: int, now: float) -> list[Command]:
-        """Deal commands to an actor that has joined, at most what it wants and its fair share."""
+    def assign(self, request: CommandsRequest, latest_version: int, now: float) -> list[Command]:
+        """Assign commands to an actor that has joined, at most what it wants and its fair share."""
         actor = self.actors[request.actor]
         actor.last_seen, actor.request = now, request
         running = {i for i in request.running if i in self.outstanding}
@@ -156,7 +156,7 @@ class Dealer:
             self._put_back(lost, request.actor)
         for known in running - actor.holds:
             self.outstanding[known].holders.setdefault(request.actor, now)
-            self.outstanding[known].was_dealt = True
+            self.outstanding[known].was_assigned = True
             self.outstanding[known].vanished.pop(request.actor, None)  # it was only cut off
         actor.holds = running
         if any(self.outstanding[i].is_suspect for i in running):
@@ -168,17 +168,17 @@ class Dealer:
 
         in_play = sum(n for v, n in self._of_version.items() if v <= latest_version)
         share = math.ceil(in_play / len(self.actors)) - len(running)
-        dealt: list[Command] = []
-        while self._undealt and len(dealt) < min(request.wanted, share, MAX_DEALT):
-            item = self.outstanding.get(self._undealt[0])
+        assigned: list[Command] = []
+        while self._unassigned and len(assigned) < min(request.wanted, share, MAX_ASSIGNED):
+            item = self.outstanding.get(self._unassigned[0])
             if item is not None and item.command.weights_version > latest_version:
                 break
-            heapq.heappop(self._undealt)
+            heapq.heappop(self._unassigned)
             if item is not None and not item.holders and not item.is_suspect:
-                dealt.append(self._give(item, actor, now))
-        if not dealt and request.wanted and not running and request.spare_cores >= 1:
-            dealt.extend(self._straggler(actor, latest_version, now))
-        return dealt
+                assigned.append(self._give(item, actor, now))
+        if not assigned and request.wanted and not running and request.spare_cores >= 1:
+            assigned.extend(self._straggler(actor, latest_version, now))
+        return assigned
 
     def _suspect(self, latest_version: int) -> Outstanding | None:
         """Return a command that must be run alone; None: there is none."""
@@ -187,8 +187,8 @@ class Dealer:
         return next(ready, None)
 
     def _give(self, item: Outstanding, actor: Actor, now: float) -> Command:
-        actor.reruns += item.was_dealt
-        item.was_dealt = True
+        actor.reruns += item.was_assigned
+        item.was_assigned = True
         item.holders[actor.join.id] = now
         actor.holds.add(item.command.id)
         return item.command

@@ -33,7 +33,7 @@ class Assignment(NamedTuple):
     behavior: ActingFunction | None
 
 
-class Courier(threading.Thread):
+class CommandFetcher(threading.Thread):
     """Fetches one actor's commands from the replay service.
 
     Args:
@@ -52,7 +52,7 @@ class Courier(threading.Thread):
         client: ReplayClient,
         stop: threading.Event,
     ) -> None:
-        super().__init__(name=f"courier of {join.id}", daemon=True)
+        super().__init__(name=f"command fetcher of {join.id}", daemon=True)
         self._transport = transport
         self._hello = hello
         self._join = join
@@ -113,7 +113,7 @@ class Courier(threading.Thread):
     def _alive(self) -> bool:
         return not (self.ended or self._stop_event.is_set() or self.error is not None)
 
-    # The courier's own thread.
+    # The fetcher's own thread.
 
     def run(self) -> None:
         """Fetch until the run ends, ``stop`` is set, or the replay service refuses."""
