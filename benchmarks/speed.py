@@ -41,10 +41,10 @@ from udrl.config import Budget, Config, change
 from udrl.environments import EnvironmentSpec, make_environment
 from udrl.episode import Episode
 from udrl.errors import UdrlError
+from udrl.experience import Experience
 from udrl.frame_stack import FrameStack
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
-from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import compute_deterministically, train, untrained
 from udrl.value import value_loss

@@ -6,7 +6,7 @@
 Algorithm 1                       :mod:`udrl.algorithm1`
 2.3.1 replay buffer               :mod:`udrl.replay`
 2.3.2 behavior function           :mod:`udrl.behavior`
-2.3.3 training                    :mod:`udrl.segments`, :mod:`udrl.training`
+2.3.3 training                    :mod:`udrl.segments`, :mod:`udrl.experience`, :mod:`udrl.training`
 2.3.4 exploratory commands        :mod:`udrl.commands`
 2.3.5 experience, Algorithm 2     :mod:`udrl.acting`
 2.3.6 evaluation                  :mod:`udrl.commands`, :mod:`udrl.evaluation`

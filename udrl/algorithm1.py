@@ -15,12 +15,12 @@ from udrl.digests import Digest, arrays_digest, episode_digest, replay_digest
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import Evaluation, summarise
+from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import resolve_arithmetic
 from udrl.replay import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
-from udrl.segments import Experience
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from udrl.config import Config
 from udrl.environments.masking import below_observation
 from udrl.environments.previous import PREVIOUS
-from udrl.segments import RankedExperience, Segments, draw_segments
+from udrl.experience import RankedExperience
+from udrl.segments import Segments, draw_segments
 from udrl.streams import Stream
 from udrl.targets import ReturnInTime
 from udrl.value import relative
@@ -27,7 +28,7 @@ _PREVIOUS = [(key,) for key in PREVIOUS]
 #: Bytes of observations that are gathered at once, for the next updates.
 _GATHERED_BYTES = 16 << 20
 
-Seen = tuple[Tensor, ...]
+SeenTensors = tuple[Tensor, ...]
 
 
 class Draw(NamedTuple):
@@ -138,7 +139,7 @@ class Batch(NamedTuple):
         valid: with a memory, whether an example counts, bool [batch].
     """
 
-    seen: Seen
+    seen: SeenTensors
     command: Tensor
     action: Tensor
     windows: npt.NDArray[np.int64] | None

@@ -30,7 +30,7 @@ class Entry(NamedTuple):
 class ReplayBuffer:
     """The best and the newest of all admitted entries, in increasing order.
 
-    It ranks episodes; it does not hold their steps (see :class:`udrl.segments.Experience`).
+    It ranks episodes; it does not hold their steps (see :class:`udrl.experience.Experience`).
 
     Args:
         settings: ``replay_size``, number of best entries; ``recent_size``, number of newest

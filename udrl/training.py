@@ -12,15 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from udrl.architecture import state_sizes
-from udrl.batches import Batch, Batches, Draw, Seen, draw_examples
+from udrl.batches import Batch, Batches, Draw, SeenTensors, draw_examples
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
 from udrl.encoders import PRECISIONS
 from udrl.environments.making import EnvironmentSpec
+from udrl.experience import RankedExperience
 from udrl.graph import Weights
 from udrl.guidance import EXAMPLES, choose_guidance
 from udrl.initialisation import draw_weights
-from udrl.segments import RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.value import Critic, ValueFunction, value_loss
@@ -234,7 +234,9 @@ def _learn_value(
     step, scale, lam = _Stepper(state), config.network.return_scale, config.training.return_lambda
     critic, size = state.critic, sum(state_sizes(config.network)[1:])
 
-    def value_at(seen: Seen, _: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def value_at(
+        seen: SeenTensors, _: Tensor, before: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         expected, after = value.expect(seen, before)
         return value.value_of(expected), after
 
@@ -244,7 +246,7 @@ def _learn_value(
     if critic is not None:
 
         def critic_at(
-            seen: Seen, action: Tensor, before: Tensor | None
+            seen: SeenTensors, action: Tensor, before: Tensor | None
         ) -> tuple[Tensor, Tensor | None]:
             expected, after = critic.expect(seen, before)
             return critic.value_of(expected, action), after

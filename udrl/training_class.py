@@ -10,7 +10,7 @@ from udrl.determinism import PROBE_STEPS
 from udrl.digests import arrays_digest
 from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.segments import Experience
+from udrl.experience import Experience
 from udrl.spaces import noise, parts_of
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained

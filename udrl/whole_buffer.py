@@ -8,12 +8,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from udrl.batches import Seen, Windows, tensor_of
+from udrl.batches import SeenTensors, Windows, tensor_of
 from udrl.config import Config
-from udrl.segments import RankedExperience, Segments
+from udrl.experience import RankedExperience
+from udrl.segments import Segments
 
 #: Maps observations, actions (int64) and states before to outputs and states after.
-Network = Callable[[Seen, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
+Network = Callable[[SeenTensors, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
 
 #: Number of episodes whose windows are evaluated at once.
 _AT_ONCE = 128
@@ -23,7 +24,7 @@ class BufferOutputs(NamedTuple):
     """A network's results on the buffer.
 
     Attributes:
-        outputs: outputs at each step, in the order of :meth:`.segments.RankedExperience.steps`,
+        outputs: outputs at each step, in the order of :meth:`.experience.RankedExperience.steps`,
             [steps, ...].
         states: with a memory, its state before each window (:class:`udrl.batches.Windows`), float32
             [windows, size], on the network's device.
@@ -96,7 +97,7 @@ def _window_by_window(
     return outputs, states
 
 
-def _to_device(arrays: tuple[npt.NDArray[Any], ...], device: str) -> Seen:
+def _to_device(arrays: tuple[npt.NDArray[Any], ...], device: str) -> SeenTensors:
     return tuple(tensor_of(one).to(device) for one in arrays)
 
 

@@ -10,10 +10,10 @@ from udrl.config import Budget, Config, build
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import summarise
+from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.replay import Entry, ReplayBuffer
-from udrl.segments import Experience
 from udrl.training import train, untrained
 
 BUDGET = Budget(max_env_steps=400)

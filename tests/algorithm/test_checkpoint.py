@@ -17,8 +17,8 @@ from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import InvalidWeights
+from udrl.experience import Experience, RankedExperience
 from udrl.graph import acting_graph, weight_shapes
-from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Vector
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import decode_weights, encode_weights

@@ -14,10 +14,11 @@ from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.environments import make_environment, specify
 from udrl.episode import Episode
+from udrl.experience import Experience
 from udrl.frame_stack import FrameStack
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call, probe_weights
-from udrl.segments import Experience, Segments
+from udrl.segments import Segments
 from udrl.spaces import Category, Image, ObservationSpace, Vector
 from udrl.streams import Purpose, stream_key
 

@@ -17,9 +17,9 @@ from udrl.config import Config, build
 from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.experience import Experience
 from udrl.numerics import resolve_arithmetic, resolve_as
 from udrl.replay import Entry, ReplayBuffer
-from udrl.segments import Experience
 from udrl.spaces import Image
 from udrl.training import train, untrained
 from udrl.training_class import training_class

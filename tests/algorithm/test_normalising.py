@@ -13,9 +13,9 @@ from udrl.digests import arrays_digest
 from udrl.encoders import Normaliser
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
+from udrl.experience import Experience, RankedExperience
 from udrl.graph import acting_graph, weight_shapes
 from udrl.inference import ActingFunction
-from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Image, Leaf, ObservationSpace, Record, Vector, parts_of
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights

@@ -20,7 +20,7 @@ from udrl.environments.making import specify
 from udrl.environments.previous import PREVIOUS, ObservePrevious, null_action
 from udrl.episode import Episode
 from udrl.errors import ConfigError, UnsupportedEnvironment
-from udrl.segments import Experience
+from udrl.experience import Experience
 from udrl.spaces import Record, Vector
 from udrl.training import train, untrained
 

@@ -15,11 +15,11 @@ from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build, refuse_ineffective
 from udrl.episode import Episode
 from udrl.errors import ConfigError
+from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.rollout import Rollout
-from udrl.segments import Experience
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import train, untrained
 from udrl.weights import encode_weights

@@ -16,7 +16,8 @@ from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
-from udrl.segments import Experience, Segments, draw_segments
+from udrl.experience import Experience
+from udrl.segments import Segments, draw_segments
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 

@@ -11,7 +11,8 @@ from udrl.batches import Batches, draw_examples
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
 from udrl.episode import Episode
-from udrl.segments import Experience, Segments
+from udrl.experience import Experience
+from udrl.segments import Segments
 from udrl.streams import Purpose, Stream, stream_key
 
 

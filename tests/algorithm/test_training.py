@@ -18,9 +18,9 @@ from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.figure2 import A1, A2, A3
 from udrl.episode import Episode
+from udrl.experience import Experience, RankedExperience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
-from udrl.segments import Experience, RankedExperience
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.training import (

@@ -15,7 +15,8 @@ from udrl.digests import arrays_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
-from udrl.segments import Experience, RankedExperience, Segments
+from udrl.experience import Experience, RankedExperience
+from udrl.segments import Segments
 from udrl.spaces import Image, Vector
 from udrl.training import train, untrained
 from udrl.value import relative

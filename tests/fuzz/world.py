@@ -17,9 +17,9 @@ from udrl.checkpoint import encode_optimizer
 from udrl.commands import Command
 from udrl.config import Budget, Config, build
 from udrl.errors import InvalidData
+from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
-from udrl.segments import Experience
 from udrl.training import TrainingState, train, untrained
 from udrl.weights import encode_weights
 from udrl_proto import key_expressions, verbs

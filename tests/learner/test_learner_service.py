@@ -14,8 +14,8 @@ from udrl.config import Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import Refused
+from udrl.experience import Experience
 from udrl.graph import acting_graph
-from udrl.segments import Experience
 from udrl.spaces import Vector
 from udrl.training import train, untrained
 from udrl.weights import encode_weights

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from udrl.checkpoint import decode_state, encode_optimizer
 from udrl.episode import Episode
 from udrl.errors import Interrupted, Refused
-from udrl.segments import Experience
+from udrl.experience import Experience
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
 from udrl.training_class import training_class
 from udrl.version import __version__
