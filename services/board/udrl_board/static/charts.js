@@ -34,7 +34,12 @@ export function merge(...tables) {
       at.set(key, held);
     }
   const xs = [...at.keys()].sort((a, b) => a - b);
-  return { xs, column: (name) => xs.map((x) => at.get(x)[name]) };
+  const names = new Set(tables.flatMap(([, , columns]) => Object.keys(columns)));
+  const column = (name) => {
+    if (!names.has(name)) throw new Error(`no column ${name}`);
+    return xs.map((x) => at.get(x)[name]);
+  };
+  return { xs, column };
 }
 
 export class Chart {

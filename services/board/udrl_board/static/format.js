@@ -4,7 +4,8 @@
 export function number(x, digits) {
   if (x == null) return "–";
   const isSmall = digits === undefined && Math.abs(x) < 1;
-  return x.toLocaleString("en", isSmall ? { maximumSignificantDigits: 2 } : { maximumFractionDigits: digits ?? 1 });
+  const decimals = digits ?? (Number.isInteger(x) ? 0 : 1);
+  return x.toLocaleString("en", isSmall ? { maximumSignificantDigits: 2 } : { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
 }
 
 export const count = (n, one, many = `${one}s`) => `${number(n)} ${n === 1 ? one : many}`;

@@ -64,7 +64,7 @@ export class Learning {
       [evaluations, "env_steps", { mean: (e) => e.mean, high: (e) => e.ci95_high, low: (e) => e.ci95_low }],
       [final ? [final] : [], "env_steps", { final: (e) => e.mean }],
     );
-    const columns = ["mean", "high", "low", "explored", "average", "most", "least", "finishing"].map(column);
+    const columns = ["mean", "high", "low", "explored", "average", "most", "least", "final"].map(column);
     columns.push(xs.map(() => target ?? undefined));
     const last = rows.at(-1), all = final ? [...evaluations, final] : evaluations;
     const best = all.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
