@@ -22,6 +22,11 @@ def test_another_preset_can_be_selected() -> None:
     assert settings.config.buffer.replay_size == preset("CartPole-v1")["replay_size"]
 
 
+def test_preset_in_place_of_the_environment_is_refused() -> None:
+    with pytest.raises(ConfigError, match="use LunarLander-v3 --preset LunarLander-v3-fleet"):
+        gather("LunarLander-v3-fleet", options={})
+
+
 def test_environment_without_preset_gets_the_generic_one() -> None:
     settings = gather("Figure2-v0", options={})
     assert settings.automatic == AUTOMATIC.keys()

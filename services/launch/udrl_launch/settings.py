@@ -154,11 +154,18 @@ def gather(
         assignments: the values of ``--set``.
 
     Raises:
-        ConfigError: a setting is unknown or invalid, or one of ``--set`` has no effect.
+        ConfigError: a setting is unknown or invalid, one of ``--set`` has no effect, or
+            ``environment`` is a preset of another one.
     """
     values: dict[str, Any] = dict(stored or {})
+    own = preset(environment) if environment in preset_names() else {}
+    if (meant := own.get("environment", environment)) != environment:
+        raise ConfigError(
+            f"ENV {environment!r}: this is a preset, expected an environment; use "
+            f"{meant} --preset {environment}"
+        )
     if preset_name is None and stored is None:
-        preset_name = environment if environment in preset_names() else ANY_PRESET
+        preset_name = environment if "environment" in own else ANY_PRESET
     if preset_name not in (None, NO_PRESET):
         values |= preset(preset_name)
     if file is not None:
