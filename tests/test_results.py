@@ -73,9 +73,9 @@ def test_every_result_answers_its_question() -> None:
     results = [part for part in parts if not part.startswith("Summary")]
     assert results
     for result in results:
-        questions, answers = result.count("**ReceivedRequest.**"), result.count("**Answer.**")
+        questions, answers = result.count("**Question.**"), result.count("**Answer.**")
         assert (questions, answers) == (1, 1), result[:80]
-        assert result.index("**ReceivedRequest.**") < result.index("**Answer.**")
+        assert result.index("**Question.**") < result.index("**Answer.**")
 
 
 def test_every_experiment_is_listed_with_its_question() -> None:

@@ -26,7 +26,7 @@ _STEPS, _MAX_STEPS = 1_000, 10_000
 _MAX_LENGTH = 2_000
 #: Candidates for the steps for which random actions are held; number of best episodes to compare.
 _HOLDS, _N_BEST = (2, 8, 32), 3
-#: ``held_rate`` in stochastic and in other environments.
+#: ``hold_rate`` in stochastic and in other environments.
 _STOCHASTIC_RATE, _RATE = 0.15, 0.05
 #: Magnitudes of the network's inputs that it learns well from.
 _MIN_INPUT, _MAX_INPUT = 0.1, 10.0
@@ -78,12 +78,12 @@ def choose(
         EnvironmentFault: the environment failed three times under the same command.
     """
     assert AUTOMATIC.keys() >= set(automatic)
-    hold, n_warm_up = config.commands.warm_up_hold, config.commands.n_warm_up_episodes
+    hold, n_warm_up = config.commands.warm_up_hold_steps, config.commands.n_warm_up_episodes
     if episodes is not None:
         sample = Sample()
         for episode in episodes:
             sample.add(episode)
-    elif {"warm_up_hold", "hold_steps"}.isdisjoint(automatic):
+    elif {"warm_up_hold_steps", "hold_steps"}.isdisjoint(automatic):
         sample = _play(config, generator, hold)
     else:
         hold, sample = _best_hold(config, generator)
@@ -105,10 +105,10 @@ def choose(
         "baseline": baseline,
         "return_lambda": max(_MIN_LAMBDA, round(1 - _REACH / length, 3)),
         "n_warm_up_episodes": n_warm_up,
-        "warm_up_hold": hold,
+        "warm_up_hold_steps": hold,
         # To estimate average outcomes, all actions must be tried repeatedly.
-        "held_actions": 0.5 if stochastic else 0.25,
-        "held_rate": _STOCHASTIC_RATE if stochastic else _RATE,
+        "hold_share": 0.5 if stochastic else 0.25,
+        "hold_rate": _STOCHASTIC_RATE if stochastic else _RATE,
         "hold_steps": hold,
     }
     return change(config, **{name: chosen[name] for name in automatic})

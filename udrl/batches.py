@@ -122,7 +122,7 @@ def draw_examples(stream: Stream, experience: RankedExperience, config: Config) 
         return draw
     # Hidden from all steps of a window or from none: a single visible action could be copied.
     units = draw.segments.rank if draw.windows is None else draw.windows
-    hidden = stream.uniforms(units.size).reshape(units.shape) < training.drop_previous
+    hidden = stream.uniforms(units.size).reshape(units.shape) < training.previous_dropout
     times = draw.segments.rank.shape[1] // units.shape[1]
     return draw._replace(hidden=hidden.repeat(times, axis=1))
 

@@ -159,7 +159,7 @@ class CommandSampler:
 
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""
-        n, hold = self._settings.n_warm_up_episodes, self._settings.warm_up_hold
+        n, hold = self._settings.n_warm_up_episodes, self._settings.warm_up_hold_steps
         commands = self._commands("warm_up", 0, 0, [(0.0, 0)] * n, TRAINING_SEEDS)
         return [
             msgspec.structs.replace(c, random_steps=c.max_steps, random_hold=hold) for c in commands
@@ -170,9 +170,9 @@ class CommandSampler:
 
         A strategy (:mod:`udrl.strategies`) chooses desired return and horizon: in the paper, a
         return uniform in [M, M + S], and the mean length of the ``last_few`` best episodes. Not in
-        the paper: a share of the episodes, ``held_actions``, have held random actions: one, which
+        the paper: a share of the episodes, ``hold_share``, have held random actions: one, which
         begins within the desired horizon and lasts for ``hold_steps`` steps, or with a
-        ``held_rate``, any number.
+        ``hold_rate``, any number.
 
         Raises:
             ConfigError: the strategy cannot be imported, or returned an invalid command.
@@ -185,13 +185,13 @@ class CommandSampler:
         ]
         commands = self._commands("explore", iteration, 0, desired, TRAINING_SEEDS)
         return [
-            self._with_held_actions(c, x[k]) if w[k] < self._settings.held_actions else c
+            self._with_random_actions(c, x[k]) if w[k] < self._settings.hold_share else c
             for k, c in enumerate(commands)
         ]
 
-    def _with_held_actions(self, command: Command, x: float) -> Command:
+    def _with_random_actions(self, command: Command, x: float) -> Command:
         """Add held random actions to a command; ``x`` in [0, 1) chooses the first step."""
-        rate, hold = self._settings.held_rate, self._settings.hold_steps
+        rate, hold = self._settings.hold_rate, self._settings.hold_steps
         if rate:
             return msgspec.structs.replace(command, random_rate=rate, random_hold=hold)
         return msgspec.structs.replace(

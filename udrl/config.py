@@ -148,20 +148,20 @@ AUTOMATIC: Mapping[str, Any] = {
     "baseline": "value",
     "return_lambda": 0.95,
     "n_warm_up_episodes": 1,
-    "warm_up_hold": 1,
-    "held_actions": 1.0,
-    "held_rate": 0.0,
+    "warm_up_hold_steps": 1,
+    "hold_share": 1.0,
+    "hold_rate": 0.0,
     "hold_steps": 1,
 }
 
 #: Conditions under which some settings have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
-    "drop_previous": (lambda config: config.observe_previous, "observe_previous"),
-    "held_rate": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
+    "previous_dropout": (lambda config: config.observe_previous, "observe_previous"),
+    "hold_rate": (lambda config: config.commands.hold_share > 0, "hold_share above 0"),
     "memory_size": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "memory_window": (lambda config: config.network.memory != "none", "memory = 'gru'"),
-    "hold_steps": (lambda config: config.commands.held_actions > 0, "held_actions above 0"),
+    "hold_steps": (lambda config: config.commands.hold_share > 0, "hold_share above 0"),
     "advantage_bound": (lambda config: config.network.baseline != "none", "a baseline"),
     "guidance_kl": (lambda config: config.network.baseline != "none", "a baseline"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),

@@ -112,7 +112,7 @@ class Policy:
                 newest last, as ``gymnasium.wrappers.FrameStackObservation`` stacks them.
             desired_return: the return still to be obtained.
             desired_horizon: the steps left for it; less than 1 counts as 1. Not used if the horizon
-                follows from the return (``desired_horizon = "return"``).
+                follows from the return (``horizon_equals_return = true``).
 
         Returns:
             float64 [n_parameters]; for a batch [n, n_parameters].

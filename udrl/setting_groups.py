@@ -61,9 +61,9 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
         return_scale: factor on the desired return at the network's input.
         horizon_scale: factor on the desired horizon at the network's input. 0: the network ignores
             the horizon.
-        desired_horizon: horizon of exploratory and evaluation commands. ``mean``: the mean length
-            of the best episodes. ``return``: equal to the desired return, as an integer, for
-            environments with a reward of 1 per step (TakeCover, 3.1).
+        horizon_equals_return: whether the desired horizon of exploratory and evaluation commands
+            is their desired return, as an integer, for environments with a reward of 1 per step
+            (TakeCover, 3.1). Otherwise it is the mean length of the best episodes.
         baseline: baseline of desired returns at the network's input. ``none``: none, as in the
             paper. ``value``: a learned value function. ``action_value``: the same, with examples
             labelled with the average outcome of their action (:mod:`udrl.value`).
@@ -84,7 +84,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     initialisation: Literal["orthogonal", "uniform"] = "orthogonal"
     return_scale: Scale = 0.025
     horizon_scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.01
-    desired_horizon: Literal["mean", "return"] = "mean"
+    horizon_equals_return: bool = False
     baseline: Literal["none", "value", "action_value"] = "none"
     advantage_bound: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     guidance_kl: Annotated[float, Meta(ge=0, le=100)] = 0.0
@@ -141,14 +141,15 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
         n_steps_per_iter: exploratory env steps per iteration, roughly. An iteration has as many
             episodes as this takes at the mean length of the newest ones, ``n_episodes_per_iter`` at
             least. None, as in the paper: a fixed number.
-        held_actions: share of exploratory episodes with held random actions; 0 in the paper.
-        held_rate: probability per step of such an episode that a held action begins. 0: one held
+        hold_share: share of exploratory episodes with held random actions; 0 in the paper.
+        hold_rate: probability per step of such an episode that a held action begins. 0: one held
             action per episode.
-        hold_steps: steps for which such an action is held. With a ``held_rate``, at least n times
+        hold_steps: steps for which such an action is held. With a ``hold_rate``, at least n times
             as many with probability 1 / n.
         n_warm_up_episodes: episodes with random actions before the first iteration. With a
             ``dataset``, the number of its episodes.
-        warm_up_hold: steps for which each random action of the warm-up is held; 1 in the paper.
+        warm_up_hold_steps: steps for which each random action of the warm-up is held; 1 in the
+            paper.
         dataset: Minari dataset to use in place of the warm-up. None: none.
         dataset_sha256: digest of the dataset's episodes. Empty: set when the run is created.
     """
@@ -157,11 +158,11 @@ class CommandSettings(SettingsGroup, frozen=True, kw_only=True):
     last_few: PositiveInt = 75
     n_episodes_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 20
     n_steps_per_iter: PositiveInt | None = None
-    held_actions: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    held_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    hold_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    hold_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
     hold_steps: PositiveInt = 30
     n_warm_up_episodes: Annotated[int, Meta(ge=1, le=100_000)] = 50
-    warm_up_hold: PositiveInt = 1
+    warm_up_hold_steps: PositiveInt = 1
     dataset: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
     dataset_sha256: Annotated[str, Meta(min_length=0, max_length=64)] = ""
 
@@ -176,7 +177,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
         n_updates_per_iter: gradient steps per iteration.
         memory_window: with a ``memory``, number of consecutive steps trained together (truncated
             backpropagation through time).
-        drop_previous: with ``observe_previous``, share of examples that hide the previous action
+        previous_dropout: with ``observe_previous``, share of examples that hide the previous action
             and reward, so that the agent does not only learn to repeat its actions.
         return_lambda: with a ``baseline``, lambda of the lambda-returns that label examples. 1: the
             observed return. 0: one reward and the value after it.
@@ -189,7 +190,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
     learning_rate: Annotated[float, Meta(gt=0, le=10)] = 3.5e-4
     n_updates_per_iter: Annotated[int, Meta(ge=1, le=100_000)] = 100
     memory_window: Annotated[int, Meta(ge=1, le=65_536)] = 32
-    drop_previous: Annotated[float, Meta(ge=0, le=1)] = 0.25
+    previous_dropout: Annotated[float, Meta(ge=0, le=1)] = 0.25
     return_lambda: Annotated[float, Meta(ge=0, le=1)] = 0.95
     reset_every: PositiveInt | None = None
 

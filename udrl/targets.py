@@ -15,7 +15,7 @@ class ReturnInTime:
     """The paper's target: a desired return within a desired horizon (section 2.2).
 
     Args:
-        network: ``return_scale``, ``horizon_scale``, ``desired_horizon``.
+        network: ``return_scale``, ``horizon_scale``, ``horizon_equals_return``.
 
     Attributes:
         horizon_follows: whether the horizon always equals the desired return, as an integer
@@ -28,7 +28,7 @@ class ReturnInTime:
     size = 2
 
     def __init__(self, network: NetworkSettings) -> None:
-        self.horizon_follows = network.desired_horizon == "return"
+        self.horizon_follows = network.horizon_equals_return
         self.least = (1.0 if self.horizon_follows else -math.inf, 1.0)
         self._network = network
 

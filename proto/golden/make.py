@@ -90,7 +90,7 @@ CONFIG = build(
         "n_episodes_per_iter": 15,
         "n_updates_per_iter": 100,
         "n_warm_up_episodes": 30,
-        "warm_up_hold": 5,
+        "warm_up_hold_steps": 5,
         "replay_size": 300,
         "max_age": 50,
         "recent_size": 100,

@@ -3,4 +3,4 @@
 ``proto/README.md`` specifies it for implementations in other languages.
 """
 
-PROTOCOL = 4
+PROTOCOL = 5

@@ -147,7 +147,7 @@ def mixed_commands(environment: str) -> tuple[Config, list[Order], list[bytes]]:
     config = settings(
         environment,
         n_warm_up_episodes=3,
-        warm_up_hold=3,
+        warm_up_hold_steps=3,
         n_episodes_per_iter=5,
         eval_episodes=4,
         max_train_steps=60,

@@ -139,13 +139,13 @@ def test_baseline_is_action_value_in_stochastic_environments(slippery: bool, exp
     )
     resolved = choose(
         settings,
-        ("baseline", "horizon_scale", "held_actions", "held_rate"),
+        ("baseline", "horizon_scale", "hold_share", "hold_rate"),
         EpisodeGenerator(settings, 1),
     )
     assert resolved.network.baseline == expected
     assert (resolved.network.horizon_scale == 0) is slippery
-    assert resolved.commands.held_actions == (0.5 if slippery else 0.25)
-    assert resolved.commands.held_rate == (0.15 if slippery else 0.05)
+    assert resolved.commands.hold_share == (0.5 if slippery else 0.25)
+    assert resolved.commands.hold_rate == (0.15 if slippery else 0.05)
     everything = change(settings, segments="all")
     assert resolve_automatic(everything, ["baseline"]).network.baseline == "none"
 
@@ -161,8 +161,8 @@ def test_scale_is_checked_against_typical_values(scale: float, size: float, good
 @pytest.mark.parametrize(("environment", "expected"), [("MountainCar-v0", 32), ("CartPole-v1", 1)])
 def test_actions_are_held_where_one_step_has_little_effect(environment: str, expected: int) -> None:
     settings = config(environment=environment)
-    resolved = choose(settings, ("warm_up_hold",), EpisodeGenerator(settings, 1)).commands
-    assert resolved.warm_up_hold == expected
+    resolved = choose(settings, ("warm_up_hold_steps",), EpisodeGenerator(settings, 1)).commands
+    assert resolved.warm_up_hold_steps == expected
     assert resolved.hold_steps == settings.commands.hold_steps
 
 
@@ -193,7 +193,7 @@ def test_dataset_sets_the_number_of_warm_up_episodes() -> None:
     settings = config(n_warm_up_episodes=3)
     resolved = choose(settings, AUTOMATIC, EpisodeGenerator(settings, 1), episodes((1.0, 9)) * 3)
     assert resolved.commands.n_warm_up_episodes == 3
-    assert resolved.commands.warm_up_hold == 1
+    assert resolved.commands.warm_up_hold_steps == 1
 
 
 @pytest.mark.parametrize(("environment", "shown"), [("Pendulum-v1", True), ("CartPole-v1", False)])

@@ -255,12 +255,12 @@ def test_id_encodes_iteration_and_index() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
     config = {
-        "held_actions": share, "hold_steps": 7, "command_strategy": "ranked", "max_train_steps": 60,
+        "hold_share": share, "hold_steps": 7, "command_strategy": "ranked", "max_train_steps": 60,
         "n_episodes_per_iter": 1000,
     }  # fmt: skip
     buffer = buffer_of([1.0, 2.0], [20, 50])
     explored = sampler(**config).explore(3, buffer)
-    others = sampler(**config | {"held_actions": 0.0}).explore(3, buffer)
+    others = sampler(**config | {"hold_share": 0.0}).explore(3, buffer)
     usual = {"random_from": 0, "random_steps": 0, "random_hold": 1}
     assert [msgspec.structs.replace(c, **usual) for c in explored] == others
     held = [c for c in explored if c.random_steps]
@@ -276,7 +276,7 @@ def test_share_of_exploratory_episodes_holds_an_action(share: float) -> None:
 
 @pytest.mark.parametrize("hold", [1, 3])
 def test_warm_up_is_random_at_every_step(hold: int) -> None:
-    for command in sampler(warm_up_hold=hold, max_train_steps=60).warm_up():
+    for command in sampler(warm_up_hold_steps=hold, max_train_steps=60).warm_up():
         numbers, random = command.decisions(60, ())
         assert random.all()
         assert numbers.tolist() == [numbers[t - t % hold] for t in range(60)]
@@ -328,7 +328,7 @@ def test_multiples_of_the_hold_are_at_least_n_with_probability_1_in_n() -> None:
 
 
 def test_random_rate_replaces_the_single_held_action() -> None:
-    config = {"held_actions": 1.0, "held_rate": 0.25, "hold_steps": 5}
+    config = {"hold_share": 1.0, "hold_rate": 0.25, "hold_steps": 5}
     for command in sampler(**config).explore(1, buffer_of([1.0])):
         assert (command.random_rate, command.random_hold, command.random_steps) == (0.25, 5, 0)
 

@@ -65,11 +65,11 @@ CATEGORY = EnvironmentSpec(
 KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (VECTOR, {}),
     (VECTOR, {"hidden": [32]}),
-    (VECTOR, {"desired_horizon": "return", "activation": "tanh"}),
+    (VECTOR, {"horizon_equals_return": True, "activation": "tanh"}),
     (VECTOR, {"frame_stack": 3}),
     (VECTOR, {"baseline": "value"}),
     (VECTOR, {"baseline": "value", "advantage_bound": 6.0}),
-    (VECTOR, {"baseline": "value", "desired_horizon": "return"}),
+    (VECTOR, {"baseline": "value", "horizon_equals_return": True}),
     (VECTOR, {"baseline": "action_value"}),
     (CATEGORY, {}),
     (CATEGORY, {"frame_stack": 3, "baseline": "value"}),
@@ -106,7 +106,7 @@ def read(config: Config, command: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """The network's inputs for a command (2.3.2, 3.1), one number at a time."""
     rows = []
     for desired_return, desired_horizon in command.tolist():
-        if config.network.desired_horizon == "return":
+        if config.network.horizon_equals_return:
             horizon, least = float(np.floor(desired_return)), 1.0
         else:
             horizon, least = desired_horizon, -np.inf

@@ -252,7 +252,7 @@ def test_precision_is_float32_where_the_features_are_unknown(
 
 
 def test_horizon_is_the_return_as_an_integer() -> None:
-    config = settings(desired_horizon="return", replay_size=10, last_few=4)
+    config = settings(horizon_equals_return=True, replay_size=10, last_few=4)
     buffer = ReplayBuffer(config.buffer)
     buffer.admit([Entry(float(r), i, r) for i, r in enumerate((200, 301, 350, 412))])
     sampler = CommandSampler(config, TAKE_COVER)

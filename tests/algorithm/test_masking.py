@@ -71,7 +71,7 @@ def config(mask: str | None = "info", given: dict[str, Any] | None = None, **val
         "environment": "Doors-v0", "environment_kwargs": given or {}, "action_mask": mask,
         "hidden": [8, 8], "batch_size": 32, "n_updates_per_iter": 10, "n_warm_up_episodes": 20,
         "n_episodes_per_iter": 5, "last_few": 5, "eval_every": 100, "eval_episodes": 5,
-        "held_actions": 0.5, "held_rate": 0.3, "hold_steps": 2,
+        "hold_share": 0.5, "hold_rate": 0.3, "hold_steps": 2,
     }  # fmt: skip
     return build(Config, small | values)
 

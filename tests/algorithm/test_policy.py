@@ -40,7 +40,7 @@ def test_horizon_is_at_least_one_step() -> None:
 
 
 def test_given_horizon_is_ignored_where_horizons_follow_from_returns() -> None:
-    agent = policy(desired_horizon="return")
+    agent = policy(horizon_equals_return=True)
     found = agent.logits(SEEN, 100.5, 3).tolist()
     assert found == agent.logits(SEEN, 100.5, 77).tolist()
     assert found != policy().logits(SEEN, 100.5, 3).tolist()

@@ -89,7 +89,7 @@ def test_episodes_store_previous_action_and_reward() -> None:
 
 
 def test_training_masks_them_in_a_share_of_the_examples() -> None:
-    always, never, half = (config(drop_previous=share) for share in (1.0, 0.0, 0.5))
+    always, never, half = (config(previous_dropout=share) for share in (1.0, 0.0, 0.5))
     spec = specify(make_environment(always), always)
     episodes = warm_up(always)
     hidden = warm_up(always)
@@ -217,5 +217,5 @@ def test_inapplicable_wrapper_is_rejected(wrapper: str, message: str) -> None:
 
 
 def test_drop_previous_without_observe_previous_is_rejected() -> None:
-    with pytest.raises(ConfigError, match=r"drop_previous = 0.25 .* needs observe_p"):
-        refuse_ineffective(config(observe_previous=False), ["drop_previous"])
+    with pytest.raises(ConfigError, match=r"previous_dropout = 0.25 .* needs observe_p"):
+        refuse_ineffective(config(observe_previous=False), ["previous_dropout"])

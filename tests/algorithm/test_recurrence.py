@@ -129,7 +129,7 @@ def test_windows_cover_every_step_once() -> None:
 
 
 def test_batch_consists_of_windows_of_consecutive_steps() -> None:
-    config = settings(observe_previous=True, drop_previous=0.5)
+    config = settings(observe_previous=True, previous_dropout=0.5)
     episodes = played(config)
     generator = EpisodeGenerator(config, 1)
     experience = Experience(config, generator.spec)

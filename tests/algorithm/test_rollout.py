@@ -54,7 +54,7 @@ def agent(environment: str = "CartPole-v1", **values: Any) -> tuple[Policy, Envi
         ({"random_from": 5, "random_steps": 4, "random_hold": 4}, {}),
         ({"random_rate": 0.3, "random_hold": 2}, {}),
         ({"random_steps": 1000, "random_hold": 7, "temperature": 0.0}, {}),
-        ({"desired_return": 40.7}, {"desired_horizon": "return"}),
+        ({"desired_return": 40.7}, {"horizon_equals_return": True}),
         ({"desired_return": 500.0}, {"max_return": 20.0}),
     ],
 )
@@ -102,7 +102,7 @@ def test_command_is_bounded_as_in_evaluations() -> None:
     policy, env = agent()
     rollout = Rollout(policy, env, command(desired_return=300.0, cap=100.0))
     assert rollout.desired_return == 100.0
-    policy, env = agent(desired_horizon="return")
+    policy, env = agent(horizon_equals_return=True)
     rollout = Rollout(policy, env, command(desired_return=33.9))
     assert rollout.desired_horizon == math.floor(33.9)
 

@@ -35,10 +35,10 @@ def test_horizon_is_at_least_one_step(horizon: int, expected: int) -> None:
 def test_horizon_that_follows_is_the_return_as_an_integer(
     desired_return: float, expected: int
 ) -> None:
-    assert target(desired_horizon="return").initial(desired_return, 99) == (expected, expected)
+    assert target(horizon_equals_return=True).initial(desired_return, 99) == (expected, expected)
 
 
 def test_network_inputs_are_bounded_and_scaled() -> None:
     usual = target(return_scale=0.5, horizon_scale=0.25)
     assert (usual.least, usual.scales) == ((-np.inf, 1.0), (0.5, 0.25))
-    assert target(desired_horizon="return").least == (1.0, 1.0)
+    assert target(horizon_equals_return=True).least == (1.0, 1.0)

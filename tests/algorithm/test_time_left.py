@@ -66,7 +66,7 @@ def test_run_is_independent_of_the_number_of_environments() -> None:
 
 def test_mask_hides_previous_steps_but_not_time_left() -> None:
     settings = config(
-        environment="Taxi-v4", action_mask="info", observe_previous=True, drop_previous=1.0
+        environment="Taxi-v4", action_mask="info", observe_previous=True, previous_dropout=1.0
     )
     episodes = warm_up(settings)
     experience = Experience(settings, EpisodeGenerator(settings, 1).spec)

@@ -79,7 +79,7 @@ def test_command_prints_lines_or_json() -> None:
     result = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(result.stdout)["max_episode_steps"] == 500
     result = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
-    chosen = "baseline = value, held_actions = 0.25, held_rate = 0.05, hold_steps = 32"
+    chosen = "baseline = value, hold_rate = 0.05, hold_share = 0.25, hold_steps = 32"
     assert f"settings      {chosen}" in result.stdout
     assert (
         "All random episodes return" not in result.stdout

@@ -295,7 +295,7 @@ def test_environment_is_shown(
     returns = page.get_by_label("Desired return", exact=True)
     expect(returns).not_to_be_empty(timeout=SOON)
     horizon = page.get_by_label("Desired horizon, steps", exact=True)
-    follows = settings.get("desired_horizon") == "return"
+    follows = settings.get("horizon_equals_return", False)
     returns.fill("60.5")
     if follows:  # TakeCover's horizon is its return
         expect(horizon).to_be_disabled()

@@ -140,7 +140,7 @@ def test_commands_are_within_the_range_of_the_buffer(ended_run: Path) -> None:
 
 
 def with_horizons_from_returns(agent: Agent) -> Agent:
-    config = change(agent.config, desired_horizon="return")
+    config = change(agent.config, horizon_equals_return=True)
     return agent._replace(config=config)
 
 

@@ -35,11 +35,13 @@ def test_environment_without_preset_gets_the_generic_one() -> None:
 
 
 def test_setting_is_automatic_or_has_a_value() -> None:
-    settings = gather("Figure2-v0", options={"return_scale": 0.5}, assignments=["warm_up_hold=4"])
-    assert settings.automatic == AUTOMATIC.keys() - {"return_scale", "warm_up_hold"}
+    settings = gather(
+        "Figure2-v0", options={"return_scale": 0.5}, assignments=["warm_up_hold_steps=4"]
+    )
+    assert settings.automatic == AUTOMATIC.keys() - {"return_scale", "warm_up_hold_steps"}
     assert settings.config.network.return_scale == 0.5
-    assert gather("CartPole-v1", options={}, assignments=["warm_up_hold=auto"]).automatic == {
-        "warm_up_hold"
+    assert gather("CartPole-v1", options={}, assignments=["warm_up_hold_steps=auto"]).automatic == {
+        "warm_up_hold_steps"
     }
 
 
@@ -96,7 +98,7 @@ def test_unknown_setting_is_rejected(name: str) -> None:
 @pytest.mark.parametrize(
     ("idle", "needed"),
     [
-        ("hold_steps=9", "held_actions=0.5"),
+        ("hold_steps=9", "hold_share=0.5"),
         ("return_lambda=0.5", "baseline=value"),
         ("dataset_sha256=00", "dataset=some/thing-v0"),
         ("training_threads=2", "device=cpu"),

@@ -381,7 +381,7 @@ def act(session: zenoh.Session) -> int:
     (reply,) = session.get("udrl/*/*/hello", payload=b"\x80", timeout=3.0)
     assert reply.ok is not None
     run = str(reply.ok.key_expr).removesuffix("/hello")
-    assert run.startswith("udrl/4/")
+    assert run.startswith("udrl/5/")
     hello = msgpack.unpackb(reply.ok.payload.to_bytes())
     join = {
         "role": "actor",

@@ -47,7 +47,7 @@ CONFIG = build(
         "n_episodes_per_iter": 3,
         "n_updates_per_iter": 2,
         "n_warm_up_episodes": 4,
-        "warm_up_hold": 3,
+        "warm_up_hold_steps": 3,
         "replay_size": 8,
         "eval_every": 100,
         "eval_episodes": 2,
@@ -120,15 +120,15 @@ def assert_same_class(config: Config) -> None:
 
 
 @pytest.mark.parametrize("frame_stack", [1, 3])
-@pytest.mark.parametrize("desired_horizon", ["mean", "return"])
+@pytest.mark.parametrize("equal", [False, True])
 @pytest.mark.parametrize("baseline", ["none", "value"])
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 def test_probe_has_equal_digests(
-    activation: Any, baseline: Any, desired_horizon: Any, frame_stack: int
+    activation: Any, baseline: Any, equal: bool, frame_stack: int
 ) -> None:
     assert_same_class(
         change(
-            CONFIG, activation=activation, baseline=baseline, desired_horizon=desired_horizon,
+            CONFIG, activation=activation, baseline=baseline, horizon_equals_return=equal,
             frame_stack=frame_stack,
         )
     )  # fmt: skip

@@ -203,7 +203,7 @@ def evaluation_commands(
             f"desired horizon {desired_horizon}: this run's agents do not use it (horizon_scale = "
             f"0); give only a desired return"
         )
-    if agent.config.network.desired_horizon == "return" and desired_horizon is not None:
+    if agent.config.network.horizon_equals_return and desired_horizon is not None:
         raise ConfigError(
             f"desired horizon {desired_horizon}: in this run it always equals the desired return, "
             f"as an integer; give only a desired return"

@@ -42,7 +42,8 @@ def cause(network: NetworkSettings, warm_up: IterationStatus) -> str:
     if spread == 0 and math.isclose(warm_up.explored_return, warm_up.return_max):
         return (
             "too little data: all warm-up episodes have the same return, so there are no better "
-            "ones to learn from; raise n_warm_up_episodes or warm_up_hold, or start with a dataset"
+            "ones to learn from; raise n_warm_up_episodes or warm_up_hold_steps, or start with a "
+            "dataset"
         )
     for name, scale, what, usual in (
         ("return_scale", network.return_scale, "returns", size),

@@ -13,7 +13,7 @@ from msgspec import inspect
 
 from udrl_proto.reports import IterationStatus
 
-SCHEMA = 6
+SCHEMA = 7
 
 
 def _declared(kind: type[msgspec.Struct]) -> str:

@@ -32,7 +32,7 @@ export class CommandForm {
     if (!contents.returns.length) return;
     const isFirst = !this.contents;
     this.contents = contents;
-    this.follows = hello.config.desired_horizon === "return";
+    this.follows = hello.config.horizon_equals_return;
     const [xs, ys] = ranges(contents);
     this.step = nice((xs[1] - xs[0]) / 200);
     Object.assign($("desired-return-slider"), { step: this.step, min: rounded(Math.floor(xs[0] / this.step) * this.step, this.step), max: rounded(Math.ceil(xs[1] / this.step) * this.step, this.step) });
