@@ -12,8 +12,8 @@ from udrl_proto.transport import EncodedReply, Presence, Query, Transport
 from udrl_proto.zenoh_transport import ZenohTransport
 from whole_run import wait_for
 
-KEY = "udrl/4/run/status"
-ALIVE = "udrl/4/run/alive/actor"
+KEY = "udrl/5/run/status"
+ALIVE = "udrl/5/run/alive/actor"
 WAIT_S = 10.0
 
 Ends = tuple[Transport, Transport]
@@ -92,7 +92,7 @@ def test_presence_changes_are_reported(ends: Ends) -> None:
     early = client.declare_presence(f"{ALIVE}/early")
     wait_for(lambda: service.present(f"{ALIVE}/*", WAIT_S), "the first token")
     seen: queue.Queue[Presence] = queue.Queue()
-    watching = service.watch("udrl/4/run/alive/*/*", seen.put)
+    watching = service.watch("udrl/5/run/alive/*/*", seen.put)
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=True)
     late = client.declare_presence(f"{ALIVE}/late")
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/late", here=True)
