@@ -98,16 +98,18 @@ class _Reader:
         self._name = name
         self._spec = spec
         self._adds_time = self._adds_previous = False
-        seen, done = dataset.observation_space, dataset.action_space
+        observation_space, action_space = dataset.observation_space, dataset.action_space
         try:
-            actions = action_conversion(done, config.actions)
-            observations = observation_conversion(seen)
+            actions = action_conversion(action_space, config.actions)
+            observations = observation_conversion(observation_space)
             if observations.plain != spec.observation_space:
                 self._adds_time = config.observe_time
                 self._adds_previous = config.observe_previous
-                shown = time_left.observation_space(seen) if self._adds_time else seen
+                shown = observation_space
+                if self._adds_time:
+                    shown = time_left.space_with_time_left(shown)
                 if self._adds_previous:
-                    shown = previous.observation_space(shown, done)
+                    shown = previous.space_with_previous(shown, action_space)
                 observations = observation_conversion(shown)
         except UnsupportedEnvironment as error:
             raise ConfigError(
@@ -115,9 +117,9 @@ class _Reader:
             ) from error
         if (observations.plain, actions.plain) != (spec.observation_space, spec.action_space):
             raise ConfigError(
-                f"dataset {name!r} has observations {seen} and actions {done}, the run's "
-                f"environment has {spec.observation_space} and {spec.action_space}; name a "
-                f"dataset of the run's environment"
+                f"dataset {name!r} has observations {observation_space} and actions "
+                f"{action_space}, the run's environment has {spec.observation_space} and "
+                f"{spec.action_space}; name a dataset of the run's environment"
             )
         self._observations, self._actions = observations, actions
 
@@ -127,8 +129,8 @@ class _Reader:
         if self._adds_time:
             shown = time_left.add_time_left(shown, n, self._spec.max_episode_steps)
         if self._adds_previous:
-            done = self._actions.declared
-            shown = previous.add_previous(done, shown, data.actions, data.rewards)
+            action_space = self._actions.declared
+            shown = previous.add_previous(action_space, shown, data.actions, data.rewards)
         return shown
 
     def episode(self, number: int, data: Any) -> Episode:

@@ -61,10 +61,10 @@ class Experience:
         # 2018).
         self._ends_at = spec.max_episode_steps if config.observe_time else _NEVER
         n_episodes = config.buffer.replay_size + config.buffer.recent_size
-        seen, acted = spec.observation_space, spec.action_space
-        self._leaves = leaves_of(seen)
-        self._stack = FrameStack(seen, config.network.frame_stack)
-        self._observations = np.empty((0, *seen.shape), seen.dtype)
+        observed, acted = spec.observation_space, spec.action_space
+        self._leaves = leaves_of(observed)
+        self._stack = FrameStack(observed, config.network.frame_stack)
+        self._observations = np.empty((0, *observed.shape), observed.dtype)
         self._actions = np.empty((0, *acted.shape), acted.dtype)
         self._earned = np.empty(0)  # P[t]: rewards earned before step t
         self._page_table = np.zeros((n_episodes, 1), np.int64)

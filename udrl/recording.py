@@ -34,9 +34,9 @@ class Recording:
             self._longest, _FIRST_CAPACITY, max(64, _FIRST_BYTES // (n * spec.step_bytes))
         )
         shape = (self._capacity, n)
-        seen, acted = spec.observation_space, spec.action_space
+        observed, acted = spec.observation_space, spec.action_space
         self._rings = {
-            "observations": np.zeros((*shape, *seen.shape), seen.dtype),
+            "observations": np.zeros((*shape, *observed.shape), observed.dtype),
             "actions": np.zeros((*shape, *acted.shape), acted.dtype),
             "rewards": np.zeros(shape, np.float32),
             "numbers": np.zeros((*shape, *acted.shape)),

@@ -27,7 +27,7 @@ class ObservePrevious(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        self.observation_space = observation_space(env.observation_space, env.action_space)
+        self.observation_space = space_with_previous(env.observation_space, env.action_space)
         self._null = null_action(env.action_space)
 
     def reset(
@@ -44,17 +44,19 @@ class ObservePrevious(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         return shown, reward, terminated, truncated, info
 
 
-def observation_space(seen: spaces.Space[Any], done: spaces.Space[Any]) -> spaces.Dict:
+def space_with_previous(
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> spaces.Dict:
     """Return the space of observations with the previous action and reward.
 
     Args:
-        seen: space of the environment's observations.
-        done: space of its actions.
+        observation_space: space of the environment's observations.
+        action_space: space of its actions.
     """
     return spaces.Dict(
         [
-            (OBSERVATION, seen),
-            (ACTION, done),
+            (OBSERVATION, observation_space),
+            (ACTION, action_space),
             (REWARD, spaces.Box(-np.inf, np.inf, (), np.float32)),
             (HAS_PREVIOUS, spaces.MultiBinary(1)),
         ]

@@ -26,7 +26,7 @@ class ObserveTime(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         gym.Wrapper.__init__(self, env)
         self._max_steps = max_steps
         self._step = 0
-        self.observation_space = observation_space(env.observation_space)
+        self.observation_space = space_with_time_left(env.observation_space)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -47,9 +47,11 @@ class ObserveTime(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         return {OBSERVATION: observation, TIME_LEFT: np.array([left], np.float32)}
 
 
-def observation_space(seen: spaces.Space[Any]) -> spaces.Dict:
+def space_with_time_left(observation_space: spaces.Space[Any]) -> spaces.Dict:
     """Return the space of observations with the time left."""
-    return spaces.Dict([(OBSERVATION, seen), (TIME_LEFT, spaces.Box(0, 1, (1,), np.float32))])
+    return spaces.Dict(
+        [(OBSERVATION, observation_space), (TIME_LEFT, spaces.Box(0, 1, (1,), np.float32))]
+    )
 
 
 def add_time_left(observations: Any, n: int, max_steps: int) -> dict[str, Any]:
