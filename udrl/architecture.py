@@ -31,7 +31,7 @@ FORBIDDEN = -1e9
 
 #: Part of the names of tensors that are set once and not trained.
 NORMALISER = "normaliser"
-#: Name of the factor of guidance (:mod:`udrl.guidance`).
+#: Name of the weight of guidance (:mod:`udrl.guidance`).
 GUIDANCE = "guidance"
 
 

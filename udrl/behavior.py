@@ -35,7 +35,8 @@ class BehaviorFunction(nn.Module):
 
     Attributes:
         value: value function that desired returns are relative to; None without a ``baseline``.
-        guidance: g, float32 [1] (:mod:`udrl.guidance`); None without guidance.
+        guidance: g and the return of c', float32 [1, 2] (:mod:`udrl.guidance`); None without
+            guidance.
     """
 
     def __init__(self, spec: EnvironmentSpec, config: Config) -> None:
@@ -51,7 +52,7 @@ class BehaviorFunction(nn.Module):
             self._assemble(spec, network, precision)
         self.bound = network.advantage_bound
         self.guidance: Tensor | None
-        self.register_buffer(GUIDANCE, torch.zeros(1) if network.is_guided else None)
+        self.register_buffer(GUIDANCE, torch.zeros(1, 2) if network.is_guided else None)
         self.value = None if network.baseline == "none" else ValueFunction(spec, network, precision)
 
     def _assemble(
@@ -92,8 +93,9 @@ class BehaviorFunction(nn.Module):
         parameters = self.forward_relative(seen, command, state)
         if self.guidance is None:
             return parameters
-        lowest = self.forward_relative(seen, with_return(command, -self.bound), state)
-        return parameters + self.guidance * (parameters - lowest)
+        factor, lowest = self.guidance[0].unbind()
+        away = self.forward_relative(seen, with_return(command, lowest), state)
+        return parameters + factor * (parameters - away)
 
     def forward_relative(
         self, seen: tuple[Tensor, ...], command: Tensor, state: Tensor | None = None

@@ -163,7 +163,6 @@ _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "memory_window": (lambda config: config.network.memory != "none", "memory = 'gru'"),
     "hold_steps": (lambda config: config.commands.hold_share > 0, "hold_share above 0"),
     "advantage_bound": (lambda config: config.network.baseline != "none", "a baseline"),
-    "guidance_kl": (lambda config: config.network.baseline != "none", "a baseline"),
     "return_lambda": (lambda config: config.network.baseline != "none", "a baseline"),
     "training_threads": (lambda config: config.arithmetic.device != "cuda", "device = 'cpu'"),
 }

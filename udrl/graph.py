@@ -163,15 +163,16 @@ class _Builder(Nodes):
         return self.layer("action", features, widths[-1], self._n_parameters)
 
     def _lowest(self, command: str) -> str:
-        """Append the command with the lowest relative return."""
+        """Append the command with the lowest return."""
+        lowest = self.column(self.weight(GUIDANCE, 1, 2), 1)
         kept = self.append("Mul", command, self.constant(np.array([[0.0, 1.0]], np.float32)))
-        lowest = np.array([[-self._network.advantage_bound, 0.0]], np.float32)
-        return self.append("Add", kept, self.constant(lowest))
+        placed = self.append("Mul", lowest, self.constant(np.array([[1.0, 0.0]], np.float32)))
+        return self.append("Add", kept, placed)
 
     def _guided(self, logits: str, lowest: str) -> str:
         """Append the guided logits; see :mod:`udrl.guidance`."""
         above = self.append("Sub", logits, lowest)
-        step = self.append("Mul", above, self.weight(GUIDANCE, 1))
+        step = self.append("Mul", above, self.column(self.weight(GUIDANCE, 1, 2), 0))
         return self.append("Add", logits, step)
 
     def _custom(self, command: str) -> str:

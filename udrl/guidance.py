@@ -7,9 +7,10 @@ weakens in training until commands have no effect, and then returns decline. Wit
 
     p(s, c) + g (p(s, c) - p(s, c')),
 
-where c' is c with the lowest relative return (:mod:`udrl.value`). The learner chooses g for each
-weights version, so that the mean KL divergence of the policy for the highest relative return from
-that for the lowest is at least ``guidance_kl``. Training does not use guidance.
+where c' is c with the lowest return: that of the examples, or with a ``baseline`` the lowest
+relative return (:mod:`udrl.value`). The learner chooses g for each weights version, so that the
+mean KL divergence of the policy for the highest return from that for the lowest is at least
+``guidance_kl``. Training does not use guidance.
 
 This is classifier-free guidance (Ho and Salimans, 2022), which Frans et al. (2025) use as a policy
 improvement operator.
@@ -36,8 +37,8 @@ def choose_guidance(
     behavior: BehaviorFunction,
     batches: Iterable[tuple[Batch, Tensor | None]],
     minimum: float,
-) -> float:
-    """Return g for a trained behavior function.
+) -> tuple[float, float]:
+    """Return g and the return of c', scaled, for a trained behavior function.
 
     The divergence is about proportional to (1 + g)^2, which gives g from the divergence without
     guidance.
@@ -47,15 +48,20 @@ def choose_guidance(
         batches: batches of examples, and with a memory, its states before their windows.
         minimum: minimum of the mean divergence, in nats.
     """
+    drawn = list(batches)
+    low, high = -behavior.bound, behavior.bound
+    if behavior.value is None:
+        returns = torch.cat([batch.counted(batch.command)[:, 0] for batch, _ in drawn])
+        low, high = float(returns.min()), float(returns.max())
     total, n = torch.zeros((), dtype=torch.float64), 0
     with torch.no_grad():
-        for batch, states in batches:
+        for batch, states in drawn:
             highest, lowest = (
                 behavior.forward_relative(batch.seen, with_return(batch.command, level), states)
-                for level in (behavior.bound, -behavior.bound)
+                for level in (high, low)
             )
             divergence = batch.counted(kl_divergence(behavior.spec.action_space, highest, lowest))
             total += divergence.double().sum().cpu()
             n += len(divergence)
     unguided = float(total) / n
-    return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MOST)
+    return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MOST), low

@@ -69,8 +69,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             labelled with the average outcome of their action (:mod:`udrl.value`).
         advantage_bound: with a ``baseline``, largest absolute value of relative desired returns, in
             mean deviations of the return.
-        guidance_kl: with a ``baseline``, minimum mean KL divergence, in nats, of the policy for the
-            highest relative return from that for the lowest (:mod:`udrl.guidance`). 0: no guidance.
+        guidance_kl: minimum mean KL divergence, in nats, of the policy for the highest return from
+            that for the lowest (:mod:`udrl.guidance`). 0: no guidance.
     """
 
     behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None
@@ -92,7 +92,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
     @property
     def is_guided(self) -> bool:
         """Whether acting uses guidance."""
-        return self.guidance_kl > 0 and self.baseline != "none"
+        return self.guidance_kl > 0
 
 
 class ActionSettings(SettingsGroup, frozen=True, kw_only=True):

@@ -215,7 +215,7 @@ def _update(
         minimum = config.network.guidance_kl
         most = math.ceil(EXAMPLES / config.training.batch_size)
         examples = ((b, _initial_states(b, states)) for b in batches.gather(most=most))
-        behavior.guidance.fill_(choose_guidance(behavior, examples, minimum))
+        behavior.guidance.copy_(torch.tensor([choose_guidance(behavior, examples, minimum)]))
     return float(losses)
 
 

@@ -135,9 +135,10 @@ def value_loss(expected: Tensor, label: Tensor) -> Tensor:
     return error.square().mean() + (error.detach().abs() - expected[:, 1]).square().mean()
 
 
-def with_return(command: Tensor, desired_return: float) -> Tensor:
-    """Return commands, [..., 2], with another desired return."""
-    return torch.stack([torch.full_like(command[..., 0], desired_return), command[..., 1]], dim=-1)
+def with_return(command: Tensor, desired_return: float | Tensor) -> Tensor:
+    """Return commands, [..., 2], with another desired return, the same for all."""
+    other = torch.zeros_like(command[..., 0]) + desired_return
+    return torch.stack([other, command[..., 1]], dim=-1)
 
 
 def relative(command: Tensor, expected: Tensor, bound: float) -> Tensor:

@@ -87,6 +87,7 @@ KINDS: list[tuple[EnvironmentSpec, dict[str, Any]]] = [
     (RECORD, {"baseline": "action_value", "normalise_observations": True}),
     (VECTOR, {"baseline": "value", "normalise_observations": True, "frame_stack": 2}),
     (VECTOR, {"baseline": "value", "guidance_kl": 0.03}),
+    (VECTOR, {"guidance_kl": 0.03}),
     (RECORD, {"baseline": "action_value", "guidance_kl": 0.03, "memory": "gru"}),
     (MASKED, {"baseline": "value", "guidance_kl": 0.03, "frame_stack": 2}),
 ]
@@ -142,7 +143,7 @@ def test_graph_equals_the_trained_network(
             for parameter in behavior.parameters():
                 parameter.add_(0.3 * torch.randn_like(parameter))
             if behavior.guidance is not None:
-                behavior.guidance.fill_(1.5)
+                behavior.guidance.copy_(torch.tensor([[1.5, -1.0]]))
     function = acting(config, behavior, spec)
     seen, command, state = probe_rows(function, 64)
     if spec.action_mask is not None:

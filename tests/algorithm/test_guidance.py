@@ -55,25 +55,26 @@ def mean_divergence(network: BehaviorFunction, batch: Batch, guidance: float) ->
 def test_guided_policy_diverges_by_the_minimum(minimum: float) -> None:
     network, batch = behavior(), examples(5000)
     assert mean_divergence(network, batch, 0.0) < minimum / 2
-    guidance = choose_guidance(network, [(batch, None)], minimum)
+    guidance, lowest = choose_guidance(network, [(batch, None)], minimum)
+    assert lowest == -2.0
     assert mean_divergence(network, batch, guidance) == pytest.approx(minimum, rel=0.2)
 
 
 def test_strong_response_is_not_guided() -> None:
     network, batch = behavior(), examples(5000)
     assert mean_divergence(network, batch, 0.0) > 0.001
-    assert choose_guidance(network, [(batch, None)], 0.001) == 0.0
+    assert choose_guidance(network, [(batch, None)], 0.001)[0] == 0.0
 
 
 def test_guidance_is_bounded() -> None:
-    assert choose_guidance(behavior(response=0.0), [(examples(10), None)], 0.05) == 30.0
+    assert choose_guidance(behavior(response=0.0), [(examples(10), None)], 0.05)[0] == 30.0
 
 
 def test_padding_does_not_count() -> None:
     batch = examples(100)
     padded = batch._replace(valid=torch.arange(100) < 50)
     first = batch._replace(seen=(batch.seen[0][:50],), command=batch.command[:50])
-    guidance = [choose_guidance(behavior(), [(b, None)], 0.05) for b in (padded, first, batch)]
+    guidance = [choose_guidance(behavior(), [(b, None)], 0.05)[0] for b in (padded, first, batch)]
     assert guidance[0] == pytest.approx(guidance[1], rel=1e-5)
     assert guidance[0] != pytest.approx(guidance[2], rel=1e-5)
 
@@ -83,7 +84,7 @@ def test_acting_is_guided_and_training_is_not() -> None:
     assert network.guidance is not None
     assert network.value is not None
     unguided = network(batch.seen, batch.command)
-    network.guidance.fill_(2.0)
+    network.guidance.copy_(torch.tensor([[2.0, -2.0]]))
     command = relative(batch.command, network.value(batch.seen), network.bound)
     trained = network.forward_relative(batch.seen, command)
     lowest = network.forward_relative(batch.seen, with_return(command, -2.0))
@@ -91,9 +92,23 @@ def test_acting_is_guided_and_training_is_not() -> None:
     assert torch.allclose(network(batch.seen, batch.command), 3 * trained - 2 * lowest)
 
 
-@pytest.mark.parametrize("values", [{"guidance_kl": 0.0}, {"baseline": "none"}])
-def test_without_baseline_or_divergence_there_is_no_guidance(values: dict[str, Any]) -> None:
-    network = behavior(**values)
+@pytest.mark.parametrize("valid", [None, torch.arange(10) < 5])
+def test_without_a_baseline_the_returns_are_those_of_the_examples(valid: Any) -> None:
+    network, batch = behavior(baseline="none"), examples(10)._replace(valid=valid)
+    returns = batch.command[:, 0] if valid is None else batch.command[:5, 0]
+    guidance, lowest = choose_guidance(network, [(batch, None)], 0.05)
+    assert lowest == returns.min()
+    assert network.guidance is not None
+    network.guidance.copy_(torch.tensor([[guidance, lowest]]))
+    trained = network.forward_relative(batch.seen, batch.command)
+    away = network.forward_relative(batch.seen, with_return(batch.command, lowest))
+    expected = trained + guidance * (trained - away)
+    assert guidance > 0
+    assert torch.allclose(network(batch.seen, batch.command), expected)
+
+
+def test_without_divergence_there_is_no_guidance() -> None:
+    network = behavior(guidance_kl=0.0)
     assert network.guidance is None
     assert "guidance" not in network.state_dict()
 
@@ -107,8 +122,9 @@ def test_training_chooses_guidance(values: dict[str, Any]) -> None:
     }  # fmt: skip
     config = build(Config, small | values)
     run = algorithm1(config, Budget(max_env_steps=300))
-    (guidance,) = run.state.weights["guidance"]
+    ((guidance, lowest),) = run.state.weights["guidance"]
     assert 0 < guidance <= 30
+    assert lowest < 0
 
 
 @given(

@@ -33,14 +33,16 @@ def settings(name: str = "Concatenating", **values: Any) -> Config:
     )
 
 
-@pytest.mark.parametrize(("baseline", "guidance_kl"), [("none", 0), ("value", 0), ("value", 0.03)])
+@pytest.mark.parametrize(
+    ("baseline", "guidance_kl"), [("none", 0), ("none", 0.03), ("value", 0), ("value", 0.03)]
+)
 @pytest.mark.parametrize("frame_stack", [1, 2])
 def test_graph_equals_the_module(baseline: str, guidance_kl: float, frame_stack: int) -> None:
     config = settings(baseline=baseline, guidance_kl=guidance_kl, frame_stack=frame_stack)
     spec = specify(make_environment(config), config)
     behavior, graph = initialise(config, spec), acting_graph(config.network, spec)
     if behavior.guidance is not None:
-        behavior.guidance.fill_(1.5)
+        behavior.guidance.copy_(torch.tensor([[1.5, -1.0]]))
     weights = weights_of(behavior)
     assert weight_shapes(graph) == {n: t.shape for n, t in weights.items()}
     function, rng = ActingFunction(graph, weights), np.random.default_rng(1)
