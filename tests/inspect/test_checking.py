@@ -50,6 +50,21 @@ def test_unusual_environment_gets_advice() -> None:
         assert part in advice
 
 
+@pytest.mark.parametrize(("brightest", "is_advised"), [(10, True), (200, False)])
+def test_images_of_indices_get_advice(brightest: int, is_advised: bool) -> None:
+    class Grid(Plain):
+        observation_space = spaces.Dict(
+            grid=spaces.Box(0, 255, (7, 7, 3), np.uint8), place=spaces.Discrete(3)
+        )
+
+        def seen(self) -> Any:
+            return {"grid": np.full((7, 7, 3), brightest, np.uint8), "place": 1}
+
+    advice = " ".join(checked(Grid, horizon_scale=0.1).advice)
+    assert ("observation['grid'] never exceeds 10 of 255" in advice) == is_advised
+    assert ("FlattenObservation" in advice) == is_advised
+
+
 def test_findings_of_gymnasiums_checker_are_advice() -> None:
     class Outside(Plain):
         observation_space = spaces.Box(0, 1, (2,), np.float32)

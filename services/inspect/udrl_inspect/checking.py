@@ -22,11 +22,14 @@ from udrl.cost import slow_training_warning
 from udrl.determinism import environment_digest, repeated_digest
 from udrl.environments.making import make_environment
 from udrl.episode import Episode
+from udrl.spaces import Image, ObservationSpace, leaves_of, parts_of
 
 #: Number of random episodes, and seconds after which no further one is started.
 _EPISODES = 20
 _PATIENCE_S = 20.0
 _MIB = 2**20
+#: Images that are never brighter, of 255, may hold indices.
+_DARK = 31
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,6 +110,7 @@ def check(config: Config, automatic: Collection[str] = ()) -> Check:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
     advice += _unusual(fitted, episodes, repeats=repeats)
+    advice += _indices(spec.observation_space, episodes)
     if long := slow_training_warning(fitted, spec):
         advice.append(f"{long[0].upper()}{long[1:]}.")
     return Check(
@@ -209,6 +213,23 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
             advice.append(
                 f"{name} = {scale:g} scales values of about {size:.3g} to inputs of about "
                 f"{scale * size:.2g}; the network needs inputs of about 1; try {name} = auto."
+            )
+    return advice
+
+
+def _indices(space: ObservationSpace, episodes: list[Episode]) -> list[str]:
+    """Return a sentence for each image that seems to hold indices, with its remedy."""
+    advice = []
+    for k, leaf in enumerate(leaves_of(space)):
+        if not isinstance(leaf.space, Image):
+            continue
+        most = max(int(parts_of(e.observations)[k].max()) for e in episodes)
+        if most <= _DARK:
+            advice.append(
+                f"The image observation{leaf.name} never exceeds {most} of 255. If it holds "
+                f"indices instead of brightness, as in MiniGrid, read it as numbers: --set "
+                f"'wrappers=[\"gymnasium.wrappers:FlattenObservation\"]' --set "
+                f"normalise_observations=true."
             )
     return advice
 
