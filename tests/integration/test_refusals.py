@@ -16,7 +16,7 @@ from udrl.errors import ConfigError, Refused
 from udrl_actor.actor_service import ActorService
 from udrl_inspect.address import Address
 from udrl_launch import roles
-from udrl_proto import verbs
+from udrl_proto import PROTOCOL, verbs
 from udrl_proto.codec import encode, encode_array
 from udrl_proto.messages import CommandsRequest, EpisodeMessage, Hello, JoinRequest, VersionMessage
 from udrl_proto.replay_client import ReplayClient
@@ -148,7 +148,7 @@ def test_run_of_another_protocol_is_reported(hosted: Hosted) -> None:
             query.reply("udrl/999/future/hello", b"whatever that will be")
 
     queryable = hosted.session.declare_queryable("udrl/999/future/hello", answer)
-    with pytest.raises(ConfigError, match="protocol 999, this program speaks 4"):
+    with pytest.raises(ConfigError, match=f"protocol 999, this program speaks {PROTOCOL}"):
         find_run(hosted.session, "future", 5)
     queryable.undeclare()
 
