@@ -22,7 +22,8 @@ class Downsample(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstruc
 
     Args:
         env: any environment.
-        height, width: size of the images in pixels, at most that of the environment's images.
+        height: height of the smaller images in pixels, at most that of the environment's.
+        width: width of the smaller images in pixels, likewise.
 
     Raises:
         UnsupportedEnvironment: there is no image, or this size does not fit.

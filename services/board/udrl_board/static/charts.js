@@ -36,7 +36,7 @@ export function merge(...tables) {
   const xs = [...at.keys()].sort((a, b) => a - b);
   const names = new Set(tables.flatMap(([, , columns]) => Object.keys(columns)));
   const column = (name) => {
-    if (!names.has(name)) throw new Error(`no column ${name}`);
+    if (!names.has(String(name))) throw new Error(`no column ${name}`);
     return xs.map((x) => at.get(x)[name]);
   };
   return { xs, column };
