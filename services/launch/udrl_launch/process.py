@@ -80,8 +80,8 @@ def keep_freed_memory() -> None:
 def switch_threads_soon() -> float:
     """Shorten the interpreter's switch interval; return the previous one in seconds.
 
-    An actor's fetcher needs the interpreter while the loop steps environments: at the default of
-    5 ms a query takes 5 ms instead of 0.2.
+    An actor's command fetcher needs the interpreter while the loop steps environments: at the
+    default of 5 ms a query takes 5 ms instead of 0.2.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
