@@ -154,6 +154,9 @@ AUTOMATIC: Mapping[str, Any] = {
     "hold_steps": 1,
 }
 
+#: The value of an optional setting that is None.
+_UNSET = "unset"
+
 #: Conditions under which some settings have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
     "dataset_sha256": (lambda config: config.commands.dataset is not None, "a dataset"),
@@ -276,13 +279,16 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
 
     Args:
         kind: :class:`Config`, :class:`Budget` or a group.
-        values: settings by name, without groups. Missing settings have their defaults.
+        values: settings by name, without groups. Missing settings have their defaults. ``"unset"``
+            is None, which TOML cannot write, for settings that may be None.
 
     Raises:
         ConfigError: a name is unknown or a value is invalid; the message names it.
     """
     refuse_unknown(values, setting_names(kind))
     given = {name: value for name, value in values.items() if name in kind.__struct_fields__}
+    optional = (f.name for f in msgspec.structs.fields(kind) if f.default is None)
+    given |= {name: None for name in optional if given.get(name) == _UNSET}
     for field, group in _groups(kind).items():
         given[field] = build(group, {n: values[n] for n in setting_names(group) if n in values})
     try:
