@@ -17,6 +17,7 @@ from udrl.commands import CommandSampler
 from udrl.config import AUTOMATIC, Config, change
 from udrl.datasets import resolve_dataset
 from udrl.episode import Episode
+from udrl.setting_groups import CommandSettings
 
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500
@@ -33,6 +34,15 @@ _MIN_INPUT, _MAX_INPUT = 0.1, 10.0
 #: Minimum episodes and env steps of the warm-up. If rewards are rare, random actions must find one
 #: before there is anything to learn from.
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000
+#: The newest iterations whose episodes are usually kept, and a number of episodes that exceeds
+#: theirs.
+_MAX_AGE, _ALL = 12, 12_000
+#: Fewest episodes above the median that this window has to have by chance. If rewards are rarer,
+#: they would be forgotten before enough are found, so the best of all time and the newest are kept.
+_FEWEST, _BEST, _NEWEST = 10, 100, 60
+#: ``guidance_kl`` if rewards are rare. Few examples then say what a high return needs, and the
+#: response to it is weak.
+_RARE_GUIDANCE = 0.1
 #: Minimum ``return_lambda``. Lambda-returns reach over at least 1 / _REACH of a random episode.
 _MIN_LAMBDA, _REACH = 0.95, 4.0
 
@@ -95,6 +105,7 @@ def choose(
     baseline = "action_value" if stochastic else "value"
     if config.training.segments == "all":
         baseline = "none"  # the only one that all segments allow
+    rare = episodes is None and rewards_are_rare(sample, config.commands)
     chosen = {
         # To plan for the step limit, an agent must observe the time left. If episodes usually end
         # long before the limit, agents that observe it learn more slowly.
@@ -106,6 +117,10 @@ def choose(
         "return_lambda": max(_MIN_LAMBDA, round(1 - _REACH / length, 3)),
         "n_warm_up_episodes": n_warm_up,
         "warm_up_hold_steps": hold,
+        "replay_size": _BEST if rare else _ALL,
+        "recent_size": _NEWEST if rare else 0,
+        "max_age": None if rare else _MAX_AGE,
+        "guidance_kl": _RARE_GUIDANCE if rare else 0.0,
         # To estimate average outcomes, all actions must be tried repeatedly.
         "hold_share": 0.5 if stochastic else 0.25,
         "hold_rate": _STOCHASTIC_RATE if stochastic else _RATE,
@@ -179,6 +194,18 @@ def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
         )
         sample.add(*generate_episodes(generator, [played], None))
     return sample
+
+
+def rewards_are_rare(sample: Sample, settings: CommandSettings) -> bool:
+    """Return whether few random episodes of the usual window would exceed the median.
+
+    One more episode counts as better, so that a small sample without any does not decide.
+    """
+    n, steps = len(sample.returns), settings.n_steps_per_iter or 0
+    median = sorted(sample.returns)[n // 2]
+    share = (1 + sum(value > median for value in sample.returns)) / (n + 2)
+    per_iteration = max(settings.n_episodes_per_iter, steps * n / sum(sample.lengths))
+    return share * _MAX_AGE * per_iteration < _FEWEST
 
 
 def scale_fits(scale: float, size: float) -> bool:

@@ -9,7 +9,13 @@ import pytest
 
 from udrl.acting import EpisodeGenerator
 from udrl.algorithm1 import algorithm1
-from udrl.automatic_settings import Sample, choose, resolve_automatic, scale_fits
+from udrl.automatic_settings import (
+    Sample,
+    choose,
+    resolve_automatic,
+    rewards_are_rare,
+    scale_fits,
+)
 from udrl.config import AUTOMATIC, Budget, Config, build, change
 from udrl.episode import Episode
 
@@ -222,3 +228,42 @@ def test_lengths_are_compared_with_the_limit_of_random_episodes(
     found = episodes(*[(1.0, length) for length in lengths])
     with closing(EpisodeGenerator(settings, 1)) as generator:
         assert choose(settings, ["observe_time"], generator, found).observe_time is shown
+
+
+@pytest.mark.parametrize(
+    ("n_better", "iterations", "rare"),
+    [
+        (4, {}, True),  # 60 episodes in 12 iterations: (1 + 4) / (30 + 2) of them are 9.4
+        (5, {}, False),
+        (2, {"n_episodes_per_iter": 10}, False),
+        (2, {"n_steps_per_iter": 1_000}, False),  # 10 episodes
+    ],
+)
+def test_rewards_are_rare_if_the_usual_window_has_few_better_episodes(
+    n_better: int, iterations: dict[str, int], rare: bool
+) -> None:
+    sample = Sample()
+    for one in episodes(*[(float(i < n_better), 100) for i in range(30)]):
+        sample.add(one)
+    settings = config(**{"n_episodes_per_iter": 5} | iterations)
+    assert rewards_are_rare(sample, settings.commands) is rare
+
+
+@pytest.mark.parametrize(("environment", "rare"), [(Endless.id, True), ("CartPole-v1", False)])
+def test_best_and_newest_episodes_are_kept_if_rewards_are_rare(
+    environment: str, rare: bool
+) -> None:
+    settings = config(environment=environment, n_episodes_per_iter=5)
+    with closing(EpisodeGenerator(settings, 1)) as generator:
+        resolved = choose(settings, AUTOMATIC, generator)
+    kept = resolved.buffer
+    expected = (100, 60, None) if rare else (12_000, 0, 12)
+    assert (kept.replay_size, kept.recent_size, kept.max_age) == expected
+    assert resolved.network.guidance_kl == (0.1 if rare else 0.0)
+
+
+def test_rewards_of_a_dataset_are_not_rare() -> None:
+    settings = config()
+    equal = episodes((1.0, 9)) * 30
+    resolved = choose(settings, ["max_age"], EpisodeGenerator(settings, 1), equal)
+    assert resolved.buffer.max_age == 12

@@ -97,7 +97,7 @@ def test_unset_is_none_for_optional_settings_only() -> None:
     limited = build(Config, {"environment": "CartPole-v1", "max_age": 3, "max_return": 1.0})
     unlimited = change(limited, max_age="unset", max_return="unset")
     assert (unlimited.buffer.max_age, unlimited.max_return) == (None, None)
-    with pytest.raises(ConfigError, match="^batch_size = 'unset': "):
+    with pytest.raises(ConfigError, match=r"^batch_size = 'unset': "):
         change(limited, batch_size="unset")
 
 

@@ -30,7 +30,7 @@ def test_preset_in_place_of_the_environment_is_refused() -> None:
 def test_environment_without_preset_gets_the_generic_one() -> None:
     settings = gather("Figure2-v0", options={})
     assert settings.automatic == AUTOMATIC.keys()
-    assert settings.config.buffer.max_age == preset("any")["max_age"]
+    assert settings.config.training.batch_size == preset("any")["batch_size"]
     assert gather("Figure2-v0", preset_name="none", options={}).automatic == frozenset()
 
 

@@ -76,7 +76,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     step_s: float
     memory_mib: float
     step_bytes: int
-    chosen: dict[str, float | str]
+    chosen: dict[str, float | str | None]
     advice: tuple[str, ...]
 
 

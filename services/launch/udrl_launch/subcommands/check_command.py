@@ -75,10 +75,15 @@ def _lines(found: Check) -> list[tuple[str, str]]:
         ),
     ]
     if found.chosen:
-        # As --set accepts them.
         chosen = ", ".join(
-            f"{name} = {str(value).lower() if isinstance(value, bool) else value}"
-            for name, value in found.chosen.items()
+            f"{name} = {_as_assigned(value)}" for name, value in found.chosen.items()
         )
         lines.append(("settings", f"{chosen} (chosen from random episodes)"))
     return lines + [("advice", sentence) for sentence in found.advice]
+
+
+def _as_assigned(value: float | str | None) -> str:
+    """Return a setting's value as ``--set`` accepts it."""
+    if value is None:
+        return "unset"
+    return str(value).lower() if isinstance(value, bool) else str(value)
