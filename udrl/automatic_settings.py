@@ -40,9 +40,9 @@ _MAX_AGE, _ALL = 12, 12_000
 #: Fewest episodes above the median that this window has to have by chance. If rewards are rarer,
 #: they would be forgotten before enough are found, so the best of all time and the newest are kept.
 _FEWEST, _BEST, _NEWEST = 10, 100, 60
-#: ``guidance_kl`` if rewards are rare. Few examples then say what a high return needs, and the
-#: response to it is weak.
-_RARE_GUIDANCE = 0.1
+#: ``guidance_kl`` and ``reset_every`` if rewards are rare. Few examples then say what a high return
+#: needs, so the response to it is weak, and networks adapt to what the first ones had in common.
+_RARE_GUIDANCE, _RARE_RESETS = 0.1, 100
 #: Minimum ``return_lambda``. Lambda-returns reach over at least 1 / _REACH of a random episode.
 _MIN_LAMBDA, _REACH = 0.95, 4.0
 
@@ -121,6 +121,7 @@ def choose(
         "recent_size": _NEWEST if rare else 0,
         "max_age": None if rare else _MAX_AGE,
         "guidance_kl": _RARE_GUIDANCE if rare else 0.0,
+        "reset_every": _RARE_RESETS if rare else None,
         # To estimate average outcomes, all actions must be tried repeatedly.
         "hold_share": 0.5 if stochastic else 0.25,
         "hold_rate": _STOCHASTIC_RATE if stochastic else _RATE,

@@ -151,6 +151,7 @@ AUTOMATIC: Mapping[str, Any] = {
     "recent_size": 0,
     "max_age": 12,
     "guidance_kl": 0.0,
+    "reset_every": None,
     "n_warm_up_episodes": 1,
     "warm_up_hold_steps": 1,
     "hold_share": 1.0,

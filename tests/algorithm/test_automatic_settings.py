@@ -260,6 +260,7 @@ def test_best_and_newest_episodes_are_kept_if_rewards_are_rare(
     expected = (100, 60, None) if rare else (12_000, 0, 12)
     assert (kept.replay_size, kept.recent_size, kept.max_age) == expected
     assert resolved.network.guidance_kl == (0.1 if rare else 0.0)
+    assert resolved.training.reset_every == (100 if rare else None)
 
 
 def test_rewards_of_a_dataset_are_not_rare() -> None:
