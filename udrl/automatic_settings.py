@@ -117,7 +117,7 @@ def choose(
         "return_lambda": max(_MIN_LAMBDA, round(1 - _REACH / length, 3)),
         "n_warm_up_episodes": n_warm_up,
         "warm_up_hold_steps": hold,
-        "replay_size": _BEST if rare else _ALL,
+        "replay_size": max(_BEST, config.commands.last_few) if rare else _ALL,
         "recent_size": _NEWEST if rare else 0,
         "max_age": None if rare else _MAX_AGE,
         "guidance_kl": _RARE_GUIDANCE if rare else 0.0,

@@ -263,6 +263,12 @@ def test_best_and_newest_episodes_are_kept_if_rewards_are_rare(
     assert resolved.training.reset_every == (100 if rare else None)
 
 
+def test_kept_episodes_include_those_that_commands_are_drawn_from() -> None:
+    settings = config(environment=Endless.id, n_episodes_per_iter=5, last_few=300)
+    with closing(EpisodeGenerator(settings, 1)) as generator:
+        assert choose(settings, ["replay_size"], generator).buffer.replay_size == 300
+
+
 def test_rewards_of_a_dataset_are_not_rare() -> None:
     settings = config()
     equal = episodes((1.0, 9)) * 30
