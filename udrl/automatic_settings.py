@@ -200,13 +200,15 @@ def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
 def rewards_are_rare(sample: Sample, settings: CommandSettings) -> bool:
     """Return whether few random episodes of the usual window would exceed the median.
 
-    One more episode counts as better, so that a small sample without any does not decide.
+    A window of many episodes is large enough, and the best of all time may only have been lucky. In
+    the sample one more episode counts as better, so that a small one without any does not decide.
     """
     n, steps = len(sample.returns), settings.n_steps_per_iter or 0
     median = sorted(sample.returns)[n // 2]
     share = (1 + sum(value > median for value in sample.returns)) / (n + 2)
     per_iteration = max(settings.n_episodes_per_iter, steps * n / sum(sample.lengths))
-    return share * _MAX_AGE * per_iteration < _FEWEST
+    window = _MAX_AGE * per_iteration
+    return window < _BEST and share * window < _FEWEST
 
 
 def scale_fits(scale: float, size: float) -> bool:
