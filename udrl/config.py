@@ -159,8 +159,8 @@ AUTOMATIC: Mapping[str, Any] = {
     "hold_steps": 1,
 }
 
-#: The value of an optional setting that is None.
-_UNSET = "unset"
+#: The value of an optional setting that is None, which TOML cannot write.
+UNSET = "unset"
 
 #: Conditions under which some settings have an effect.
 _NEEDS: dict[str, tuple[Callable[[Config], bool], str]] = {
@@ -293,7 +293,7 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
     refuse_unknown(values, setting_names(kind))
     given = {name: value for name, value in values.items() if name in kind.__struct_fields__}
     optional = (f.name for f in msgspec.structs.fields(kind) if f.default is None)
-    given |= {name: None for name in optional if given.get(name) == _UNSET}
+    given |= {name: None for name in optional if given.get(name) == UNSET}
     for field, group in _groups(kind).items():
         given[field] = build(group, {n: values[n] for n in setting_names(group) if n in values})
     try:

@@ -8,6 +8,7 @@ from udrl.config import AUTOMATIC, preset, preset_names
 from udrl.errors import ConfigError
 from udrl_launch.settings import gather
 from udrl_launch.subcommands.train_command import warn_of_idle_environments
+from udrl_replay.creation import write_config
 
 
 def test_preset_of_the_environment_is_the_default() -> None:
@@ -112,6 +113,15 @@ def test_ineffective_setting_is_rejected(idle: str, needed: str) -> None:
     ):
         gather("Figure2-v0", preset_name="none", options={}, assignments=[*without, idle])
     gather("Figure2-v0", preset_name="none", options={}, assignments=[idle, needed])
+
+
+def test_written_configuration_is_complete_without_its_preset(tmp_path: Path) -> None:
+    assigned = ["max_age=unset", "environment_kwargs={}", "keep_versions=unset"]
+    written = gather("Figure2-v0", preset_name="CartPole-v1", options={}, assignments=assigned)
+    write_config(tmp_path, written.config, written.budget)
+    again = gather("Figure2-v0", file=tmp_path / "config.toml", options={})
+    assert again == written
+    assert again.config.buffer.max_age is None  # and not chosen, as the preset "any" asks for
 
 
 def test_ineffective_setting_of_a_file_is_accepted(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import msgspec
 from udrl.acting import EpisodeGenerator
 from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
-from udrl.config import Budget, Config, flat
+from udrl.config import UNSET, Budget, Config, flat
 from udrl.cost import slow_training_warning
 from udrl.datasets import resolve_dataset
 from udrl.determinism import repeated_digest
@@ -164,9 +164,7 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
     """
     lines = []
     for settings in (config, budget):
-        for name, value in flat(settings).items():
-            if value is not None and value != {}:
-                lines.append(f"{name} = {as_toml(value)}")
+        lines += [f"{name} = {as_toml(value)}" for name, value in flat(settings).items()]
     path = run_dir / "config.toml"
     try:
         # A full disk must not destroy the old budget.
@@ -178,6 +176,8 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
 
 def as_toml(value: object) -> str:
     """Return a setting's value in TOML."""
+    if value is None:
+        value = UNSET  # left out, it would be a preset's value
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{as_toml(k)} = {as_toml(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 
+from udrl.config import UNSET
 from udrl_inspect.checking import Check
 from udrl_inspect.checking import check as check_environment
 from udrl_launch import completions
@@ -85,5 +86,5 @@ def _lines(found: Check) -> list[tuple[str, str]]:
 def _as_assigned(value: float | str | None) -> str:
     """Return a setting's value as ``--set`` accepts it."""
     if value is None:
-        return "unset"
+        return UNSET
     return str(value).lower() if isinstance(value, bool) else str(value)
