@@ -82,10 +82,11 @@ class Child:
         """Shorten a long log: environments may print without limit."""
         if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
             end = _end_of(self.log_file, _LONGEST_LOG // 4)
-            # The child has opened the file in append mode, so its output follows.
+            # The child appends meanwhile. What it writes before the file is truncated is lost; what
+            # it writes afterwards follows, because its file is in append mode.
             with self.log_file.open("r+", encoding="utf-8") as log_file:
-                log_file.truncate(0)
                 log_file.write(f"... earlier output was removed\n{end}")
+                log_file.truncate()
 
 
 def _end_of(file: Path, size: int) -> str:
