@@ -263,6 +263,29 @@ def test_limit_steps_changes_the_limit_of_later_episodes(register: Register) -> 
         assert len(play(env, 1, [0] * 100)[1]) == steps
 
 
+@pytest.mark.parametrize(("own", "set_to", "actions"), [(10, None, 3), (10, 4, 4), (2, None, 1)])
+def test_limits_count_actions_if_a_wrapper_repeats_them(
+    register: Register, own: int, set_to: int | None, actions: int
+) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=own)
+    repeated = {"wrappers": ("gymnasium.wrappers:RepeatAction(num_repeats=3)",)}
+    env = make(name, max_episode_steps=set_to, observe_time=True, **repeated)
+    assert specify(env, settings(name, max_episode_steps=set_to)).max_episode_steps == actions
+    env.reset(seed=1)
+    left = [env.step(0)[0]["['time_left']"].item() for _ in range(actions)]
+    assert left == pytest.approx([1 - k / actions for k in range(1, actions + 1)])
+    limit_steps(env, 2)
+    assert play(env, 1, [0] * 100)[2] == [False, True]
+
+
+def test_wrapped_time_limit_counts_its_own_steps(register: Register) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=10)
+    repeat, limit = "RepeatAction(num_repeats=2)", "TimeLimit(max_episode_steps=3)"
+    env = make(name, wrappers=tuple(f"gymnasium.wrappers:{w}" for w in (repeat, limit)))
+    assert specify(env, settings(name)).max_episode_steps == 3
+    assert play(env, 1, [0] * 100)[2] == [False, False, True]
+
+
 def test_limit_steps_rejects_an_environment_without_a_limit() -> None:
     with pytest.raises(UnsupportedEnvironment, match="make it with make_environment"):
         limit_steps(Figure2(), 3)

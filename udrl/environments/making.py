@@ -45,6 +45,11 @@ _EXTRAS = {
 #: environments of a run on one machine.
 INDEX = "UDRL_ENVIRONMENT_INDEX"
 
+#: Attribute of wrappers that repeat actions, such as Gymnasium's ``RepeatAction``.
+_REPEATS = "num_repeats"
+#: Attribute of Gymnasium's ``TimeLimit``.
+_LIMIT = "_max_episode_steps"
+
 _making = threading.RLock()
 
 
@@ -116,8 +121,11 @@ def make_environment(config: Config) -> Adapter:
         ) from error
     for wrapper in config.wrappers:
         env = _wrapped(env, wrapper)
-    if config.observe_time and env.spec is not None and env.spec.max_episode_steps is not None:
-        env = ObserveTime(env, env.spec.max_episode_steps)
+    longest = _step_limit(env, config)
+    if longest is not None:
+        limit_steps(env, longest)
+        if config.observe_time:
+            env = ObserveTime(env, longest)
     return adapt(ObservePrevious(env) if config.observe_previous else env, name, config.actions)
 
 
@@ -241,8 +249,8 @@ def _needs_main_thread(text: str) -> bool:
 
 def specify(env: Environment, config: Config) -> EnvironmentSpec:
     """Return the specification of an environment from :func:`make_environment`."""
-    assert env.spec is not None
-    assert env.spec.max_episode_steps is not None
+    longest = _step_limit(env, config)
+    assert longest is not None
     space, actions = (env.get_wrapper_attr(name).plain for name in ("observations", "actions"))
     declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
     max_return = config.max_return if config.max_return is not None else declared
@@ -250,7 +258,7 @@ def specify(env: Environment, config: Config) -> EnvironmentSpec:
         observation_space=space,
         action_space=actions,
         action_mask=_mask(config, space, actions),
-        max_episode_steps=env.spec.max_episode_steps,
+        max_episode_steps=longest,
         max_return=None if max_return is None else float(max_return),
     )
 
@@ -277,8 +285,26 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
     return found[0]
 
 
+def _step_limit(env: Environment, config: Config) -> int | None:
+    """Return the time limit of an environment's episodes, in actions; None if it has none."""
+    if env.spec is None or env.spec.max_episode_steps is None:
+        return None
+    if config.max_episode_steps is not None:
+        return config.max_episode_steps
+    return max(1, env.spec.max_episode_steps // _steps_per_action(env))
+
+
+def _steps_per_action(env: Environment) -> int:
+    """Return how many steps of Gymnasium's ``TimeLimit`` an action takes."""
+    steps = 1
+    while isinstance(env, gym.Wrapper) and _LIMIT not in vars(env):
+        steps *= vars(env).get(_REPEATS, 1)
+        env = env.env
+    return steps
+
+
 def limit_steps(env: Environment, max_steps: int) -> None:
-    """Set the time limit of the environment's next episodes, in steps.
+    """Set the time limit of the environment's next episodes, in actions.
 
     This changes Gymnasium's ``TimeLimit`` wrapper instead of counting steps outside, because the
     wrappers outside it must see the truncation (:class:`~udrl.environments.sparse.RewardAtEnd`).
@@ -286,7 +312,8 @@ def limit_steps(env: Environment, max_steps: int) -> None:
     Raises:
         UnsupportedEnvironment: it has no ``TimeLimit``.
     """
-    if not env.set_wrapper_attr("_max_episode_steps", max_steps, force=False):
+    steps = max_steps * _steps_per_action(env)
+    if not env.set_wrapper_attr(_LIMIT, steps, force=False):
         raise UnsupportedEnvironment(
             f"environment {env} has no gymnasium.wrappers.TimeLimit to set to {max_steps} steps; "
             f"make it with make_environment"
