@@ -5,20 +5,29 @@ Good values depend on the length of episodes and on the magnitude of returns. Se
 :class:`udrl.config.Config` holds the chosen values.
 """
 
+import logging
 import math
 from collections.abc import Collection, Sequence
 from contextlib import closing
 from hashlib import blake2b
 
 import msgspec
+import numpy as np
 
 from udrl.acting import EpisodeGenerator, generate_episodes
+from udrl.actions import ActionSpace, random_actions
 from udrl.commands import CommandSampler
 from udrl.config import AUTOMATIC, Config, change
 from udrl.datasets import resolve_dataset
+from udrl.environments.making import make_environment
+from udrl.environments.masking import mask_in
 from udrl.episode import Episode
 from udrl.setting_groups import CommandSettings
 
+log = logging.getLogger("udrl")
+
+#: Reset seed with which the environment is asked for an action mask, from the training range.
+_SEED = 1_000_000
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500
 #: Env steps above which sampling stops: after the usual number of episodes, and before.
@@ -64,6 +73,7 @@ def resolve_automatic(config: Config, automatic: Collection[str]) -> Config:
     """
     if not automatic:
         return config
+    config = with_offered_mask(config, automatic)
     with closing(EpisodeGenerator(config, 1)) as generator:
         _, offline = resolve_dataset(config, generator.spec)
         return choose(config, automatic, generator, offline)
@@ -78,7 +88,8 @@ def choose(
     """Return settings with values for the automatic ones.
 
     Args:
-        config: the settings; the values of automatic ones are ignored.
+        config: the settings; the values of automatic ones are ignored, but for ``action_mask``, on
+            which random episodes depend (:func:`with_offered_mask`).
         automatic: names of the automatic settings, among :data:`udrl.config.AUTOMATIC`.
         generator: runs the first commands of the warm-up.
         episodes: episodes to use instead of these.
@@ -107,6 +118,7 @@ def choose(
         baseline = "none"  # the only one that all segments allow
     rare = episodes is None and rewards_are_rare(sample, config.commands)
     chosen = {
+        "action_mask": config.actions.action_mask,
         # To plan for the step limit, an agent must observe the time left. If episodes usually end
         # long before the limit, agents that observe it learn more slowly.
         "observe_time": 2 * length > _limit(config, generator),
@@ -128,6 +140,31 @@ def choose(
         "hold_steps": hold,
     }
     return change(config, **{name: chosen[name] for name in automatic})
+
+
+def with_offered_mask(config: Config, automatic: Collection[str]) -> Config:
+    """Return settings with the environment's own action mask, if it has one and this is automatic.
+
+    Args:
+        config: the settings.
+        automatic: names of the automatic settings.
+
+    Raises:
+        UnsupportedEnvironment: the environment does not exist or is not supported.
+    """
+    if "action_mask" not in automatic or config.commands.dataset is not None:
+        return config
+    with closing(make_environment(config)) as env:
+        actions: ActionSpace = env.get_wrapper_attr("actions").plain
+        n = actions.n_parameters
+        try:
+            mask = mask_in(env.reset(seed=_SEED)[1], n, "reset")
+            allowed = random_actions(actions, mask[None], np.zeros((1, *actions.shape)))
+            mask_in(env.step(allowed[0])[4], n, "step")
+        except Exception as error:  # noqa: BLE001 - random episodes will show other faults
+            log.debug("%s offers no action mask: %s", config.environment, error)
+            return config
+    return change(config, action_mask="info")
 
 
 class Sample:

@@ -142,6 +142,7 @@ class Budget(SettingsGroup, frozen=True, kw_only=True):
 #: Settings that accept ``auto``, with placeholders until :mod:`udrl.automatic_settings` chooses
 #: values.
 AUTOMATIC: Mapping[str, Any] = {
+    "action_mask": None,
     "observe_time": False,
     "return_scale": 1.0,
     "horizon_scale": 1.0,

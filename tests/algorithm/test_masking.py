@@ -10,6 +10,7 @@ from gymnasium import spaces
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.actions import Categorical, Product, random_actions
 from udrl.algorithm1 import algorithm1
+from udrl.automatic_settings import with_offered_mask
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
 from udrl.environments import make_environment
@@ -45,7 +46,8 @@ class Doors(gym.Env[Any, Any]):
             mask = np.zeros(4, np.int8)
         if self.fault == "too short":
             mask = np.ones(3, np.int8)
-        info = {} if self.fault == "no mask" else {"action_mask": mask}
+        absent = self.fault == "no mask" or (self.fault == "only at reset" and self.t > 0)
+        info = {} if absent else {"action_mask": mask}
         flat = np.concatenate(mask) if self.two else mask
         return ({"doors": flat, "time": time} if self.shows else time), info
 
@@ -93,6 +95,30 @@ def test_run_takes_allowed_actions_only(
     runs = [algorithm1(settings, Budget(max_env_steps=400), n) for n in (1, 5)]
     assert len({(run.weights_sha256, run.replay_sha256) for run in runs}) == 1
     assert np.isfinite(runs[0].state.loss)
+
+
+@pytest.mark.parametrize(
+    ("given", "chosen"),
+    [
+        ({}, "info"),
+        ({"two": True}, "info"),
+        ({"fault": "no mask"}, None),
+        ({"fault": "too short"}, None),
+        ({"fault": "only at reset"}, None),
+    ],
+)
+def test_automatic_mask_is_the_one_that_the_environment_offers(
+    given: dict[str, Any], chosen: str | None
+) -> None:
+    settings = config(None, given)
+    assert with_offered_mask(settings, ["action_mask"]).actions.action_mask == chosen
+    assert with_offered_mask(settings, ["hold_rate"]) == settings
+
+
+def test_run_with_an_automatic_mask_takes_allowed_actions_only() -> None:
+    automatic = ["action_mask", "observe_time", "return_scale"]
+    run = algorithm1(config(None), Budget(max_env_steps=400), automatic=automatic)
+    assert np.isfinite(run.state.loss)
 
 
 def test_random_action_is_uniform_among_the_allowed() -> None:

@@ -94,7 +94,7 @@ def test_command_prints_lines_or_json() -> None:
     result = CliRunner().invoke(cli, ["check", "CartPole-v1", "--json"], standalone_mode=False)
     assert json.loads(result.stdout)["max_episode_steps"] == 500
     result = CliRunner().invoke(cli, ["check", "MountainCar-v0"], standalone_mode=False)
-    chosen = "baseline = value, guidance_kl = 0.0, hold_rate = 0.05, hold_share = 0.25"
+    chosen = "action_mask = unset, baseline = value, guidance_kl = 0.0, hold_rate = 0.05"
     assert f"settings      {chosen}" in result.stdout
     assert (
         "All random episodes return" not in result.stdout

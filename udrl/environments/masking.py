@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 
 from udrl.environments.conversions import describe
@@ -51,18 +52,32 @@ class ObserveMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         return self._with_mask("step", observation, info), reward, terminated, truncated, info
 
     def _with_mask(self, where: str, observation: Any, info: Any) -> dict[str, Any]:
-        try:
-            given = info[MASK]
-        except (KeyError, TypeError, IndexError) as error:
-            raise EnvironmentFault(
-                f"{where}() returned {describe(info)} as info, without {MASK!r}; set "
-                f"action_mask only where every info has it"
-            ) from error
-        parts = given if isinstance(given, tuple) else (given,)
-        mask = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
-        if mask.size != self._size or mask.dtype.kind not in "biuf":
-            raise EnvironmentFault(
-                f"{where}() returned as info[{MASK!r}] {describe(given)}, expected {self._size} "
-                f"numbers, 0 or 1"
-            )
-        return {OBSERVATION: observation, MASK: mask.astype(np.int8)}
+        return {OBSERVATION: observation, MASK: mask_in(info, self._size, where)}
+
+
+def mask_in(info: Any, size: int, where: str) -> npt.NDArray[np.int8]:
+    """Return the mask in the ``info`` of ``reset`` or ``step``, in one array.
+
+    Args:
+        info: the environment's ``info``.
+        size: length of the mask.
+        where: the method that returned it, for messages.
+
+    Raises:
+        EnvironmentFault: there is no mask, or it is invalid.
+    """
+    try:
+        given = info[MASK]
+    except (KeyError, TypeError, IndexError) as error:
+        raise EnvironmentFault(
+            f"{where}() returned {describe(info)} as info, without {MASK!r}; set "
+            f"action_mask only where every info has it"
+        ) from error
+    parts = given if isinstance(given, tuple) else (given,)
+    mask = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
+    if mask.size != size or mask.dtype.kind not in "biuf":
+        raise EnvironmentFault(
+            f"{where}() returned as info[{MASK!r}] {describe(given)}, expected {size} "
+            f"numbers, 0 or 1"
+        )
+    return mask.astype(np.int8)

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from udrl.acting import EpisodeGenerator
-from udrl.automatic_settings import choose, scale_fits
+from udrl.automatic_settings import choose, scale_fits, with_offered_mask
 from udrl.commands import CommandSampler
 from udrl.config import Config, change, flat
 from udrl.cost import slow_training_warning
@@ -94,10 +94,11 @@ def check(config: Config, automatic: Collection[str] = ()) -> Check:
     before, began = _memory(), time.perf_counter()
     env = make_environment(config)
     make_s = time.perf_counter() - began
+    memory = _memory() - before
     advice = _of_gymnasium(env.unwrapped)
     env.close()
+    config = with_offered_mask(config, automatic)
     with closing(EpisodeGenerator(config, 1)) as generator:
-        memory = (_memory() - before) / 2  # two were created
         fitted = choose(config, automatic, generator) if automatic else config
     env = make_environment(fitted)  # what is chosen may add to the observations
     declared = env.observations.declared, env.actions.declared
