@@ -37,7 +37,7 @@ TASKS = {
     "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
     "FrozenLakeSlippery": Task("FrozenLake-v1", 200_000, {}),
     # Returns vary greatly, so an evaluation needs many episodes.
-    "Blackjack": Task("Blackjack-v1", 60_000, {"eval_episodes": 5_000}),
+    "Blackjack": Task("Blackjack-v1", 60_000, {"eval_episodes": 5_000, "max_episode_steps": 20}),
     "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
     "Taxi": Task("Taxi-v4", 200_000, {}),
     "CartPole": Task("CartPole-v1", 100_000, {}),
@@ -45,7 +45,6 @@ TASKS = {
     "MountainCar": Task("MountainCar-v0", 150_000, {}),
     "LunarLander": Task("LunarLander-v3", 200_000, {}),
     "LunarLanderSparse": Task("LunarLanderSparse-v3", 200_000, {}),
-    "TaxiMasked": Task("Taxi-v4", 200_000, {"action_mask": "info"}),
     "Pendulum": Task("Pendulum-v1", 300_000, {"normalise_observations": True}),
     "MountainCarContinuous": Task(
         "MountainCarContinuous-v0", 300_000, {"normalise_observations": True}
