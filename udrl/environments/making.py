@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from numbers import Integral
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -298,7 +299,9 @@ def _steps_per_action(env: Environment) -> int:
     """Return how many steps of Gymnasium's ``TimeLimit`` an action takes."""
     steps = 1
     while isinstance(env, gym.Wrapper) and _LIMIT not in vars(env):
-        steps *= vars(env).get(_REPEATS, 1)
+        repeats = vars(env).get(_REPEATS)
+        if isinstance(repeats, Integral):
+            steps *= max(1, int(repeats))
         env = env.env
     return steps
 
