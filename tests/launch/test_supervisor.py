@@ -114,7 +114,8 @@ def test_long_log_is_shortened(supervisor: Supervisor, monkeypatch: pytest.Monke
     log_file = supervisor.children[0].log_file
     assert log_file.stat().st_size <= 4000
     assert log_file.read_text().splitlines()[0] == "... earlier output was removed"
-    assert supervisor.children[0].log_tail().splitlines()[-1] == "end"
+    # The child may be in the middle of a line when its log is shortened: "line end" is right, too.
+    assert supervisor.children[0].log_tail().endswith("end")
 
 
 def test_end_kills_an_unresponsive_child(
