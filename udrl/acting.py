@@ -60,7 +60,7 @@ class EpisodeGenerator:
         spec: specification of the environment.
 
     Raises:
-        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        UnsupportedEnvironment: the environment cannot be created or is not supported.
     """
 
     def __init__(

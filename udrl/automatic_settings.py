@@ -32,7 +32,7 @@ _SEED = 1_000_000
 _EPISODES, _MAX_EPISODES = 40, 500
 #: Env steps above which sampling stops: after the usual number of episodes, and before.
 _STEPS, _MAX_STEPS = 1_000, 10_000
-#: Upper bound of the time limit of sampled episodes, in steps.
+#: Upper bound of the step limit of sampled episodes, in steps.
 _MAX_LENGTH = 2_000
 #: Candidates for the steps for which random actions are held; number of best episodes to compare.
 _HOLDS, _N_BEST = (2, 8, 32), 3
@@ -254,7 +254,7 @@ def scale_fits(scale: float, size: float) -> bool:
 
 
 def _limit(config: Config, generator: EpisodeGenerator) -> int:
-    """Return the time limit of sampled episodes, in steps."""
+    """Return the step limit of sampled episodes, in steps."""
     training = config.max_train_steps or _MAX_LENGTH
     return min(generator.spec.max_episode_steps, training, _MAX_LENGTH)
 

@@ -61,7 +61,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         environment_seed: reset seed of the environment.
         stream_key: key of the random stream whose number t chooses action t, 16 bytes.
         weights_version: version of the behavior function; 0 in the warm-up: random actions.
-        max_steps: time limit of the episode in steps.
+        max_steps: step limit of the episode in steps.
         temperature: divisor of the logits before sampling; 0 = the most likely action.
         random_from: first step of a period of uniformly random actions.
         random_steps: length of this period in steps.
@@ -142,7 +142,7 @@ class CommandSampler:
 
     Args:
         config: the run's settings.
-        spec: the environment's time limit and highest return.
+        spec: the environment's step limit and highest return.
     """
 
     def __init__(self, config: Config, spec: EnvironmentSpec) -> None:

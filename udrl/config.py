@@ -61,8 +61,8 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
             ``package.module:Wrapper(size=8)``.
         observe_time: whether the time left until the step limit is added to observations.
         observe_previous: whether the previous action and reward are added to observations.
-        max_episode_steps: time limit of an episode in steps. None: the environment's own.
-        max_train_steps: shorter time limit of warm-up and exploratory episodes. None: none.
+        max_episode_steps: step limit of an episode. None: the environment's own.
+        max_train_steps: shorter step limit of warm-up and exploratory episodes. None: none.
         max_return: the highest possible return, which caps the desired return in evaluation
             (2.3.2). None: the environment's own, if it declares one.
         seed: seed of all random streams.
@@ -302,7 +302,7 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
     except msgspec.ValidationError as error:
         named = [n for n in values if re.search(rf"\$\.{n}\b", str(error))]
         value = f"{named[0]} = {values[named[0]]!r}: " if named else ""
-        raise ConfigError(f"{value}{error}; see docs/configuration.md") from error
+        raise ConfigError(f"{value}{error}") from error
 
 
 def change(settings: Kind, **values: Any) -> Kind:

@@ -46,7 +46,7 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
 
     Raises:
         ConfigError: there is no such dataset, it is empty, or its episodes do not fit the
-            environment or its time limit.
+            environment or its step limit.
     """
     minari = _minari()
     try:
@@ -167,7 +167,7 @@ def write_dataset(
 ) -> None:
     """Write episodes to a Minari dataset without loss, in the environment's own spaces.
 
-    If the environment cannot be made, they are written in the algorithm's spaces, and the dataset
+    If the environment cannot be created, they are written in the algorithm's spaces, and the dataset
     does not name its environment.
 
     Args:

@@ -61,13 +61,13 @@ def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> s
         config: settings of the episode's run.
         episode: the recorded episode.
         seed: its environment seed.
-        max_steps: its time limit.
+        max_steps: its step limit.
 
     Returns:
         A description of the first difference; None: there is none.
 
     Raises:
-        UnsupportedEnvironment: the environment can no longer be made.
+        UnsupportedEnvironment: the environment can no longer be created.
         EnvironmentFault: it returned an invalid value.
     """
     env = make_environment(config)

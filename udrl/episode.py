@@ -32,7 +32,7 @@ class Episode:
         actions: a_t, T elements of the action space.
         rewards: r_t, float32 [T], rounded once, at the environment.
         terminated: whether the environment reached a terminal state.
-        truncated: whether a time limit ended the episode.
+        truncated: whether a step limit ended the episode.
     """
 
     command_id: int

@@ -36,6 +36,14 @@ def return_text(value: float) -> str:
     return f"{whole}.{decimals.rstrip('0') or '0'}"
 
 
+def interval_text(mean: float, half: float) -> str:
+    """Format a mean and the half width of its interval, with as many decimals as that has."""
+    if half == 0:
+        return f"{return_text(mean)} ± 0.0"
+    decimals = min(max(1, math.ceil(-math.log10(half))), 6)
+    return f"{mean:.{decimals}f} ± {half:.{decimals}f}"
+
+
 def summarise(returns: Sequence[float]) -> Evaluation:
     """Return the statistics of episode returns, at least one."""
     mean = fmean(returns)

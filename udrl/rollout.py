@@ -41,7 +41,7 @@ class Rollout:
         steps: number of steps taken.
         episode_return: return obtained so far, a sequential sum in float64.
         terminated: whether the environment reached a terminal state.
-        truncated: whether a time limit ended the episode.
+        truncated: whether a step limit ended the episode.
         action: the last action, an index or one for each component; None before the first.
 
     Raises:

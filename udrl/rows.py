@@ -45,7 +45,7 @@ class Rows:
         reward: last reward of each row, float32 [n].
 
     Raises:
-        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        UnsupportedEnvironment: the environment cannot be created or is not supported.
     """
 
     def __init__(

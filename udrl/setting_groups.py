@@ -68,7 +68,7 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             paper. ``value``: a learned value function. ``action_value``: the same, with examples
             labelled with the average outcome of their action (:mod:`udrl.value`).
         advantage_bound: with a ``baseline``, largest absolute value of relative desired returns, in
-            mean deviations of the return.
+            mean absolute deviations of the return.
         guidance_kl: minimum mean KL divergence, in nats, of the policy for the highest return from
             that for the lowest (:mod:`udrl.guidance`). 0: no guidance.
     """
@@ -181,7 +181,7 @@ class TrainingSettings(SettingsGroup, frozen=True, kw_only=True):
             and reward, so that the agent does not only learn to repeat its actions.
         return_lambda: with a ``baseline``, lambda of the lambda-returns that label examples. 1: the
             observed return. 0: one reward and the value after it.
-        reset_every: versions after which all networks begin anew from their initial weights, with
+        reset_every: versions after which all networks are reset to their initial weights, with
             :data:`udrl.training.RESET_ROUNDS` times the updates. None: never, as in the paper.
     """
 

@@ -39,7 +39,7 @@ class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     Attributes:
         algorithm: the algorithm.
-        config: environment and its time limit, ``frame_stack``, ``convolutions``, ``hidden``, seed,
+        config: environment and its step limit, ``frame_stack``, ``convolutions``, ``hidden``, seed,
             evaluations (DQN always acts greedily in them) and device. Other settings are ignored.
         hyperparameters: those of the algorithm's class in :mod:`udrl_experiments.tuned` that differ
             from their defaults.

@@ -294,7 +294,7 @@ def test_limit_steps_rejects_an_environment_without_a_limit() -> None:
 @pytest.mark.parametrize("name", ["Pong", "NoSuchEnvironment-v0", "CartPole-v99", "a b c"])
 def test_unknown_id_is_rejected_with_the_two_accepted_forms(name: str) -> None:
     with pytest.raises(
-        UnsupportedEnvironment, match=f"'{name}' cannot be made.*package.module:Env-v0"
+        UnsupportedEnvironment, match=f"'{name}' cannot be created.*package.module:Env-v0"
     ):
         make(name)
 
@@ -318,7 +318,7 @@ def test_missing_extra_is_reported_with_the_install_command(
 def test_keyword_arguments_reach_the_environment_and_unknown_ones_are_rejected() -> None:
     env = make("Obedience-v0", environment_kwargs={"steps": 3})
     assert specify(env, settings("Obedience-v0")).max_return == 3.0
-    with pytest.raises(UnsupportedEnvironment, match=r"'Obedience-v0' cannot be made.*stpes"):
+    with pytest.raises(UnsupportedEnvironment, match=r"'Obedience-v0' cannot be created.*stpes"):
         make("Obedience-v0", environment_kwargs={"stpes": 3})
 
 
@@ -363,6 +363,6 @@ def test_module_that_fails_to_import_is_rejected(importable_module: str, tmp_pat
 
 def test_unknown_environment_of_an_importable_module_is_rejected(importable_module: str) -> None:
     with pytest.raises(
-        UnsupportedEnvironment, match=f"'{importable_module}:Impatience-v0' cannot be made"
+        UnsupportedEnvironment, match=f"'{importable_module}:Impatience-v0' cannot be created"
     ):
         make(f"{importable_module}:Impatience-v0")

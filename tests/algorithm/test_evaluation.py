@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.evaluation import return_text, summarise
+from udrl.evaluation import interval_text, return_text, summarise
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=50))
@@ -44,3 +44,18 @@ def test_return_is_formatted_with_the_necessary_digits(value: float, text: str) 
 def test_formatted_return_parses_to_the_same_value(value: float) -> None:
     read = float(return_text(value))
     assert abs(read - value) <= max(0.0501 if abs(value) >= 10 else 0, 0.0051 * abs(value))
+
+
+@pytest.mark.parametrize(
+    ("mean", "half", "text"),
+    [
+        (15.8321, 0.0977, "15.83 ± 0.10"),
+        (249.25, 5.21, "249.2 ± 5.2"),
+        (-0.0712, 0.0038, "-0.071 ± 0.004"),
+        (500.0, 0.0, "500.0 ± 0.0"),
+        (0.0123, 0.0, "0.0123 ± 0.0"),
+        (1.0, 1e-9, "1.000000 ± 0.000000"),
+    ],
+)
+def test_interval_has_the_decimals_of_its_half_width(mean: float, half: float, text: str) -> None:
+    assert interval_text(mean, half) == text

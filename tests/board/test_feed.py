@@ -231,7 +231,7 @@ def test_page_gets_the_report_on_obedience(run: CountingSource, clock: Clock, ob
     assert found is not None
     assert (found.low, found.high) == ((0.0, 4.0) if obeys else (None, None))
     assert found.weights_version == 3
-    assert found.answer.startswith("Command returns between 0 and 4" if obeys else "This agent")
+    assert found.answer.startswith("You can command returns from 0 to 4" if obeys else "This agent")
     run.report = report("of another run", obeys=obeys)
     clock.now += FRESH_S
     assert feed.news().obeyed is None

@@ -55,22 +55,22 @@ def report(
 
 def test_summary_of_an_agent_that_obeys_in_part() -> None:
     assert answer(report(obeyed=(30.0, 80.0), correlation=0.97)) == (
-        "Command returns between 30 and 80; mean absolute error 7, correlation 0.97. "
+        "You can command returns from 30 to 80 (mean absolute error 7, correlation 0.97). "
         "Outside this range, do not expect the commanded return."
     )
 
 
 def test_summary_of_an_agent_that_obeys_everywhere() -> None:
     assert answer(report(obeyed=(-20.0, 130.0), tolerance=4.0)) == (
-        "Command returns between -20 and 130; mean absolute error 7.2, correlation 0.50. "
+        "You can command returns from -20 to 130 (mean absolute error 7.2, correlation 0.50). "
         "No other returns were measured."
     )
 
 
 def test_summary_of_an_agent_that_follows_at_a_distance() -> None:
     assert answer(report(lambda r: r / 2 - 100, correlation=0.99)) == (
-        "Higher commands obtain more, but not what is commanded: commands from -20 to 130 obtain "
-        "-110 to -35 on average; mean absolute error 7, correlation 0.99."
+        "A higher desired return obtains more, but not the desired return itself: commands from -20 "
+        "to 130 obtain -110 to -35 on average; mean absolute error 7, correlation 0.99."
     )
 
 

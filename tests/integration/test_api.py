@@ -165,5 +165,5 @@ def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     for given in ({"on_evaluation": 3}, {"on_end": ""}, {"callbacks": [print, None]}):
         with pytest.raises(ConfigError, match=f"^{next(iter(given))}: .* is not a function"):
             udrl.train("CartPole-v1", run_dir=tmp_path / "run", **given)
-    with pytest.raises(UdrlError, match="cannot be made"):
+    with pytest.raises(UdrlError, match="cannot be created"):
         udrl.train("Nothing-v0", run_dir=tmp_path / "run")

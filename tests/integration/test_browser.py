@@ -348,7 +348,7 @@ def test_map_shows_the_obeyed_returns(
     report = measure(agent, plan_commands(agent, points=5, episodes=20, temperature=0.0))
     save_report(run_dir, report)
     expect(caption).to_have_text(summary(report), timeout=SOON)
-    expect(caption).to_contain_text("Command returns between 0 and 4")
+    expect(caption).to_contain_text("You can command returns from 0 to 4")
     expect(shaded).to_have_count(1)
     left, right = shaded.bounding_box(), page.locator("#map svg").bounding_box()
     assert left is not None

@@ -64,7 +64,7 @@ def test_obedient_agent_is_reported_as_such(obedient: Path) -> None:
     assert (report.obeyed.low, report.obeyed.high) == (0.0, 4.0)
     assert report.obeyed.correlation > 0.99
     assert text.splitlines()[-1] == answer(report)
-    assert "Command returns between 0 and 4; mean absolute error 0.0" in text
+    assert "You can command returns from 0 to 4 (mean absolute error 0.0" in text
 
 
 def test_output_is_one_document_and_reproducible(run_dir: Path) -> None:

@@ -126,7 +126,7 @@ def test_small_returns_are_distinguishable() -> None:
         buffer=BufferStatus(episodes=3, return_min=0.0, return_mean=0.0123, return_max=1.0),
     )  # fmt: skip
     text = line(small)
-    assert "0.05 ± 0.0098 at 10,000 env steps" in text
+    assert "0.050 ± 0.010 at 10,000 env steps" in text
     assert "lowest return 0.0, mean 0.0123, highest 1.0" in text
 
 

@@ -60,7 +60,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     Attributes:
         observation_space: space of single observations.
         action_space: space of actions.
-        max_episode_steps: time limit of episodes in steps.
+        max_episode_steps: step limit of episodes in steps.
         max_return: the highest possible return, if declared; caps evaluation commands (2.3.2).
         action_mask: number of the observation's leaf with the action mask: 1 for allowed actions,
             otherwise 0, for each of the ``n_parameters``. None: all actions are allowed.
@@ -97,7 +97,7 @@ def make_environment(config: Config) -> Adapter:
     """Return the environment of a run, adapted to the algorithm's spaces.
 
     Raises:
-        UnsupportedEnvironment: it does not exist, cannot be made, has no time limit, or has
+        UnsupportedEnvironment: it does not exist, cannot be created, has no step limit, or has
             unsupported spaces. The message lists all problems with limit and spaces.
     """
     name = config.environment
@@ -117,7 +117,7 @@ def make_environment(config: Config) -> Adapter:
             )
     except Exception as error:
         raise UnsupportedEnvironment(
-            f"environment {name!r} cannot be made: {type(error).__name__}: {error}; "
+            f"environment {name!r} cannot be created: {type(error).__name__}: {error}; "
             f"{_remedy(error, config)}"
         ) from error
     for wrapper in config.wrappers:
@@ -182,7 +182,7 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
         settings: settings of its action space.
 
     Raises:
-        UnsupportedEnvironment: it has no time limit, or unsupported spaces. The message lists all
+        UnsupportedEnvironment: it has no step limit, or unsupported spaces. The message lists all
             problems, and the environment is closed.
     """
     observations = actions = None
@@ -225,7 +225,7 @@ def _remedy(error: Exception, config: Config) -> str:
         return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
     if threading.current_thread() is not threading.main_thread() and _needs_main_thread(text):
         return (
-            "it must be made in the main thread of a process: train without --in-process (in "
+            "it must be created in the main thread of a process: train without --in-process (in "
             "Python: in_process=False), and watch it with udrl play instead of the board"
         )
     if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
@@ -287,7 +287,7 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
 
 
 def _step_limit(env: Environment, config: Config) -> int | None:
-    """Return the time limit of an environment's episodes, in actions; None if it has none."""
+    """Return the step limit of an environment's episodes, in actions; None if it has none."""
     if env.spec is None or env.spec.max_episode_steps is None:
         return None
     if config.max_episode_steps is not None:
@@ -307,7 +307,7 @@ def _steps_per_action(env: Environment) -> int:
 
 
 def limit_steps(env: Environment, max_steps: int) -> None:
-    """Set the time limit of the environment's next episodes, in actions.
+    """Set the step limit of the environment's next episodes, in actions.
 
     This changes Gymnasium's ``TimeLimit`` wrapper instead of counting steps outside, because the
     wrappers outside it must see the truncation (:class:`~udrl.environments.sparse.RewardAtEnd`).

@@ -68,7 +68,7 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
             episode has ended.
         actions: names of the components and values; only in the first moment of an episode.
         over: whether the episode has ended.
-        truncated: whether a time limit ended it.
+        truncated: whether a step limit ended it.
         is_changed: whether the command was changed during the episode.
         paused: whether the episode is paused.
         picture: whether a picture follows.

@@ -69,8 +69,8 @@ def answer(report: ObedienceReport) -> str:
             else "Outside this range, do not expect the commanded return."
         )
         return (
-            f"Command returns between {_exact(found.low)} and {_exact(found.high)}; mean absolute "
-            f"error {error(found.mean_absolute_error)}, correlation {found.correlation:.2f}. "
+            f"You can command returns from {_exact(found.low)} to {_exact(found.high)} (mean "
+            f"absolute error {error(found.mean_absolute_error)}, correlation {found.correlation:.2f}). "
             f"{outside}"
         )
     means = [point.return_mean for point in report.by_return]
@@ -78,8 +78,8 @@ def answer(report: ObedienceReport) -> str:
     over = f"commands from {_exact(every.low)} to {_exact(every.high)}"
     if every.correlation >= _FOLLOWS and varies > report.tolerance:
         return (
-            f"Higher commands obtain more, but not what is commanded: {over} obtain "
-            f"{error(means[0])} to {error(means[-1])} on average; mean absolute error "
+            f"A higher desired return obtains more, but not the desired return itself: {over} "
+            f"obtain {error(means[0])} to {error(means[-1])} on average; mean absolute error "
             f"{error(every.mean_absolute_error)}, correlation {every.correlation:.2f}."
         )
     return (

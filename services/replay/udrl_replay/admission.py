@@ -107,8 +107,8 @@ class Admission:
         if not hello.allow_inexact:
             raise Refused(
                 "other_environment",
-                f"the environment {hello.config.environment} gives other observations or rewards "
-                f"on {request.host} than where the run was created (digest of a short episode: "
+                f"the environment {hello.config.environment} gives different observations or "
+                f"rewards on {request.host} than where the run was created (digest of a short episode: "
                 f"{found or 'none'}, expected {hello.environment_digest}); install the same "
                 f"versions of its package and its dependencies, or create the run with "
                 f"--allow-inexact",

@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from udrl.evaluation import return_text
+from udrl.evaluation import interval_text, return_text
 from udrl_proto.reports import EvaluationStatus, Status, Waiting
 from udrl_proto.text import printable
 
@@ -239,7 +239,7 @@ def _evaluation(result: EvaluationStatus | None) -> list[str]:
         return ["none yet"]
     half = (result.ci95_high - result.ci95_low) / 2
     return [
-        f"mean return {return_text(result.mean)} ± {return_text(half)}",
+        f"mean return {interval_text(result.mean, half)}",
         f"at {result.env_steps:,} env steps",
     ]
 

@@ -12,7 +12,13 @@ export const count = (n, one, many = `${one}s`) => `${number(n)} ${n === 1 ? one
 
 export const command = (desiredReturn, horizon) => `${number(desiredReturn)} in ${count(Math.max(horizon, 1), "step")}`;
 
-export const evaluated = (e) => (e ? `${number(e.mean)} ± ${number((e.ci95_high - e.ci95_low) / 2)}` : "none yet");
+// A mean and the half width of its interval, with as many decimals as that has.
+export function evaluated(e) {
+  if (!e) return "none yet";
+  const half = (e.ci95_high - e.ci95_low) / 2;
+  const decimals = half ? Math.min(Math.max(1, Math.ceil(-Math.log10(half))), 6) : undefined;
+  return `${number(e.mean, decimals)} ± ${number(half, decimals)}`;
+}
 
 export const percent = (share) => `${Math.round(100 * share)} %`;
 

@@ -102,7 +102,7 @@ def play(
             }
             print_json(report)
         else:
-            ending = "" if rollout.terminated else " (time limit reached)"
+            ending = "" if rollout.terminated else " (step limit reached)"
             click.echo(
                 f"seed {rollout.command.environment_seed}: return "
                 f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
