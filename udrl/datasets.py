@@ -167,8 +167,8 @@ def write_dataset(
 ) -> None:
     """Write episodes to a Minari dataset without loss, in the environment's own spaces.
 
-    If the environment cannot be created, they are written in the algorithm's spaces, and the dataset
-    does not name its environment.
+    If the environment cannot be created, they are written in the algorithm's spaces, and the
+    dataset does not name its environment.
 
     Args:
         name: name of the dataset, in Minari's form, e.g. ``LunarLander/udrl-v0``.

@@ -69,8 +69,8 @@ def test_summary_of_an_agent_that_obeys_everywhere() -> None:
 
 def test_summary_of_an_agent_that_follows_at_a_distance() -> None:
     assert answer(report(lambda r: r / 2 - 100, correlation=0.99)) == (
-        "A higher desired return obtains more, but not the desired return itself: commands from -20 "
-        "to 130 obtain -110 to -35 on average; mean absolute error 7, correlation 0.99."
+        "A higher desired return obtains more, but not the desired return itself: commands from "
+        "-20 to 130 obtain -110 to -35 on average; mean absolute error 7, correlation 0.99."
     )
 
 

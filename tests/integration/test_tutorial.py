@@ -17,7 +17,7 @@ BLOCKS = Page("docs/tutorial.md").blocks
 
 #: Parts of the output that differ between machines, and their placeholders.
 _MASKS = [
-    (r"(Command returns|Higher commands|This agent does not) .*", "VERDICT"),
+    (r"(You can command|A higher desired return|This agent does not) .*", "VERDICT"),
     (r"  obeyed$|, cut by its step limit$| \(step limit reached\)$", ""),
     (r"-[0-9a-f]{8}\b", "-ID"),
     (r"-?\d[\d.,]*(?:[:e]-?\d+)*", "N"),
@@ -99,6 +99,7 @@ def test_page_has_files_commands_and_output() -> None:
 
 
 def test_missing_output_is_detected() -> None:
-    shown = "ended:  spent 40 env steps\n...\n  5.2  21  6.20  obeyed\nYou can command returns from 4 to 8."
+    table = "ended:  spent 40 env steps\n...\n  5.2  21  6.20  obeyed\n"
+    shown = f"{table}You can command returns from 4 to 8 (mean absolute error 1)."
     assert masked(shown) == ["ended: spent N env steps", "N N N", "VERDICT"]
     assert masked("spent 40") != masked("spend 40")

@@ -70,8 +70,8 @@ def answer(report: ObedienceReport) -> str:
         )
         return (
             f"You can command returns from {_exact(found.low)} to {_exact(found.high)} (mean "
-            f"absolute error {error(found.mean_absolute_error)}, correlation {found.correlation:.2f}). "
-            f"{outside}"
+            f"absolute error {error(found.mean_absolute_error)}, correlation "
+            f"{found.correlation:.2f}). {outside}"
         )
     means = [point.return_mean for point in report.by_return]
     varies = max(means) - min(means)

@@ -108,8 +108,8 @@ class Admission:
             raise Refused(
                 "other_environment",
                 f"the environment {hello.config.environment} gives different observations or "
-                f"rewards on {request.host} than where the run was created (digest of a short episode: "
-                f"{found or 'none'}, expected {hello.environment_digest}); install the same "
+                f"rewards on {request.host} than where the run was created (digest of a short "
+                f"episode: {found or 'none'}, expected {hello.environment_digest}); install the same "
                 f"versions of its package and its dependencies, or create the run with "
                 f"--allow-inexact",
             )
