@@ -109,8 +109,8 @@ class Admission:
                 "other_environment",
                 f"the environment {hello.config.environment} gives different observations or "
                 f"rewards on {request.host} than where the run was created (digest of a short "
-                f"episode: {found or 'none'}, expected {hello.environment_digest}); install the same "
-                f"versions of its package and its dependencies, or create the run with "
+                f"episode: {found or 'none'}, expected {hello.environment_digest}); install the "
+                f"same versions of its package and its dependencies, or create the run with "
                 f"--allow-inexact",
             )
         self._run.mark_inexact(f"the environment of actor {request.id} behaves differently")
