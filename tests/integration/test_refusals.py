@@ -113,9 +113,7 @@ def test_actor_with_another_environment_digest_is_refused(
     monkeypatch.setattr(
         udrl_actor.actor_service, "environment_digest", lambda _: "0123456789abcdef"
     )
-    with pytest.raises(
-        Refused, match=r"gives different observations.*0123456789abc"
-    ) as no:
+    with pytest.raises(Refused, match=r"gives different observations.*0123456789abc") as no:
         ActorService(hosted.transport, hosted.hello, "other", 1, hosted.stop).run()
     assert no.value.code == "other_environment"
 
