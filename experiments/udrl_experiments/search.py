@@ -29,7 +29,7 @@ from udrl_experiments.protocol import (
     Task,
     shared,
 )
-from udrl_experiments.ray_tune import run_jobs
+from udrl_experiments.ray_tune import run_jobs_on_ray
 from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
 from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
@@ -245,9 +245,9 @@ def _study(
         stop: threading.Event,
         echo: Callable[[str], None],
     ) -> None:
-        run_jobs(planned, root, side_by_side, stop, echo)
+        run_jobs_on_ray(planned, root, side_by_side, stop, echo)
         if longer := finalists(root):
-            run_jobs(longer, root, side_by_side, stop, echo)
+            run_jobs_on_ray(longer, root, side_by_side, stop, echo)
 
     def report(folders: StudyFolders) -> str:
         # A finalist's score also counts evaluations of its longer run, so the finalists may differ

@@ -14,7 +14,7 @@ from udrl.config import Config, build, flat
 from udrl.errors import Interrupted, RunFailed
 from udrl_experiments import jobs
 from udrl_experiments.jobs import Job
-from udrl_experiments.ray_tune import run_jobs
+from udrl_experiments.ray_tune import run_jobs_on_ray
 
 CONFIG = build(Config, {"environment": "CartPole-v1", "eval_every": 100})
 JOBS = [
@@ -72,7 +72,7 @@ def test_each_failed_run_is_one_line_with_its_cause(
     with pytest.raises(
         RunFailed, match=r"no run succeeded; the first failed: .*exit code 1: ValueError: no luck"
     ):
-        run_jobs(JOBS, tmp_path, 1, threading.Event(), lines.append)
+        run_jobs_on_ray(JOBS, tmp_path, 1, threading.Event(), lines.append)
     assert lines[0] == "2 runs on Ray Tune, 1 at a time"
     assert lines[1::2] == [job.described for job in JOBS]
     for line, job in zip(lines[2::2], JOBS, strict=True):
@@ -90,7 +90,7 @@ def test_error_of_ray_is_its_first_line(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(jobs, "run_jobs", die)
     lines: list[str] = []
     with pytest.raises(RunFailed, match=r"the first failed: The actor died unexpectedly\.$"):
-        run_jobs(JOBS[:1], tmp_path, 1, threading.Event(), lines.append)
+        run_jobs_on_ray(JOBS[:1], tmp_path, 1, threading.Event(), lines.append)
     assert lines[2:] == [f"failed: {JOBS[0].described}: The actor died unexpectedly."]
 
 
@@ -104,7 +104,7 @@ def test_some_failed_runs_do_not_fail_the_search(
     monkeypatch.setattr(jobs, "run_jobs", fail_once)
     monkeypatch.setattr(Job, "evaluations", lambda job, root: [])
     lines: list[str] = []
-    run_jobs(JOBS, tmp_path, 1, threading.Event(), lines.append)
+    run_jobs_on_ray(JOBS, tmp_path, 1, threading.Event(), lines.append)
     assert [line for line in lines if line.startswith("failed")] == [
         f"failed: {JOBS[0].described}: no luck"
     ]
@@ -115,5 +115,5 @@ def test_stop_interrupts_the_search(tmp_path: Path) -> None:
     stop.set()
     lines: list[str] = []
     with pytest.raises(Interrupted, match="--resume"):
-        run_jobs(JOBS, tmp_path, 1, stop, lines.append)
+        run_jobs_on_ray(JOBS, tmp_path, 1, stop, lines.append)
     assert "--resume" in lines[-1]
