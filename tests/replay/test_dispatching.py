@@ -262,6 +262,22 @@ def test_failures_on_the_only_actor_are_hopeless(dispatcher: Dispatcher) -> None
     assert [fail(dispatcher, "a") for _ in range(3)] == [False, False, True]
 
 
+def test_failures_on_a_removed_actor_are_not_hopeless_before_another_has_tried(
+    dispatcher: Dispatcher,
+) -> None:
+    assert [fail(dispatcher, "a") for _ in range(3)] == [False] * 3
+    ask(dispatcher, "a", wanted=0, running=ids(0))
+    dispatcher.remove_actor("a")
+    assert not dispatcher.is_hopeless(ids(0)[0])
+    assert fail(dispatcher, "b")
+
+
+def test_actor_that_vanished_with_a_command_has_tried_it(dispatcher: Dispatcher) -> None:
+    ask(dispatcher, "b", wanted=0, running=ids(0))
+    dispatcher.join(join("b"), 0.0)
+    assert [fail(dispatcher, "a") for _ in range(3)] == [False, False, True]
+
+
 def test_failed_command_is_assigned_again(dispatcher: Dispatcher) -> None:
     ask(dispatcher, "a")
     dispatcher.note_failure(ids(0)[0], "a")

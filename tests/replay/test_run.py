@@ -511,7 +511,7 @@ def test_failed_run_has_the_reason(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run()
     for actors in ("ab", "a"):
         fail(run, 2, *actors)
-    assert read_status(tmp_path).ended_because.startswith("failed: command 2 failed three times: ")
+    assert read_status(tmp_path).ended_because.startswith("failed: command 2 failed 3 times: ")
 
 
 def test_stopped_run_differs_from_a_killed_one(
@@ -591,7 +591,7 @@ def test_three_failures_on_two_actors_stop_the_run(make_run: MakeRun) -> None:
     fail(run, 2, "a")
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
-        "command 2 failed three times: no more fuel; reproduce it with: udrl reproduce RUN_DIR 2"
+        "command 2 failed 3 times: no more fuel; reproduce it with: udrl reproduce RUN_DIR 2"
     )
 
 
@@ -649,12 +649,47 @@ def test_command_that_kills_its_actors_stops_the_run(
     assert vanish(run, "f") == {0}
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
-        "command 0 ended three actors that ran nothing else: its environment hangs or "
+        "command 0 ended 3 actors that ran nothing else: its environment hangs or "
         "crashes; reproduce it with: udrl reproduce RUN_DIR 0"
     )
     run = reopened(run)
     finish(run)
     assert result(run) == reference(0, 20)
+
+
+def test_command_that_failed_on_one_actor_only_does_not_stop_the_run_when_it_leaves(
+    make_run: MakeRun,
+) -> None:
+    run = make_run(max_env_steps=20)
+    run.dispatcher.join(join("healthy"), 0.0)
+    for _ in range(3):
+        fail(run, 2, "broken")
+    run.dispatcher.join(join("broken"), 0.0)
+    again = CommandsRequest(actor="broken", wanted=0, running=(2,))
+    run.dispatcher.assign(again, run.progress.latest_version, 0.0)
+    with run.store.transaction():
+        run.remove_actor("broken")
+        run.save()
+    assert run.progress.state == "running"
+    assert run.dispatcher.outstanding[2].ended == []
+    finish(run)
+    assert result(run) == reference(0, 20)
+
+
+@pytest.mark.parametrize("reported_last", [True, False])
+def test_failed_run_has_the_causes_of_all_attempts(reported_last: bool, make_run: MakeRun) -> None:
+    run = make_run()
+    if not reported_last:
+        fail(run, 0, "x")
+    assert vanish(run, "a", "b", "c", "d") == {0}
+    assert vanish(run, "e") == {0}
+    if reported_last:
+        fail(run, 0, "f")
+    cause = "no more fuel" if reported_last else "its environment hangs or crashes"
+    assert run.progress.problem == (
+        "command 0 failed 3 times, 2 of them by ending an actor that ran nothing else: "
+        f"{cause}; reproduce it with: udrl reproduce RUN_DIR 0"
+    )
 
 
 def test_removal_of_an_unknown_actor_has_no_effect(make_run: MakeRun) -> None:

@@ -54,6 +54,11 @@ class Outstanding:
         """Whether it must be run alone, because too many actors vanished with it."""
         return len(self.vanished) >= SUSPICIOUS
 
+    @property
+    def ended(self) -> list[str]:
+        """Names of the actors that vanished while they ran it alone; each counts as a failure."""
+        return [name for name, alone in self.vanished.items() if alone]
+
 
 @dataclass
 class Actor:
@@ -136,11 +141,15 @@ class Dispatcher:
         return [name for name in quiet if name not in here]
 
     def is_hopeless(self, command_id: int) -> bool:
-        """Return whether a command failed so often that the run must stop."""
+        """Return whether a command failed so often that the run must stop.
+
+        A single actor may be at fault itself, so another must have tried the command, too, unless
+        there is none.
+        """
         item = self.outstanding[command_id]
-        failures = [*item.failures, *(name for name, alone in item.vanished.items() if alone)]
-        on_two = len(set(failures)) >= min(2, len(self.actors))
-        return len(failures) >= MAX_FAILURES and on_two
+        failures = [*item.failures, *item.ended]
+        untried = self.actors.keys() - {*item.failures, *item.vanished}
+        return len(failures) >= MAX_FAILURES and (len(set(failures)) >= 2 or not untried)
 
     def _put_back(self, command_id: int, name: str) -> None:
         item = self.outstanding.get(command_id)

@@ -20,7 +20,7 @@ from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import IterationStatus
 from udrl_proto.text import printable
 from udrl_replay.arrival import Arrival
-from udrl_replay.dispatching import SUSPICIOUS
+from udrl_replay.dispatching import SUSPICIOUS, Outstanding
 from udrl_replay.enforcement import Enforcement
 from udrl_replay.progress import STOPPED
 from udrl_replay.run_state import RunState
@@ -164,10 +164,7 @@ class StoredRun(RunState):
         log.warning("%s failed on command %d: %s", failure.actor, failure.command_id, error)
         self.dispatcher.note_failure(failure.command_id, failure.actor)
         if self.dispatcher.is_hopeless(failure.command_id):
-            self._give_up(
-                failure.command_id,
-                f"command {failure.command_id} failed three times: {error}",
-            )
+            self._give_up(self.dispatcher.outstanding[failure.command_id], error)
 
     def remove_actor(self, actor: str) -> None:
         """Remove an actor that is gone; a command that it held may be the cause."""
@@ -179,16 +176,23 @@ class StoredRun(RunState):
                     "command %d was held by %d actors that vanished and is now run alone",
                     command_id, SUSPICIOUS,
                 )  # fmt: skip
-            if self.dispatcher.is_hopeless(command_id):
-                self._give_up(
-                    command_id,
-                    f"command {command_id} ended three actors that ran nothing else: its "
-                    f"environment hangs or crashes",
-                )
+            if actor in item.ended and self.dispatcher.is_hopeless(command_id):
+                self._give_up(item, "its environment hangs or crashes")
 
-    def _give_up(self, command_id: int, why: str) -> None:
+    def _give_up(self, item: Outstanding, cause: str) -> None:
         if self.progress.state == "failed":
             return
+        command_id, ended = item.command.id, len(item.ended)
+        attempts = len(item.failures) + ended
+        if ended == 0:
+            why = f"command {command_id} failed {attempts} times: {cause}"
+        elif ended == attempts:
+            why = f"command {command_id} ended {ended} actors that ran nothing else: {cause}"
+        else:
+            why = (
+                f"command {command_id} failed {attempts} times, {ended} of them by ending an actor "
+                f"that ran nothing else: {cause}"
+            )
         self.progress.state = "failed"
         self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
         log.error("%s", RunFailed(self.progress.problem))
