@@ -137,6 +137,14 @@ def test_throughput_of_the_first_moment_is_finite() -> None:
     assert throughput.per_second(5.0) == 100.0
 
 
+def test_unobserved_throughput_forgets_old_episodes() -> None:
+    throughput = Throughput()
+    for second in range(1000):
+        throughput.add(float(second), 100)
+    assert len(throughput._arrivals) == 11
+    assert throughput.per_second(999.0) == pytest.approx(110.0)
+
+
 # Waits.
 
 

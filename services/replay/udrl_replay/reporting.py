@@ -97,16 +97,21 @@ class Throughput:
 
     def add(self, now: float, steps: int) -> None:
         """Count the steps of an accepted episode."""
+        self._forget(now)  # here, too: no status may ever be requested
         self._arrivals.append((now, steps))
 
     def per_second(self, now: float) -> float:
         """Return the mean rate."""
-        while self._arrivals and now - self._arrivals[0][0] > _WINDOW_S:
-            self._arrivals.popleft()
+        self._forget(now)
         if not self._arrivals:
             return 0.0
         span = max(now - self._arrivals[0][0], 1.0)
         return sum(steps for _, steps in self._arrivals) / span
+
+    def _forget(self, now: float) -> None:
+        """Forget the episodes that arrived too long ago."""
+        while self._arrivals and now - self._arrivals[0][0] > _WINDOW_S:
+            self._arrivals.popleft()
 
 
 class Waits:
