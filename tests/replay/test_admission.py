@@ -117,6 +117,8 @@ def test_quarantined_actors_and_too_many_actors_are_refused(
     monkeypatch.setattr(admission, "MOST_ACTORS", 1)
     one.join(join("a"), 0.0)
     assert refusal(lambda: one.join(join("b"), 0.0)) == "too_many_actors"
+    one.join(join("a"), 1.0)  # its reply was lost
+    assert run.dispatcher.actors["a"].last_seen == 1.0
     one.join(request("learner", "l"), 0.0)
 
 

@@ -53,7 +53,9 @@ class Admission:
             return
         if request.id in run.quarantined:
             raise run.quarantined.refusal(request.id)
-        if len(run.dispatcher.actors) >= MOST_ACTORS:
+        actors = run.dispatcher.actors
+        # An actor whose reply was lost joins again, and is already counted.
+        if request.id not in actors and len(actors) >= MOST_ACTORS:
             raise Refused(
                 "too_many_actors",
                 f"{MOST_ACTORS} actors have joined, the maximum; use fewer actors with more "
