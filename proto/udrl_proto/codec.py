@@ -18,6 +18,8 @@ AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 #: Largest message without arrays or weights, bytes.
 SMALL = 1 << 20
+#: Largest status of a run, bytes; it lists up to 10,000 actors.
+REPORT = 16 << 20
 #: Size of a page of episodes, bytes.
 PAGE = 4 << 20
 #: Largest message, bytes.

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from udrl_proto.codec import LARGEST, PAGE, SMALL
+from udrl_proto.codec import LARGEST, PAGE, REPORT, SMALL
 from udrl_proto.messages import (
     Acknowledged,
     ChangesReply,
@@ -80,7 +80,7 @@ EPISODES = Verb("episodes", EpisodesRequest, EpisodesReply, _LEARNER, PAGE, LARG
 VERSION = Verb("version", VersionMessage, VersionReply, _LEARNER, LARGEST)
 STATE = Verb("state", StateRequest, StateReply, _LEARNER, reply_limit=LARGEST)
 WEIGHTS = Verb("weights", WeightsRequest, Weights, _ACTOR + _OBSERVER, reply_limit=LARGEST)
-STATUS = Verb("status", StatusRequest, Status, _OBSERVER)
+STATUS = Verb("status", StatusRequest, Status, _OBSERVER, reply_limit=REPORT)
 HISTORY = Verb("history", HistoryRequest, History, _OBSERVER)
 CONTENTS = Verb("contents", ContentsRequest, Contents, _OBSERVER)
 

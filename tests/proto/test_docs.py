@@ -17,7 +17,7 @@ from udrl.config import Config, FlatSettings, Keywords
 from udrl.environments import EnvironmentSpec
 from udrl.spaces import Bits, Categories, Category, Image, Leaf, Record, Vector
 from udrl_proto import PROTOCOL, key_expressions, verbs
-from udrl_proto.codec import LARGEST, SMALL
+from udrl_proto.codec import SMALL
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
@@ -149,13 +149,16 @@ def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
 
 
 def test_limits_of_replies_are_described() -> None:
-    large = [v.reply.__name__ for v in verbs.VERBS if v.reply_limit > SMALL]
-    assert {v.reply_limit for v in verbs.VERBS} == {SMALL, LARGEST}
-    most, exceptions, limit = re.findall(
-        r"Replies have at most (.+?), except (.+?): (.+?)\.", PAGE
-    )[0]
-    assert (most, limit) == (size(SMALL), size(LARGEST))
-    assert re.split(r", | and ", exceptions) == large
+    (sentence,) = re.findall(r"Replies have at most (.+?)\.", " ".join(PAGE.split()))
+    described = {}
+    most, *exceptions = re.split(r", except |(?<=B), and ", sentence)
+    for exception in exceptions:
+        replies, limit = exception.split(": ")
+        described |= dict.fromkeys(re.split(r", | and ", replies), limit)
+    assert most == size(SMALL)
+    assert described == {
+        v.reply.__name__: size(v.reply_limit) for v in verbs.VERBS if v.reply_limit > SMALL
+    }
 
 
 def test_every_key_expression_is_described() -> None:

@@ -8,14 +8,17 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from tests.replay.synthetic import arrive, config, episode, finish, join, work
 from udrl.config import Budget
 from udrl.schedule import weights_version
+from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import CommandsRequest
 from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status, Waiting
 from udrl_replay import reporting
+from udrl_replay.dispatching import MOST_ACTORS
 from udrl_replay.reporting import (
     MetricsFile,
     Throughput,
@@ -100,6 +103,31 @@ def test_status_counts_duplicates_and_rejected_episodes(make_run: MakeRun) -> No
     run.reject("a wrong one")
     seen = shown(run).episodes
     assert (seen.delivered, seen.accepted, seen.duplicate, seen.rejected) == (4, 1, 2, 1)
+
+
+def test_largest_status_is_within_its_limit(
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, waits = make_run(), Waits()
+    wide = "\U00020000"  # four bytes in UTF-8
+    for number in range(MOST_ACTORS):
+        name = f"{number:-<100}"
+        host, large = wide * 4000, 2**62
+        run.dispatcher.join(replace(join(name, 65_536), host=host), 0.0)
+        actor = run.dispatcher.actors[name]
+        actor.request = CommandsRequest(
+            actor=name, wanted=0, env_steps_per_s=1e300, weights_version=large
+        )
+        actor.reruns = actor.failures = large
+        waits.begin(f"learner {name}", "actors", f"iteration {large}: no actor is connected", 0.0)
+    run.quarantined.reasons = {f"{number:-<100}": wide * 1000 for number in range(1000)}
+    run.progress.problem = run.progress.inexact_reason = wide * 5000
+    monkeypatch.setattr(run.store, "versions_kept", lambda: range(2**40, 2**40 + 100_000))
+    seen = status(run, Throughput(), waits, 0.0, 1e-3)
+    data = encode(seen)
+    assert len(data) < verbs.STATUS.reply_limit
+    assert decode(data, Status, verbs.STATUS.reply_limit) == seen
+    assert len(seen.actors) == len(seen.waiting) == MOST_ACTORS
 
 
 def test_replay_digest_covers_order_and_content(make_run: MakeRun) -> None:

@@ -38,6 +38,7 @@ from udrl.errors import Refused
 from udrl.replay import Entry
 from udrl.schedule import weights_version
 from udrl_inspect.inspection import read_status
+from udrl_proto.codec import decode, encode
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import Status
 from udrl_replay.arrival import Arrival
@@ -593,6 +594,18 @@ def test_three_failures_on_two_actors_stop_the_run(make_run: MakeRun) -> None:
     assert run.progress.problem == (
         "command 2 failed 3 times: no more fuel; reproduce it with: udrl reproduce RUN_DIR 2"
     )
+
+
+def test_long_error_leaves_room_for_the_remedy(make_run: MakeRun) -> None:
+    run = make_run()
+    for name in ("a", "b", "a"):
+        run.dispatcher.join(join(name), 0.0)
+        request = CommandsRequest(actor=name, wanted=0, running=(2,))
+        run.dispatcher.assign(request, 0, 0.0)
+        run.fail(FailureMessage(actor=name, command_id=2, error=4000 * "\n"))
+    seen = status(run, Throughput(), Waits(), 0.0, 0.0)
+    assert seen.problem.endswith("; reproduce it with: udrl reproduce RUN_DIR 2")
+    assert decode(encode(seen), Status) == seen
 
 
 def test_repeated_failure_counts_once(make_run: MakeRun) -> None:

@@ -37,6 +37,9 @@ log = logging.getLogger("udrl")
 _WINDOW_S = 10.0
 #: Most waits remembered; services that wait need not have joined.
 _MOST_WAITS = 10_000
+#: Most characters of an actor's host name and of other texts in the status. Actors choose the host
+#: name, and a status with long ones of many actors would be larger than observers accept.
+_LONGEST_HOST, _LONGEST_TEXT = 100, 4000
 
 
 class MetricsFile:
@@ -151,7 +154,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
     actors = tuple(
         ActorStatus(
             id=name,
-            host=actor.join.host,
+            host=actor.join.host[:_LONGEST_HOST],
             environments=actor.join.environments,
             env_steps_per_s=round(actor.request.env_steps_per_s, 1),
             weights_version=actor.request.weights_version,
@@ -207,12 +210,12 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         if progress.state == "ended"
         else None,
         exact=progress.exact,
-        inexact_reason=progress.inexact_reason,
+        inexact_reason=progress.inexact_reason[:_LONGEST_TEXT],
         useful_concurrency=episodes_due(config.commands, run.buffer) * (config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
         waiting=waits.list(now),
-        problem=progress.problem,
+        problem=progress.problem[:_LONGEST_TEXT],
         ended_because=progress.why_ended(),
         advice=advice(run),
         audit=AuditStatus(

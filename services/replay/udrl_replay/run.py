@@ -182,6 +182,7 @@ class StoredRun(RunState):
     def _give_up(self, item: Outstanding, cause: str) -> None:
         if self.progress.state == "failed":
             return
+        cause = cause[:3000]  # so that the status has the rest, too
         command_id, ended = item.command.id, len(item.ended)
         attempts = len(item.failures) + ended
         if ended == 0:
