@@ -212,6 +212,94 @@ def test_false_episode_of_before_the_first_audit_stops_the_run(
     assert "actor b delivered a false episode" in run.progress.problem
 
 
+def dispute(run: StoredRun, *, first_is_false: bool = False) -> Command:
+    """Let actors a and b deliver different episodes of a command."""
+    (made,) = ask(run, "a")
+    deliver(run, "a", made, is_false=first_is_false)
+    assert ask(run, "b") == [made]
+    deliver(run, "b", made, is_false=not first_is_false)
+    return made
+
+
+def end(run: StoredRun, max_env_steps: int = 1) -> None:
+    """Deliver everything that a run with a small budget needs, but no audits."""
+    run.budget = Budget(max_env_steps=max_env_steps)
+    while run.progress.state != "ended":
+        work(run)
+
+
+@pytest.mark.parametrize("max_env_steps", [1, 20])
+def test_run_that_ends_with_an_undecided_dispute_is_not_exact(
+    audited_run: StoredRun, max_env_steps: int
+) -> None:
+    made = dispute(audited_run)
+    assert audited_run.progress.exact
+    end(audited_run, max_env_steps)
+    assert audited_run.progress.inexact_reason == (
+        f"two actors ran command {made.id} and their episodes differ; no third actor decided which "
+        f"is wrong"
+    )
+
+
+def test_dispute_that_arises_after_the_end_makes_the_run_inexact(audited_run: StoredRun) -> None:
+    run = audited_run
+    (made,) = ask(run, "a")
+    deliver(run, "a", made)
+    ask(run, "b")
+    end(run)
+    assert run.progress.exact
+    deliver(run, "b", made, is_false=True)
+    assert "no third actor decided" in run.progress.inexact_reason
+
+
+@pytest.mark.parametrize("first_is_false", [True, False])
+def test_dispute_that_is_decided_after_the_end(
+    first_is_false: bool, audited_run: StoredRun, reopened: Callable[..., StoredRun]
+) -> None:
+    run = audited_run
+    made = dispute(run, first_is_false=first_is_false)
+    assert ask(run, "c") == [made]
+    end(run)
+    assert run.progress.exact, "it may still be decided"
+    deliver(run, "c", made)
+    with run.store.transaction():
+        run.stop()
+    again = reopened(run).progress
+    assert (again.state, again.deceived, again.problem) == ("ended", False, "")
+    assert set(run.quarantined.reasons) == {"a" if first_is_false else "b"}
+    assert again.exact is not first_is_false
+    if first_is_false:
+        assert again.inexact_reason.startswith("actor a delivered a false episode: its episode")
+
+
+def test_failed_run_with_a_false_episode_cannot_be_resumed(
+    audited_run: StoredRun, tmp_path: Path
+) -> None:
+    run = audited_run
+    made = dispute(run, first_is_false=True)
+    assert ask(run, "c") == [made]
+    run.progress.state, run.progress.problem = "failed", "command 2 failed 3 times"
+    deliver(run, "c", made)
+    assert run.progress.state == "failed"
+    run.store.close()
+    with (
+        closing(Store(tmp_path)) as store,
+        pytest.raises(Deceived, match="actor a delivered a false episode"),
+    ):
+        StoredRun(store, run.budget)
+
+
+def test_run_that_stops_with_an_undecided_dispute_is_not_exact(
+    audited_run: StoredRun, reopened: Callable[..., StoredRun]
+) -> None:
+    run = audited_run
+    made = dispute(run)
+    assert ask(run, "c") == [made]
+    with run.store.transaction():
+        run.stop()
+    assert "no third actor decided" in reopened(run).progress.inexact_reason
+
+
 def test_nondeterministic_environment_leads_to_no_quarantine(audited_run: StoredRun) -> None:
     run = audited_run
     (made,) = ask(run, "a")

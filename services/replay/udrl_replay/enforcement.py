@@ -59,6 +59,8 @@ class Enforcement:
             log.warning(
                 "two actors differ on command %d; a third run decides which is wrong", command_id
             )
+            if run.progress.state == "ended":
+                self.mark_undecided()
         elif verdict is None:
             run.progress.agreed += 1
         elif verdict.wrong_actor is None:
@@ -77,15 +79,34 @@ class Enforcement:
         why = f"its episode of command {command_id} differs from those of two other actors"
         self.quarantine(actor, why)
         progress = self._run.progress
-        if actor in self._entered and progress.state not in ("ended", "failed"):
-            progress.state = "failed"
-            progress.deceived = True
-            progress.problem = (
-                f"actor {actor} delivered a false episode: {why}. Since iteration "
-                f"{self._entered[actor]} the run has learned from its episodes; start a "
-                f"new run without it, in another --run-dir"
-            )
-            log.error("%s", progress.problem)
+        if actor not in self._entered or progress.deceived:
+            return
+        found = (
+            f"actor {actor} delivered a false episode: {why}. Since iteration "
+            f"{self._entered[actor]} the run has learned from its episodes"
+        )
+        if progress.state == "ended":
+            self._run.mark_inexact(found)
+            return
+        # Also if the run has failed for another reason: otherwise it could be resumed.
+        progress.state = "failed"
+        progress.deceived = True
+        progress.problem = f"{found}; start a new run without it, in another --run-dir"
+        log.error("%s", progress.problem)
+
+    def mark_undecided(self, *, stops: bool = False) -> None:
+        """Mark the run inexact if two actors differ on a command and no third will decide.
+
+        Args:
+            stops: whether the replay service stops, so that not even an actor that is running the
+                command now can decide.
+        """
+        for command_id, audit in self._run.auditor.open.items():
+            if audit.is_disputed and (stops or not audit.at):
+                self._run.mark_inexact(
+                    f"two actors ran command {command_id} and their episodes differ; no third "
+                    f"actor decided which is wrong"
+                )
 
     def count_offence(self, actor: str, what: str) -> None:
         """Count an invalid delivery; quarantine the actor after too many."""

@@ -33,7 +33,7 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         problem: why the run failed.
         ended_because: why the run ended, or :data:`STOPPED`.
         deceived: whether the run failed because it learned from episodes of an actor that
-            delivered false ones.
+            delivered false ones; it cannot be resumed.
         audit: share of the episodes that are audited.
         agreed: number of audits in which both episodes were equal.
     """

@@ -75,6 +75,7 @@ class StoredRun(RunState):
 
     def stop(self) -> None:
         """Mark the run as stopped, for processes that read its file."""
+        self.enforcement.mark_undecided(stops=True)  # open audits are lost
         if self.progress.state in ("running", "finishing"):
             self.progress.ended_because = STOPPED
         self.save()
@@ -322,7 +323,7 @@ class StoredRun(RunState):
         """Issue the final evaluation if version N has arrived; version 0 is not evaluated."""
         final = self.progress.iteration
         if final == 0:
-            self.progress.state = "ended"
+            self._end()
         elif self.progress.latest_version == final:
             self._issue(self.sampler.evaluate_final(final, self.buffer))
 
@@ -337,7 +338,11 @@ class StoredRun(RunState):
         self.store.remove_episodes(e.id for e in entries)
         self.store.remove_commands(c.id for c in commands)
         self.progress.wall_s = self.wall_s
+        self._end()
+
+    def _end(self) -> None:
         self.progress.state = "ended"
+        self.enforcement.mark_undecided()  # no more audits are assigned
 
     def _final_commands(self) -> list[Command]:
         return [c for c in self.open_commands() if c.index >= FINAL_EVALUATION]
