@@ -17,7 +17,7 @@ import msgspec
 
 from udrl.atomic_files import replacing
 from udrl.errors import ConfigError, DamagedStore, OtherConfiguration, RunInUse, StoreError
-from udrl_replay.remedies import remedy
+from udrl_replay.remedies import database_remedy, primary_code, remedy
 from udrl_replay.schema import SCHEMA, SEALED, TABLES, Value, marks, seal
 from udrl_replay.tallies import TALLIES, Tallies, Tally
 
@@ -203,12 +203,13 @@ class Database:
             raise self._fault(error) from error
 
     def _fault(self, error: sqlite3.Error) -> StoreError:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
+        if primary_code(error) in _DAMAGE:
             return self._damaged(error)
-        what_to_do = remedy(error, "free some disk space or repair the disk")
+        what_to_do = database_remedy(error, read_only=self.read_only)
+        if self.read_only:
+            return StoreError(f"{self._path} cannot be read: {error}; {what_to_do}")
         return StoreError(
-            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: {what_to_do}, "
-            f"and restart with --resume"
+            f"{self._path} cannot be used: {error}; nothing acknowledged is lost: {what_to_do}"
         )
 
     def _damaged(self, what: object) -> DamagedStore:

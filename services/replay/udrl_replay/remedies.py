@@ -1,4 +1,4 @@
-"""Remedies if a file of a run cannot be written."""
+"""Remedies if a file of a run cannot be read or written."""
 
 import errno
 import os
@@ -9,12 +9,49 @@ from udrl.errors import StoreError
 
 _OUT_OF_FILES = {errno.EMFILE, errno.ENFILE}
 
+_CLOSE = "close the other program that uses the file"
+_PERMIT = "make the file and its directory readable and writable"
+#: By SQLite's primary result codes, what to do before the file can be used again.
+_REMEDIES = {
+    sqlite3.SQLITE_BUSY: _CLOSE,
+    sqlite3.SQLITE_LOCKED: _CLOSE,
+    sqlite3.SQLITE_PROTOCOL: _CLOSE,
+    sqlite3.SQLITE_PERM: _PERMIT,
+    sqlite3.SQLITE_READONLY: _PERMIT,
+    sqlite3.SQLITE_CANTOPEN: _PERMIT,
+    sqlite3.SQLITE_FULL: "free some disk space",
+    sqlite3.SQLITE_IOERR: "repair the disk, or raise its quota",
+    sqlite3.SQLITE_NOMEM: "free some memory",
+}
+
 
 def remedy(error: OSError | sqlite3.Error, otherwise: str) -> str:
     """Return the remedy for an error: ``otherwise``, unless there are too many open files."""
     if _is_out_of_files(error):
         return "raise the limit of open files, e.g. ulimit -n 4096"
     return otherwise
+
+
+def database_remedy(error: sqlite3.Error, *, read_only: bool) -> str:
+    """Return the remedy if a run's file cannot be used.
+
+    Args:
+        error: the reason.
+        read_only: whether the file was only to be read, e.g. by ``udrl status``.
+    """
+    code = primary_code(error)
+    if code == sqlite3.SQLITE_TOOBIG:  # it would be as big again
+        return (
+            "a row has at most 1 GB; start a new run with a smaller network or shorter episodes, "
+            "in another --run-dir"
+        )
+    first = remedy(error, _REMEDIES.get(code, "check the disk and the file"))
+    return f"{first}, and {'try again' if read_only else 'restart with --resume'}"
+
+
+def primary_code(error: sqlite3.Error) -> int:
+    """Return SQLite's primary result code; 0: the error is not SQLite's."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
 def _is_out_of_files(error: OSError | sqlite3.Error) -> bool:
