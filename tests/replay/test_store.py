@@ -1,5 +1,8 @@
 """The file of a run: atomic creation, one writer, transactions."""
 
+import errno
+import fcntl
+import os
 import sqlite3
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
@@ -80,6 +83,20 @@ def test_second_writer_is_refused(store: Store, tmp_path: Path) -> None:
         Store(tmp_path)
     with pytest.raises(RunInUse):
         create(tmp_path)
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP])
+def test_file_system_without_locks_is_not_reported_as_a_second_writer(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    expected = rf"{tmp_path} cannot be locked: .* not support locks \(.*\); use a --run-dir on a"
+    with pytest.raises(StoreError, match=expected) as refused:
+        create(tmp_path)
+    assert not isinstance(refused.value, RunInUse)
 
 
 def test_file_can_be_reopened_after_its_writer_closed_it(store: Store, tmp_path: Path) -> None:

@@ -300,12 +300,18 @@ def _lock(run_dir: Path) -> Any:
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             if time.monotonic() < deadline:  # is_locked() in another process may hold it briefly
                 time.sleep(_LOOK_S / 10)
                 continue
             file.close()
             raise RunInUse(
                 f"{run_dir} is in use by another replay service; stop it, or use another --run-dir"
+            ) from error
+        except OSError as error:
+            file.close()
+            raise StoreError(
+                f"{run_dir} cannot be locked: its file system does not support locks ({error}); "
+                f"use a --run-dir on a local disk"
             ) from error
         return file
