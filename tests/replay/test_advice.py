@@ -1,12 +1,13 @@
 """Advice for runs that do not learn."""
 
+import re
 from collections.abc import Callable
 
 import msgspec
 import pytest
 
 from tests.replay.synthetic import finish
-from udrl.config import Budget
+from udrl.config import Budget, change
 from udrl.setting_groups import NetworkSettings
 from udrl_launch.training_run import Adviser
 from udrl_proto.reports import IterationStatus
@@ -75,6 +76,31 @@ def test_most_likely_cause(
         msgspec.structs.replace(NETWORK, **network), msgspec.structs.replace(WARM_UP, **warm_up)
     )
     assert found.startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("network", "warm_up", "expected"),
+    [
+        ({}, {}, "more env steps (--max-env-steps), a dataset with more or better episodes or"),
+        ({}, {"return_min": 0.0, "return_max": 0.0, "explored_return": 0.0},
+         "all episodes of the dataset have the same return, so there are no better ones to learn "
+         "from; start with a dataset that has better ones, too"),
+        ({"return_scale": 0.001}, {}, "it scales the dataset's typical returns of 22 to"),
+    ],
+)  # fmt: skip
+def test_advice_for_a_run_with_a_dataset_does_not_name_the_warm_up(
+    network: dict[str, float], warm_up: dict[str, float], expected: str, run: StoredRun
+) -> None:
+    found = cause(
+        msgspec.structs.replace(NETWORK, **network),
+        msgspec.structs.replace(WARM_UP, **warm_up),
+        has_dataset=True,
+    )
+    assert expected in found
+    run.config = change(run.config, dataset="mine-v0")
+    assert "the dataset's mean return" in advice(run)
+    for text in (found, advice(run)):
+        assert not re.search(r"warm.up", text)
 
 
 def test_advice_is_logged_once(run: StoredRun, caplog: pytest.LogCaptureFixture) -> None:
