@@ -150,7 +150,7 @@ def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
 
 def test_limits_of_replies_are_described() -> None:
     (sentence,) = re.findall(r"Replies have at most (.+?)\.", " ".join(PAGE.split()))
-    described = {}
+    described: dict[str, str] = {}
     most, *exceptions = re.split(r", except |(?<=B), and ", sentence)
     for exception in exceptions:
         replies, limit = exception.split(": ")
