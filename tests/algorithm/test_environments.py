@@ -192,6 +192,37 @@ def test_max_return_is_from_setting_then_instance_then_metadata(
     assert specify(make(blank), settings(blank)).max_return == 7.0
 
 
+@pytest.mark.parametrize(
+    "declared",
+    [np.inf, np.float32("nan"), 10**400, "500", print, [1.0], 1j],
+    ids=lambda value: str(value)[:10],
+)
+def test_declared_max_return_must_be_a_finite_number(register: Register, declared: Any) -> None:
+    """JSON has neither infinity nor NaN: stored as null, it would differ from what actors find."""
+
+    def factory() -> Blank:
+        blank = Blank(VECTOR, spaces.Discrete(2))
+        blank.metadata["max_return"] = declared
+        return blank
+
+    name = register(factory)
+    with pytest.raises(
+        UnsupportedEnvironment, match=r"max_return = .*expected a finite number.*--set max_return="
+    ):
+        specify(make(name), settings(name))
+    assert specify(make(name), settings(name, max_return=3.0)).max_return == 3.0
+
+
+def test_declared_max_return_may_be_any_kind_of_number(register: Register) -> None:
+    def factory() -> Blank:
+        blank = Blank(VECTOR, spaces.Discrete(2))
+        blank.metadata["max_return"] = np.float32(2.5)
+        return blank
+
+    name = register(factory)
+    assert specify(make(name), settings(name)).max_return == 2.5
+
+
 def test_discrete_observation_with_offset_is_shifted_to_zero(register: Register) -> None:
     name = register(lambda: Blank(spaces.Discrete(3, start=-1), spaces.Discrete(2)))
     env = make(name)

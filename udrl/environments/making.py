@@ -6,6 +6,7 @@ of :mod:`udrl.actions`. Errors for unsupported spaces list the supported ones.
 
 import ast
 import errno
+import math
 import os
 import threading
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from udrl.actions import ActionSpace
 from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
-from udrl.environments.conversions import observation_conversion
+from udrl.environments.conversions import describe, observation_conversion
 from udrl.environments.masking import MASK, ObserveMask, below_observation
 from udrl.environments.previous import ObservePrevious
 from udrl.environments.time_left import ObserveTime
@@ -249,19 +250,41 @@ def _needs_main_thread(text: str) -> bool:
 
 
 def specify(env: Environment, config: Config) -> EnvironmentSpec:
-    """Return the specification of an environment from :func:`make_environment`."""
+    """Return the specification of an environment from :func:`make_environment`.
+
+    Raises:
+        UnsupportedEnvironment: it declares an invalid ``max_return``, or has no such action mask.
+    """
     longest = _step_limit(env, config)
     assert longest is not None
     space, actions = (env.get_wrapper_attr(name).plain for name in ("observations", "actions"))
-    declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
-    max_return = config.max_return if config.max_return is not None else declared
     return EnvironmentSpec(
         observation_space=space,
         action_space=actions,
         action_mask=_mask(config, space, actions),
         max_episode_steps=longest,
-        max_return=None if max_return is None else float(max_return),
+        max_return=_max_return(env, config),
     )
+
+
+def _max_return(env: Environment, config: Config) -> float | None:
+    """Return the highest possible return: the setting, or what the environment declares."""
+    if config.max_return is not None:
+        return config.max_return
+    declared = getattr(env.unwrapped, "max_return", env.metadata.get("max_return"))
+    if declared is None:
+        return None
+    try:
+        number = math.nan if isinstance(declared, str | bytes) else float(declared)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise UnsupportedEnvironment(
+            f"environment {config.environment!r} declares max_return = {describe(declared)}, "
+            f"expected a finite number, or no declaration if there is no highest return; correct "
+            f"it in the environment or its metadata, or override it, e.g. --set max_return=500"
+        )
+    return number
 
 
 def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int | None:
