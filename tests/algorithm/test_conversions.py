@@ -162,6 +162,39 @@ def test_undeclared_bounds_can_be_configured() -> None:
     assert [conversion.back_one([k, k]).tolist() for k in range(3)] == [[-5, 0], [-2, 3.5], [1, 7]]
 
 
+INTEGERS = spaces.Box(-np.inf, np.inf, (1,), np.int64)
+
+
+@pytest.mark.parametrize(
+    ("space", "bins"),
+    [
+        (INTEGERS, [-5, 1, 7]),
+        (spaces.Box(INTEGERS.low, INTEGERS.high, dtype=np.int64), [-5, 1, 7]),
+        (spaces.Box(-np.inf, np.inf, (1,), np.int8), [-5, 1, 7]),
+        (spaces.Box(0, np.inf, (1,), np.int32), [0, 4, 7]),
+        (spaces.Box(-np.inf, 3, (1,), np.int32), [-5, -1, 3]),
+        (spaces.Box(0, 2**64 - 1, (1,), np.uint64), [0, 4, 7]),
+        (spaces.Box(-128, 127, (1,), np.int8), [-128, 0, 127]),
+        (spaces.Box(0, 255, (1,), np.uint8), [0, 128, 255]),
+    ],
+    ids=["int64", "copied bounds", "int8", "no higher", "no lower", "uint64", "all int8", "bytes"],
+)
+def test_undeclared_bounds_of_integers_can_be_configured(space: AnySpace, bins: list[int]) -> None:
+    """Gymnasium replaces infinite bounds of integers by the limits of their dtype."""
+    given_ = ActionSettings(action_low=-5, action_high=7, action_bins=3)
+    conversion = action_conversion(space, given_)
+    assert [conversion.back_one([k]).tolist() for k in range(3)] == [[b] for b in bins]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1000, 7), (-5, 128), (-5, 127.5)])
+def test_configured_bounds_must_fit_the_dtype(low: float, high: float) -> None:
+    space = spaces.Box(-np.inf, np.inf, (1,), np.int8)
+    with pytest.raises(
+        UnsupportedEnvironment, match=rf"its action\[0\] is from {low} to {high}.*int8.*-128 to 127"
+    ):
+        action_conversion(space, ActionSettings(action_low=low, action_high=high))
+
+
 DICT = spaces.Dict(
     inventory=spaces.Tuple((spaces.Discrete(3), spaces.Box(-1, 1, (2,)), spaces.MultiBinary(2))),
     map=spaces.Box(0, 255, (4, 4), np.uint8),
@@ -244,6 +277,7 @@ def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, mess
             r"its action\[0\] has no bounds.*--set action_low=-1 --set action_high=1",
             None,
         ),
+        (spaces.Box(-np.inf, 5, (2,), np.int64), r"its action\[0\] has no bounds", None),
         (
             spaces.Dict(a=spaces.Box(1, 1, (2,))),
             r"its action\['a'\]\[0\] is from 1 to 1; expected",

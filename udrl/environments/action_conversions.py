@@ -179,10 +179,7 @@ def _of_leaf(
 
 
 def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -> Conversion:
-    low, high = (
-        np.where(np.isfinite(bound), bound, np.nan if given is None else given).astype(np.float64)
-        for bound, given in ((space.low, settings.action_low), (space.high, settings.action_high))
-    )
+    low, high = _bounds(space, settings)
     missing = np.isnan(low) | np.isnan(high)
     if missing.any():
         place = np.argwhere(missing)[0].tolist()
@@ -197,8 +194,38 @@ def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -
             f"expected a lower bound below the higher one"
         )
     whole = np.issubdtype(space.dtype, np.integer)
+    if whole:
+        limits = np.iinfo(space.dtype.name)
+        outside = (np.rint(low) < limits.min) | (np.rint(high) >= float(limits.max) + 1)
+        if outside.any():
+            place = np.argwhere(outside)[0].tolist()
+            raise UnsupportedEnvironment(
+                f"its {name}{place} is from {low[tuple(place)]:g} to {high[tuple(place)]:g}; "
+                f"expected numbers that its dtype {space.dtype} can hold, {limits.min} to "
+                f"{limits.max}; set action_low and action_high accordingly"
+            )
     values = [
         np.unique(np.rint(v)) if whole else v
         for v in np.linspace(low.reshape(-1), high.reshape(-1), bins, axis=1)
     ]
     return _Bins(name, space, [v.astype(space.dtype) for v in values])
+
+
+def _bounds(space: spaces.Box, settings: ActionSettings) -> tuple[Array, Array]:
+    """Return the bounds of each dimension, float64; NaN if it is neither declared nor set."""
+    below, above = space.bounded_below.copy(), space.bounded_above.copy()
+    if space.dtype.kind in "iu" and space.dtype.itemsize >= 4:
+        # Gymnasium replaces infinite bounds of integers by the limits of their dtype, and a wrapper
+        # that copies them loses the flags. Only small integers may really have these bounds.
+        limits = np.iinfo(space.dtype.name)
+        above &= space.high.astype(np.float64) < float(limits.max)
+        if limits.min < 0:
+            below &= space.low > limits.min
+    low, high = (
+        np.where(declared & np.isfinite(bound), bound, np.nan if given is None else float(given))
+        for declared, bound, given in (
+            (below, space.low, settings.action_low),
+            (above, space.high, settings.action_high),
+        )
+    )
+    return low.astype(np.float64), high.astype(np.float64)
