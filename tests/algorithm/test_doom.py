@@ -2,6 +2,7 @@
 
 import builtins
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -140,6 +141,51 @@ def test_other_scenarios_and_scenario_files(doom: Callable[..., Doom], tmp_path:
         doom(scenario="nowhere")
     with pytest.raises(ValueError, match="height = 121, width = 32: the screen is 120 x 160"):
         doom(height=121)
+
+
+@pytest.mark.parametrize("frame_skip", [0, -1, 1.5, "4", None])
+def test_frame_skip_must_be_a_positive_integer(doom: Callable[..., Doom], frame_skip: Any) -> None:
+    with pytest.raises(ValueError, match=r"frame_skip = .*: expected an integer, 1 or more"):
+        doom(frame_skip=frame_skip)
+
+
+def error_of_scenario(path: Path, content: str) -> str:
+    """Return the error for a scenario file with this content; check that no engine remains."""
+    path.write_text(content)
+    before = set(engines(os.getpid()))
+    with pytest.raises(UnsupportedEnvironment) as caught:
+        make_environment(
+            build(Config, {"environment": "Doom-v0", "environment_kwargs": {"scenario": str(path)}})
+        )
+    wait_until(lambda: set(engines(os.getpid())) <= before)
+    assert str(path) in str(caught.value)
+    assert "pip install" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_missing_file_of_a_scenario_is_named(tmp_path: Path) -> None:
+    content = "doom_scenario_path = nowhere.wad\navailable_buttons = { MOVE_LEFT }\n"
+    message = error_of_scenario(tmp_path / "mine.cfg", content)
+    assert re.search(
+        r"nowhere\.wad\" does not exist.*correct the files.*doom_scenario_path", message
+    )
+
+
+def test_scenario_without_buttons_is_rejected_with_the_remedy(tmp_path: Path) -> None:
+    message = error_of_scenario(tmp_path / "mine.cfg", "no { scenario\n")
+    assert "it has no buttons; name at least one that ViZDoom has as available_buttons" in message
+
+
+def test_engine_that_does_not_start_is_reported_with_what_it_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(game: Any, folder: str) -> None:
+        raise OSError("libopenal.so.1: cannot open shared object file")
+
+    monkeypatch.setattr("udrl.environments.doom._start", broken)
+    with pytest.raises(UnsupportedEnvironment, match=r"libopenal.*--force-reinstall vizdoom") as e:
+        make_environment(take_cover())
+    assert "udrl[doom]" not in str(e.value)
 
 
 def test_close_ends_the_engine(doom: Callable[..., Doom]) -> None:

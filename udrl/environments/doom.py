@@ -37,8 +37,9 @@ class Doom(gym.Env[Image, np.int64]):
         render_mode: ``rgb_array``, or None.
 
     Raises:
-        gymnasium.error.DependencyNotInstalled: ViZDoom is not installed, or does not work.
-        ValueError: there is no such scenario, or the size is too large.
+        gymnasium.error.DependencyNotInstalled: ViZDoom cannot be imported.
+        ValueError: there is no such scenario, it has no buttons, or another argument is invalid.
+        RuntimeError: the engine does not start with the scenario.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 35}
@@ -61,7 +62,7 @@ class Doom(gym.Env[Image, np.int64]):
             )
         self.render_mode = render_mode
         self.max_return = max_return
-        self._frame_skip = frame_skip
+        self._frame_skip = _tics(frame_skip)
         self._shrink = AreaAverage(*_SCREEN, height, width)
         self._game, self._folder = _open(scenario, colour=colour)
         n = self._game.get_available_buttons_size()
@@ -105,6 +106,14 @@ class Doom(gym.Env[Image, np.int64]):
         return self._shrink(self._screen)
 
 
+def _tics(frame_skip: Any) -> int:
+    if not isinstance(frame_skip, int | np.integer) or frame_skip < 1:
+        raise ValueError(
+            f"frame_skip = {frame_skip!r}: expected an integer, 1 or more; 1 acts in every tic"
+        )
+    return int(frame_skip)
+
+
 def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirectory[str]]:
     """Start an engine; return it and its working directory."""
     try:
@@ -130,14 +139,32 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
         game.set_window_visible(False)
         game.set_sound_enabled(False)
         _start(game, folder.name)
+        n = game.get_available_buttons_size()
     except Exception as error:
-        with contextlib.suppress(Exception):
-            game.close()
-        folder.cleanup()
-        raise gym.error.DependencyNotInstalled(
-            f"vizdoom's engine does not start: {type(error).__name__}: {error}"
+        _discard(game, folder)
+        remedy = (
+            "reinstall it: pip install --force-reinstall vizdoom"
+            if path == shipped
+            else "correct the files and the map that it names, such as doom_scenario_path"
+        )
+        raise RuntimeError(
+            f"scenario {str(path)!r}: ViZDoom does not start with it: {type(error).__name__}: "
+            f"{error}; {remedy}"
         ) from error
+    if n == 0:
+        _discard(game, folder)
+        raise ValueError(
+            f"scenario {str(path)!r}: it has no buttons; name at least one that ViZDoom has as "
+            f"available_buttons, e.g. available_buttons = {{ MOVE_LEFT MOVE_RIGHT }}"
+        )
     return game, folder
+
+
+def _discard(game: Any, folder: tempfile.TemporaryDirectory[str]) -> None:
+    """Stop a game's engine, if it runs, and remove its working directory."""
+    with contextlib.suppress(Exception):
+        game.close()
+    folder.cleanup()
 
 
 def _start(game: Any, folder: str) -> None:
