@@ -156,11 +156,12 @@ def with_offered_mask(config: Config, automatic: Collection[str]) -> Config:
         return config
     with closing(make_environment(config)) as env:
         actions: ActionSpace = env.get_wrapper_attr("actions").plain
-        n = actions.n_parameters
+        components = actions.components
         try:
-            mask = mask_in(env.reset(seed=_SEED)[1], n, "reset")
+            mask = mask_in(env.reset(seed=_SEED)[1], components, "reset", is_over=False)
             allowed = random_actions(actions, mask[None], np.zeros((1, *actions.shape)))
-            mask_in(env.step(allowed[0])[4], n, "step")
+            _, _, terminated, truncated, info = env.step(allowed[0])
+            mask_in(info, components, "step", is_over=terminated or truncated)
         except Exception as error:  # noqa: BLE001 - random episodes will show other faults
             log.debug("%s offers no action mask: %s", config.environment, error)
             return config

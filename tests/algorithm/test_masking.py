@@ -32,7 +32,7 @@ class Doors(gym.Env[Any, Any]):
         self.observation_space: spaces.Space[Any] = seen
         if shows:
             self.observation_space = spaces.Dict(
-                doors=spaces.Box(0, 1, (6 if two else 4,), np.int8), time=seen
+                doors=spaces.Box(0, 1, (6 if two else 4,)), time=seen
             )
 
     def _returned(self) -> tuple[Any, dict[str, Any]]:
@@ -42,8 +42,14 @@ class Doors(gym.Env[Any, Any]):
         if self.two:
             mask = (self.open, np.array([0, 1], np.int8))
         time = np.array([self.t / 6], np.float32)
-        if self.fault == "none open":
+        if self.fault == "none open" or (self.fault == "none open at last" and self.t == 6):
             mask = np.zeros(4, np.int8)
+        if self.fault == "second closed":
+            mask = (self.open, np.zeros(2, np.int8))
+        if self.fault == "half open":
+            mask = np.array([1.0, 0.0, 1.0, 0.5], np.float32)
+        if self.fault == "wide open":
+            mask = np.array([256, 1, 2, 1])
         if self.fault == "too short":
             mask = np.ones(3, np.int8)
         absent = self.fault == "no mask" or (self.fault == "only at reset" and self.t > 0)
@@ -105,6 +111,8 @@ def test_run_takes_allowed_actions_only(
         ({"fault": "no mask"}, None),
         ({"fault": "too short"}, None),
         ({"fault": "only at reset"}, None),
+        ({"fault": "none open"}, None),
+        ({"fault": "half open"}, None),
     ],
 )
 def test_automatic_mask_is_the_one_that_the_environment_offers(
@@ -165,6 +173,37 @@ def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], mess
     commands = CommandSampler(config(), generator.spec).warm_up()
     with pytest.raises(EnvironmentFault, match=message):
         generate_episodes(generator, commands, None)
+
+
+@pytest.mark.parametrize("previous", [False, True])
+@pytest.mark.parametrize(("mask", "shows"), [("info", False), ("doors", True)])
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("half open", r"0\.5 as number 3 of MASK, expected 0 or 1"),
+        ("wide open", r"256\b.* as number 0 of MASK, expected 0 or 1"),
+        ("none open", r"no 1 in MASK, so no action is allowed; expected at least one"),
+        ("second closed", r"no 1 in the numbers 4 to 5 of MASK, so no action is allowed"),
+    ],
+)
+def test_mask_has_zeros_and_ones_and_allows_an_action(
+    fault: str, message: str, mask: str, shows: bool, previous: bool
+) -> None:
+    given = {"fault": fault, "shows": shows, "two": fault == "second closed"}
+    name = r"info\['action_mask'\]" if mask == "info" else r"observation\['doors'\]"
+    env = make_environment(config(mask, given, observe_previous=previous))
+    with pytest.raises(
+        EnvironmentFault, match=r"reset\(\) returned " + message.replace("MASK", name)
+    ):
+        env.reset(seed=1)
+
+
+@pytest.mark.parametrize(("mask", "shows"), [("info", False), ("doors", True)])
+def test_mask_after_the_last_step_may_allow_no_action(mask: str, shows: bool) -> None:
+    settings = config(mask, {"fault": "none open at last", "shows": shows})
+    generator = EpisodeGenerator(settings, 1)
+    commands = CommandSampler(settings, generator.spec).warm_up()[:2]
+    assert [e.length for e in generate_episodes(generator, commands, None)] == [6, 6]
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, close
 from udrl.environments.conversions import describe, observation_conversion
-from udrl.environments.masking import MASK, ObserveMask, below_observation
+from udrl.environments.masking import MASK, CheckMask, ObserveMask, below_observation
 from udrl.environments.previous import ObservePrevious
 from udrl.environments.time_left import ObserveTime
 from udrl.errors import UnsupportedEnvironment
@@ -192,8 +192,8 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
         actions = action_conversion(env.action_space, settings)
     except UnsupportedEnvironment as error:
         problems.append(str(error))
-    if actions is not None and settings.action_mask == "info":
-        env = ObserveMask(env, actions.plain.n_parameters)
+    if actions is not None and settings.action_mask is not None:
+        env = _with_checked_mask(env, settings.action_mask, actions.plain.components)
     try:
         observations = observation_conversion(env.observation_space)
     except UnsupportedEnvironment as error:
@@ -207,6 +207,14 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
         close(env)
         raise UnsupportedEnvironment(f"environment {name!r}: {'; also, '.join(problems)}")
     return Adapter(env, observations, actions)
+
+
+def _with_checked_mask(
+    env: Environment, action_mask: str, components: tuple[int, ...]
+) -> Environment:
+    if action_mask == "info":
+        return ObserveMask(env, components)
+    return CheckMask(env, action_mask, components)
 
 
 def _remedy(error: Exception, config: Config) -> str:
