@@ -4,6 +4,7 @@ With ``lead = 0``, the distributed system's results are bit-identical to this fi
 """
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 
 from udrl.acting import EpisodeGenerator, generate_episodes
@@ -96,7 +97,13 @@ def algorithm1(
             f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
         )
     config = resolve_arithmetic(resolve_automatic(config, automatic))
-    generator = EpisodeGenerator(config, n_environments)
+    with closing(EpisodeGenerator(config, n_environments)) as generator:
+        return _algorithm1(config, budget, generator, report)
+
+
+def _algorithm1(
+    config: Config, budget: Budget, generator: EpisodeGenerator, report: Callable[[Run], None]
+) -> Run:
     config, offline = resolve_dataset(config, generator.spec)
     sample = CommandSampler(config, generator.spec)
     graph = acting_graph(config.network, generator.spec)
@@ -130,7 +137,6 @@ def algorithm1(
         due = evaluation_due(run.iteration, before, run.env_steps, config.evaluation.eval_every)
         stop = run.env_steps >= budget.max_env_steps or _reached_stop_return(run, budget)
         report(run)
-    generator.close()
     return run
 
 

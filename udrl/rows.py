@@ -62,10 +62,10 @@ class Rows:
         try:
             for row in range(n):
                 self._envs.append(self._make_row(row))
+            self.spec: EnvironmentSpec = specify(self._envs[0], config)
         except BaseException:
             self.close()
             raise
-        self.spec: EnvironmentSpec = specify(self._envs[0], config)
         self._limits = [self.spec.max_episode_steps] * n
         space = self.spec.observation_space
         self.observation: Observations = np.zeros((n, *space.shape), space.dtype)

@@ -26,7 +26,7 @@ from udrl.environments import (
 )
 from udrl.environments.making import adapt
 from udrl.episode import Episode
-from udrl.errors import EnvironmentFault
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.frame_stack import Seen
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
@@ -583,4 +583,17 @@ def test_generate_raises_the_fault_of_a_command_that_keeps_failing() -> None:
 def test_close_closes_all_environments() -> None:
     world = World()
     EpisodeGenerator(settings(), 3, world.make).close()
+    assert [instance.closed for instance in world.instances] == [True] * 3
+
+
+def test_environments_are_closed_if_they_cannot_be_specified() -> None:
+    world = World()
+
+    def make(config: Config) -> Environment:
+        env = world.make(config)
+        env.metadata["max_return"] = np.inf
+        return env
+
+    with pytest.raises(UnsupportedEnvironment, match="max_return"):
+        EpisodeGenerator(settings(), 3, make)
     assert [instance.closed for instance in world.instances] == [True] * 3

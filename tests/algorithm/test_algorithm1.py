@@ -7,6 +7,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import Run, algorithm1
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
+from udrl.environments.obedience import Obedience
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.evaluation import summarise
@@ -205,3 +206,16 @@ def test_buffer_discards_all_but_the_best_episodes() -> None:
 def test_lead_is_rejected_with_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"lead = 2: .*set lead=0"):
         algorithm1(settings(lead=2), BUDGET)
+
+
+def test_environments_are_closed_if_the_run_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Obedience] = []
+    monkeypatch.setattr(Obedience, "close", lambda self: closed.append(self))
+
+    def report(run: Run) -> None:
+        if run.iteration == 1:
+            raise RuntimeError("the callback failed")
+
+    with pytest.raises(RuntimeError, match="the callback failed"):
+        algorithm1(obedience(), BUDGET, n_environments=3, report=report)
+    assert len(set(map(id, closed))) == 3
