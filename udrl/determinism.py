@@ -4,15 +4,22 @@ A run is exact only if its environment is. Whether machines compute the same num
 question, with a separate remedy (:mod:`udrl.numerics`).
 """
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
 
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
 from udrl.digests import episode_digest
+from udrl.environments.adapter import raised
 from udrl.environments.making import limit_steps, make_environment
 from udrl.episode import Episode
+from udrl.errors import EnvironmentFault
 from udrl.streams import Purpose, stream_key
+
+Result = TypeVar("Result")
 
 #: Maximum length of a probe's episode, in steps.
 PROBE_STEPS = 64
@@ -68,16 +75,17 @@ def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> s
 
     Raises:
         UnsupportedEnvironment: the environment can no longer be created.
-        EnvironmentFault: it returned an invalid value.
+        EnvironmentFault: it raised an exception, or returned an invalid value.
     """
     env = make_environment(config)
     try:
         limit_steps(env, max_steps)
-        observation, _ = env.reset(seed=seed)
+        observation, _ = _called("reset", env.reset, seed=seed)
         for t in range(episode.length):
             if not np.array_equal(observation, episode.observations[t]):
                 return f"the observation of step {t} differs"
-            observation, reward, terminated, truncated, _ = env.step(episode.actions[t])
+            taken = _called("step", env.step, episode.actions[t])
+            observation, reward, terminated, truncated, _ = taken
             if np.float32(reward) != episode.rewards[t]:
                 return f"the reward of step {t} is {reward:g}, it was {episode.rewards[t]:g}"
             ends = t == episode.length - 1
@@ -87,3 +95,13 @@ def difference(config: Config, episode: Episode, seed: int, max_steps: int) -> s
         return None
     finally:
         env.close()
+
+
+def _called(where: str, method: Callable[..., Result], *args: Any, **kwargs: Any) -> Result:
+    """Call a method of the environment; turn its exceptions into :class:`EnvironmentFault`."""
+    try:
+        return method(*args, **kwargs)
+    except EnvironmentFault:
+        raise
+    except Exception as error:
+        raise EnvironmentFault(raised(where, error)) from error

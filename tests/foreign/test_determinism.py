@@ -13,7 +13,7 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.commands import Command
 from udrl.config import Config, build
 from udrl.determinism import difference
-from udrl.errors import Deceived, OtherConfiguration
+from udrl.errors import Deceived, EnvironmentFault, OtherConfiguration
 from udrl.streams import Purpose, stream_key
 from udrl_inspect.inspection import read_status
 from udrl_proto.messages import Hello
@@ -48,6 +48,18 @@ class Changing(Plain):
 
 class ChangingLate(Changing):
     late = 70
+
+
+class Breaking(ChangingLate):
+    """Fails after ``late`` steps while ``today`` is not 1, as often as ``failures`` says."""
+
+    failures = 1000
+
+    def pay(self, action: Any) -> float:
+        if self.t > self.late and self.today != 1.0 and self.failures > 0:
+            type(self).failures -= 1
+            raise RuntimeError("no more steps today")
+        return float(action)
 
 
 def train(kind: type[Plain], run_dir: Path, **more: Any) -> Status:
@@ -88,6 +100,27 @@ def test_changed_environment_is_detected_on_resume(
     assert status.state == "ended"
     assert not status.exact
     assert "has changed" in status.inexact_reason
+
+
+def test_environment_that_newly_raises_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(Breaking, tmp_path / "run")
+    monkeypatch.setattr(Breaking, "today", 10.0)
+    raised = r"step\(\) raised RuntimeError: no more steps today \(test_determinism\.py, line \d+\)"
+    with pytest.raises(
+        OtherConfiguration, match=rf"has changed .* in episode \d+ {raised}.*--allow-inexact"
+    ):
+        train(Breaking, tmp_path / "run", resume=True, max_env_steps=800)
+
+    # All environments may fail now and then.
+    monkeypatch.setattr(Breaking, "failures", 2)
+    assert train(Breaking, tmp_path / "run", resume=True, max_env_steps=800).exact
+
+    monkeypatch.setattr(Breaking, "late", 7)
+    monkeypatch.setattr(Breaking, "failures", 1000)
+    with pytest.raises(EnvironmentFault, match=rf"{raised}; it did not fail when the run was"):
+        train(Breaking, tmp_path / "run", resume=True, max_env_steps=1200)
 
 
 def test_false_episode_is_reported_before_a_changed_environment(

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import msgspec
 
-from udrl.acting import EpisodeGenerator
-from udrl.commands import CommandSampler
+from udrl.acting import MAX_FAILURES, EpisodeGenerator
+from udrl.commands import Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Config, flat
 from udrl.determinism import difference, environment_digest
+from udrl.episode import Episode
 from udrl.errors import EnvironmentFault, OtherConfiguration
 from udrl.numerics import resolve_as
 from udrl_proto.codec import LARGEST, decode, decode_episode
@@ -40,6 +41,7 @@ def resume(
     Raises:
         StoreError: there is no run, it is in use, its configuration differs, or its environment
             behaves differently than before.
+        EnvironmentFault: the environment fails in its first steps.
     """
     store = Store(run_dir)
     with closed_on_error(store):
@@ -93,6 +95,12 @@ def _changed(store: Store, hello: Hello) -> str | None:
             return f"it is {spec}, it was {hello.environment}"
         if environment_digest(generator) != hello.environment_digest:
             return "its first steps differ"
+    except EnvironmentFault as fault:
+        # Whatever --allow-inexact permits, the run cannot continue with such an environment.
+        raise EnvironmentFault(
+            f"{fault}; it did not fail when the run was created: restore the versions of its "
+            f"package and dependencies, and what it needs, such as a server"
+        ) from fault
     finally:
         generator.close()
     sampler = CommandSampler(config, spec)
@@ -102,13 +110,23 @@ def _changed(store: Store, hello: Hello) -> str | None:
         (body,) = store.episode_bodies([episode_id], 1)
         episode = decode_episode(decode(body, EpisodeMessage, LARGEST), spec.observation_space)
         command = sampler.training_command(episode_id)
-        try:
-            found = difference(config, episode, command.environment_seed, command.max_steps)
-        except EnvironmentFault as fault:
-            found = str(fault)
+        found = _difference(config, episode, command)
         if found is not None:
             return f"in episode {episode_id} {found}"
     return None
+
+
+def _difference(config: Config, episode: Episode, command: Command) -> str | None:
+    """Return how an episode differs when it is repeated; None: it does not.
+
+    As in training, only an environment that fails repeatedly cannot run a command.
+    """
+    for _ in range(MAX_FAILURES):
+        try:
+            return difference(config, episode, command.environment_seed, command.max_steps)
+        except EnvironmentFault as error:
+            fault = str(error)
+    return fault
 
 
 def _episodes_to_repeat(store: Store, config: Config) -> Iterator[int]:
