@@ -21,6 +21,9 @@ Positive = Annotated[int, Meta(ge=1, le=2**62)]
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Role = Literal["actor", "learner"]
 
+#: Most episodes in one request of a learner.
+MAX_EPISODES = 100_000
+
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all messages."""
@@ -203,13 +206,13 @@ class ChangesReply(Message, frozen=True, kw_only=True):
 class EpisodesRequest(Message, frozen=True, kw_only=True):
     """A learner's request for episodes that it does not have."""
 
-    ids: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=100_000)]
+    ids: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
 
 
 class EpisodesReply(Message, frozen=True, kw_only=True):
     """The first requested episodes, up to 4 MiB but at least one; request the rest again."""
 
-    episodes: tuple[bytes, ...]
+    episodes: Annotated[tuple[bytes, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
 
 
 class VersionMessage(Message, frozen=True, kw_only=True):

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from udrl.checkpoint import encode_optimizer
 from udrl.config import Config, build, flat
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
-from udrl.errors import Refused
+from udrl.errors import InvalidMessage, Refused
 from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.spaces import Vector
@@ -122,6 +123,39 @@ def test_only_new_episodes_are_fetched(replay: Scripted, run: Callable[[], None]
     run()
     first = [request.ids[0] for request in replay.requests(verbs.EPISODES)]
     assert first == [1, 2, 3, 4]
+
+
+def invalid(number: int) -> bytes:
+    valid = episode(number)
+    return encode_episode(replace(valid, rewards=np.full(3, np.nan, np.float32)), "a")
+
+
+@pytest.mark.parametrize(
+    ("reply", "message"),
+    [
+        (lambda ids: [], r"EpisodesReply: .* length >= 1"),
+        (
+            lambda ids: [encode_episode(episode(ids[-1]), "a")],
+            "replied with episode 2, expected episode 1; stop it",
+        ),
+        (
+            lambda ids: [encode_episode(episode(i), "a") for i in (*ids, 3)],
+            "replied with 3 episodes, expected at most 2",
+        ),
+        (lambda ids: [invalid(ids[0])], r"invalid episode 1 \(rewards are not all finite"),
+    ],
+    ids=["none", "another", "too many", "invalid"],
+)
+def test_reply_without_the_requested_episodes_is_an_error(
+    reply: Callable[[tuple[int, ...]], list[bytes]],
+    message: str,
+    replay: Scripted,
+    run: Callable[[], None],
+) -> None:
+    """An empty page would be requested again and again, and another episode trained on."""
+    replay.answers(verbs.EPISODES, lambda r: EpisodesReply(episodes=tuple(reply(r.ids))))
+    with pytest.raises(InvalidMessage, match=message):
+        run()
 
 
 def test_next_buffer_is_requested_during_training(

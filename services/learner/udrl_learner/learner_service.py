@@ -17,8 +17,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from udrl.checkpoint import decode_state, encode_optimizer
-from udrl.episode import Episode
-from udrl.errors import Interrupted, Refused
+from udrl.episode import Episode, fault
+from udrl.errors import Interrupted, InvalidMessage, Refused
 from udrl.experience import Experience
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
 from udrl.training_class import training_class
@@ -93,6 +93,7 @@ class LearnerService:
         Raises:
             Refused: the run does not accept this learner, or restarts bring no progress.
             Unreachable: the replay service has not replied for too long.
+            InvalidMessage: a reply is invalid, or has other episodes than requested.
         """
         run_id = self._hello.run_id
         declared: list[Any] = []
@@ -250,11 +251,23 @@ class LearnerService:
     def _episodes(self, missing: list[int]) -> list[Episode]:
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
-            request = EpisodesRequest(ids=tuple(left[:_ASK_FOR]))
-            page = self._client.request(verbs.EPISODES, request)
-            messages = [decode(body, EpisodeMessage, LARGEST) for body in page.episodes]
-            episodes += [decode_episode(m, self._spec.observation_space) for m in messages]
+            asked = left[:_ASK_FOR]
+            page = self._client.request(verbs.EPISODES, EpisodesRequest(ids=tuple(asked)))
+            if len(page.episodes) > len(asked):
+                raise _wrong(f"{len(page.episodes)} episodes, expected at most {len(asked)}")
+            pairs = zip(page.episodes, asked, strict=False)
+            episodes += [self._decode(body, expected) for body, expected in pairs]
         return episodes
+
+    def _decode(self, body: bytes, expected: int) -> Episode:
+        """Return the episode in a reply, which must be the one that was requested."""
+        message = decode(body, EpisodeMessage, LARGEST)
+        episode = decode_episode(message, self._spec.observation_space)
+        if episode.command_id != expected:
+            raise _wrong(f"episode {episode.command_id}, expected episode {expected}")
+        if found := fault(episode, self._spec):
+            raise _wrong(f"an invalid episode {expected} ({found})")
+        return episode
 
     def _deliver(self, message: VersionMessage) -> None:
         self._client.request_joined(verbs.VERSION, message, self._join)
@@ -265,3 +278,10 @@ class LearnerService:
         self._transport.publish(
             key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS), announcement
         )
+
+
+def _wrong(received: str) -> InvalidMessage:
+    return InvalidMessage(
+        f"the replay service replied with {received}; stop it and restart it with --resume, with "
+        f"the learner's version of udrl"
+    )
