@@ -20,6 +20,7 @@ from udrl.graph import acting_graph
 from udrl.spaces import Vector
 from udrl.training import train, untrained
 from udrl.weights import encode_weights
+from udrl_learner import learner_service
 from udrl_learner.learner_service import LearnerService
 from udrl_proto import PROTOCOL, verbs
 from udrl_proto.codec import encode_episode
@@ -282,3 +283,36 @@ def test_failed_delivery_is_noticed_while_the_next_buffer_is_awaited(
     replay.answers(verbs.VERSION, lambda _: Problem(code="invalid", message="diverged"))
     with pytest.raises(Refused, match="diverged"):
         run()
+
+
+def test_wait_for_the_buffer_is_short_however_many_actors_there_are(
+    replay: Scripted, run: Callable[[], None]
+) -> None:
+    """The publication of progress is lost."""
+    requested = 0
+
+    def changes(request: ChangesRequest) -> ChangesReply:
+        nonlocal requested
+        requested += 1
+        if requested == 1:
+            return ChangesReply(wait=Wait(on="actors", retry_after_s=3600.0))
+        return ChangesReply(ended=True)
+
+    replay.answers(verbs.CHANGES, changes)
+    run()
+    assert requested == 2
+
+
+def test_stopped_learner_does_not_wait_for_the_buffer(
+    replay: Scripted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner_service, "_LONGEST_WAIT_S", 3600.0)
+    stop = threading.Event()
+
+    def changes(request: ChangesRequest) -> ChangesReply:
+        stop.set()
+        return ChangesReply(wait=Wait(on="actors", retry_after_s=3600.0))
+
+    replay.answers(verbs.CHANGES, changes)
+    LearnerService(replay.transport, HELLO, "l", stop).run()
+    assert len(replay.requests(verbs.CHANGES)) == 1

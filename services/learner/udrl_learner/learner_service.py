@@ -47,6 +47,11 @@ _ASK_FOR = 10_000
 #: Pauses before the restarts of a learner without progress, seconds; after the last it gives up.
 _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 
+#: Longest pause between two requests for the same buffer, seconds. The replay service's
+#: ``retry_after_s`` grows with the number of actors, to spread their requests. There are few
+#: learners, and the run waits for them if a publication of progress is lost.
+_LONGEST_WAIT_S = 1.0
+
 #: Interval at which a wait for the buffer checks ``stop``, seconds.
 _LOOK_S = 0.5
 
@@ -206,6 +211,8 @@ class LearnerService:
             if delivered is not None and delivered.done():
                 delivered.result()
                 pending = [fetched]
+        if self._stop.is_set():
+            self._progress.set()  # the next request raises
         return fetched.result()
 
     def _take(self, experience: Experience, buffer: Buffer) -> None:
@@ -245,7 +252,7 @@ class LearnerService:
                 return Buffer(
                     changes.ids, self._episodes([i for i in changes.ids if i not in held])
                 )
-            self._progress.wait(changes.wait.retry_after_s)
+            self._progress.wait(min(changes.wait.retry_after_s, _LONGEST_WAIT_S))
         return None
 
     def _episodes(self, missing: list[int]) -> list[Episode]:
