@@ -19,7 +19,7 @@ from udrl_inspect.inspection import read_status
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import Child, Supervisor
 from udrl_proto.reports import Status
-from udrl_replay.creation import create, write_config
+from udrl_replay.creation import create_run, write_config
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
@@ -87,7 +87,7 @@ class DisturbedRun:
         self.moments: list[Moment] = []
         self._hang_s = hang_s
         self._deadline = time.monotonic() + limit_s
-        create(run_dir, settings.config).close()
+        create_run(run_dir, settings.config).close()
         write_config(run_dir, settings.config, settings.budget)
         self._supervisor = Supervisor(run_dir / "logs")
 

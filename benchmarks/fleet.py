@@ -30,7 +30,7 @@ from udrl_proto.messages import (
     EpisodeReply,
     JoinRequest,
     Message,
-    Weights,
+    WeightsMessage,
 )
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -150,7 +150,7 @@ class Fleet:
         )  # fmt: skip
 
     def _note_weights(self, sample: zenoh.Sample) -> None:
-        version = decode(sample.payload.to_bytes(), Weights, LARGEST).version
+        version = decode(sample.payload.to_bytes(), WeightsMessage, LARGEST).version
         self._arrivals[str(version)] = time.monotonic()  # that of the last session
         self._news = True
 

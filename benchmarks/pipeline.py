@@ -42,7 +42,7 @@ from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
 from udrl.streams import Purpose, stream_key
 from udrl_launch.settings import Settings, gather
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_replay.run import StoredRun
 
 #: Seconds on the machine of docs/performance.md, measured in runs; see :class:`Costs`.
@@ -77,7 +77,7 @@ def record(settings: Settings) -> Recorded:
         tempfile.TemporaryDirectory() as folder,
         mock.patch.object(StoredRun, "accept", note_episode),
     ):
-        status = train(settings, Path(folder) / "run", threading.Event(), in_process=True)
+        status = run_training(settings, Path(folder) / "run", threading.Event(), in_process=True)
     complete = range(status.iteration + 1)
     return Recorded([[n for _, n in sorted(found[i].items())] for i in complete], settings.config)
 

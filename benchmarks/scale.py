@@ -40,7 +40,7 @@ from udrl_launch.training_run import free_port
 from udrl_proto import PROTOCOL, key_expressions, verbs
 from udrl_proto import session as sessions
 from udrl_proto.codec import encode
-from udrl_proto.messages import ChangesRequest, Hello, JoinRequest, VersionMessage, Weights
+from udrl_proto.messages import ChangesRequest, Hello, JoinRequest, VersionMessage, WeightsMessage
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -102,7 +102,7 @@ def deliver_versions(
             )  # fmt: skip
             client.request(verbs.VERSION, message)
             announced.append(Announced(version, time.monotonic()))
-            news = encode(Weights(version=version, weights=weights))
+            news = encode(WeightsMessage(version=version, weights=weights))
             session.put(key_expressions.key(RUN, key_expressions.NEW_WEIGHTS), news)
             version += 1
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from udrl.errors import UdrlError
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
@@ -117,7 +117,7 @@ def _pace(run_dir: Path, now: float) -> Iterator[Pace]:
             progress = store.fact("progress", RunProgress)
     except UdrlError:
         return
-    size = sum(f.stat().st_size for f in run_dir.glob(f"{FILE}*")) / 2**20
+    size = sum(f.stat().st_size for f in run_dir.glob(f"{STORE_FILE}*")) / 2**20
     yield Pace(now, progress.iteration, progress.env_steps, size)
 
 

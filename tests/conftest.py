@@ -29,7 +29,7 @@ def _one_thread() -> None:
 def keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Keys for all roles."""
     folder = tmp_path_factory.mktemp("keys")
-    authority.create(folder)
+    authority.create_keys(folder)
     return folder
 
 
@@ -37,5 +37,5 @@ def keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def foreign_keys_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Keys for all roles of an untrusted authority."""
     folder = tmp_path_factory.mktemp("foreign")
-    authority.create(folder)
+    authority.create_keys(folder)
     return folder

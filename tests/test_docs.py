@@ -32,7 +32,7 @@ from udrl.errors import UdrlError
 from udrl_launch.settings import Fleet, gather
 from udrl_launch.supervisor import FINAL_CODES
 from udrl_proto.reports import Status
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import COLUMNS, Store
 
@@ -214,7 +214,7 @@ def test_documented_exit_codes_state_which_children_are_restarted() -> None:
 
 def test_every_table_and_column_of_the_store_is_documented(tmp_path: Path) -> None:
     Store.create(tmp_path).close()
-    with sqlite3.connect(tmp_path / FILE) as db:
+    with sqlite3.connect(tmp_path / STORE_FILE) as db:
         tables_there = db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         expected = {
             name: [column for _, column, *_ in db.execute(f"PRAGMA table_info({name})")]

@@ -23,7 +23,7 @@ from udrl.strategies import Best, CommandStrategy, choose_command, make_strategy
 from udrl.streams import Purpose, Stream, stream_key
 from udrl.targets import ReturnInTime
 
-Kind = Literal["warm_up", "explore", "evaluate"]
+CommandKind = Literal["warm_up", "explore", "evaluate"]
 
 #: Reset seeds (section 3.2), half-open ranges.
 TRAINING_SEEDS = (1_000_000, 10_000_000)
@@ -72,7 +72,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """
 
     id: Annotated[int, Meta(ge=0, le=2**62)]
-    kind: Kind
+    kind: CommandKind
     desired_return: float
     desired_horizon: Annotated[int, Meta(ge=0, le=2**31)]
     cap: float | None = None
@@ -204,7 +204,7 @@ class CommandSampler:
     def training_command(self, episode_id: int) -> Command:
         """Return a training command again, without desired return, horizon and random actions."""
         iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
-        kind: Kind = "explore" if iteration else "warm_up"
+        kind: CommandKind = "explore" if iteration else "warm_up"
         return self._commands(kind, iteration, 0, [(0.0, 0)] * (index + 1), TRAINING_SEEDS)[index]
 
     def evaluate(self, iteration: int, buffer: ReplayBuffer) -> list[Command]:
@@ -240,7 +240,7 @@ class CommandSampler:
 
     def _commands(
         self,
-        kind: Kind,
+        kind: CommandKind,
         iteration: int,
         first: int,
         desired: list[tuple[float, int]],

@@ -13,7 +13,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.frame_stack import FrameStack, Seen
-from udrl.segments import Indices, Segments
+from udrl.segments import IndexArray, Segments
 from udrl.spaces import leaves_of
 from udrl.targets import Desired, ReturnInTime
 
@@ -45,7 +45,7 @@ class Examples(NamedTuple):
 @dataclass(frozen=True)
 class _Place:
     slot: int
-    pages: Indices
+    pages: IndexArray
 
 
 class Experience:
@@ -155,7 +155,7 @@ class RankedExperience:
         action_shape: shape of an action.
     """
 
-    def __init__(self, experience: Experience, slots: Indices) -> None:
+    def __init__(self, experience: Experience, slots: IndexArray) -> None:
         self._experience = experience
         self._slots = slots
         self.labels: npt.NDArray[np.float64] | None = None
@@ -163,8 +163,8 @@ class RankedExperience:
         self.shapes = experience._stack.shapes
         self.leaves = experience._leaves
         self.action_shape = experience._actions.shape[1:]
-        self.lengths: Indices = experience._lengths[slots]
-        self._first_step: Indices = np.cumsum(self.lengths) - self.lengths
+        self.lengths: IndexArray = experience._lengths[slots]
+        self._first_step: IndexArray = np.cumsum(self.lengths) - self.lengths
 
     def examples(self, segments: Segments) -> Examples:
         """Gather the examples of segments."""
@@ -187,9 +187,9 @@ class RankedExperience:
         """Return (V, D) of s_t1, float32 [n, 2]; None if unknown."""
         return None if self.expected is None else self.expected[self._step(segments)]
 
-    def _step(self, segments: Segments) -> Indices:
+    def _step(self, segments: Segments) -> IndexArray:
         """Return the index of each t1 in the order of :meth:`steps`."""
-        steps: Indices = self._first_step[segments.rank] + segments.t1
+        steps: IndexArray = self._first_step[segments.rank] + segments.t1
         return steps
 
     def steps(self, at_once: int = 4096) -> Iterator[tuple[Seen, Array]]:
@@ -228,12 +228,12 @@ class RankedExperience:
             labels[step] += lam * labels[step + 1]
         self.labels = labels
 
-    def _all_steps(self) -> tuple[Indices, Indices]:
+    def _all_steps(self) -> tuple[IndexArray, IndexArray]:
         """Return slot and time of every step, episode by episode."""
         rank = np.repeat(np.arange(len(self.lengths)), self.lengths)
         return self._slots[rank], np.arange(len(rank)) - self._first_step[rank]
 
-    def _observed(self, slot: Indices, t: Indices) -> Seen:
+    def _observed(self, slot: IndexArray, t: IndexArray) -> Seen:
         """Return what the network sees at times t: single observations, or stacks of them."""
         held = self._experience
         stack = held._stack
@@ -241,7 +241,7 @@ class RankedExperience:
             return stack.join(held._observations[self._row(slot, t)])
         return stack.join(held._observations[self._row(slot[:, None], stack.times(t))])
 
-    def _row(self, slot: Indices, t: Indices) -> Indices:
+    def _row(self, slot: IndexArray, t: IndexArray) -> IndexArray:
         page = self._experience._page_table[slot, t // _PAGE]
-        rows: Indices = page * _PAGE + t % _PAGE
+        rows: IndexArray = page * _PAGE + t % _PAGE
         return rows

@@ -55,7 +55,7 @@ class _Format(msgspec.Struct, frozen=True):
     format: int
 
 
-def save(folder: Path, policy: Policy, card: str) -> None:
+def save_folder(folder: Path, policy: Policy, card: str) -> None:
     """Write a policy to a folder, which may exist.
 
     Args:
@@ -90,7 +90,7 @@ def save(folder: Path, policy: Policy, card: str) -> None:
         ) from error
 
 
-def load(folder: str | Path) -> Policy:
+def load_folder(folder: str | Path) -> Policy:
     """Return a policy written by :func:`save`.
 
     Its ``desired_return`` and ``desired_horizon`` are those of evaluation commands.

@@ -23,7 +23,7 @@ _DTYPES: dict[str, np.dtype[Any]] = {
 
 Commands = npt.NDArray[np.float64]
 Logits = npt.NDArray[np.float32]
-State = npt.NDArray[np.float32]
+MemoryState = npt.NDArray[np.float32]
 
 
 _COMMAND, _STATE = "command", "state"
@@ -43,9 +43,9 @@ class Call(Protocol):
 
     seen: Seen
     command: Commands
-    state: State
+    state: MemoryState
     logits: Logits
-    next_state: State
+    next_state: MemoryState
 
     def run(self) -> None:
         """Compute the logits."""
@@ -104,7 +104,7 @@ class ActingFunction:
         last = self._session.get_inputs()[-1]
         return int(last.shape[1]) if last.name == _STATE else 0
 
-    def logits(self, seen: Seen, command: Commands, state: State | None = None) -> Logits:
+    def logits(self, seen: Seen, command: Commands, state: MemoryState | None = None) -> Logits:
         """Return the logits of rows, float32 [n, n_parameters]. Thread-safe.
 
         Args:
@@ -115,8 +115,8 @@ class ActingFunction:
         return self.advance(seen, command, state)[0]
 
     def advance(
-        self, seen: Seen, command: Commands, state: State | None = None
-    ) -> tuple[Logits, State]:
+        self, seen: Seen, command: Commands, state: MemoryState | None = None
+    ) -> tuple[Logits, MemoryState]:
         """Return the logits of rows, like :meth:`logits`, and the states at the next step."""
         names = [one.name for one in self._session.get_inputs()]
         given: list[npt.NDArray[Any]] = [*seen, command]
@@ -213,7 +213,7 @@ def probe_weights(graph: bytes) -> Weights:
     return weights
 
 
-def probe_rows(function: ActingFunction, n: int) -> tuple[Seen, Commands, State]:
+def probe_rows(function: ActingFunction, n: int) -> tuple[Seen, Commands, MemoryState]:
     """Return random observations, commands in [-100, 100), and states in [-1, 1)."""
     stream = Stream(stream_key(0, Purpose.PROBE, 2, 0))
     like = function.call(1).seen

@@ -13,7 +13,7 @@ from udrl.environments.conversions import describe, nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 from udrl.frame_stack import FrameStack
-from udrl.inference import ActingFunction, State
+from udrl.inference import ActingFunction, MemoryState
 from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
 
 
@@ -65,7 +65,7 @@ class Policy:
             rows: the rows of a batch whose episodes begin, bool [n]. None: all.
         """
         if rows is None:
-            self._state: State | None = None
+            self._state: MemoryState | None = None
         elif self._state is not None:
             begins = np.asarray(rows, bool)
             if begins.shape != (len(self._state),):
@@ -128,8 +128,8 @@ class Policy:
         observation: npt.ArrayLike,
         desired_return: npt.ArrayLike,
         desired_horizon: npt.ArrayLike,
-        state: State | None,
-    ) -> tuple[npt.NDArray[np.float64], State]:
+        state: MemoryState | None,
+    ) -> tuple[npt.NDArray[np.float64], MemoryState]:
         """Return the logits, like :meth:`logits`, and the memory at the next step.
 
         Args:

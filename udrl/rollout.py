@@ -17,7 +17,7 @@ from udrl.commands import Command
 from udrl.environments.adapter import raised
 from udrl.environments.making import Environment, limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
-from udrl.inference import State
+from udrl.inference import MemoryState
 from udrl.policy import Policy
 from udrl.spaces import parts_of
 from udrl.targets import ReturnInTime
@@ -59,7 +59,7 @@ class Rollout:
         self._env = env
         self._target = ReturnInTime(policy.config.network)
         self._cap = np.array([math.inf if command.cap is None else command.cap])
-        self._state: State | None = None
+        self._state: MemoryState | None = None
         self._decisions = command.decisions(0, policy.spec.action_space.shape)
         limit_steps(env, command.max_steps)
         observation = self._guarded("reset", lambda: env.reset(seed=command.environment_seed)[0])
@@ -155,7 +155,7 @@ class Rollout:
             self._decisions = self.command.decisions(t + _AT_ONCE, shape)
         return self._decisions.numbers[t], bool(self._decisions.random[t])
 
-    def _advance(self) -> tuple[npt.NDArray[np.float64], State]:
+    def _advance(self) -> tuple[npt.NDArray[np.float64], MemoryState]:
         return self._policy.advance(
             np.stack(self._recent), self.desired_return, self.desired_horizon, self._state
         )

@@ -10,19 +10,19 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Indices = npt.NDArray[np.int64]
+IndexArray = npt.NDArray[np.int64]
 
 
 class Segments(NamedTuple):
     """Segments as int64 arrays of one shape: the episode's rank in the buffer, t1 and t2."""
 
-    rank: Indices
-    t1: Indices
-    t2: Indices
+    rank: IndexArray
+    t1: IndexArray
+    t2: IndexArray
 
 
 def draw_segments(
-    uniforms: npt.NDArray[np.float64], lengths: Indices, kind: Literal["trailing", "all"]
+    uniforms: npt.NDArray[np.float64], lengths: IndexArray, kind: Literal["trailing", "all"]
 ) -> Segments:
     """Draw segments: an episode uniformly, then the times uniformly.
 

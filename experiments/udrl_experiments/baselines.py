@@ -74,7 +74,7 @@ class _State(msgspec.Struct, frozen=True, kw_only=True):
     rows: list[EvaluationRecord]
 
 
-def run(
+def train_baseline(
     baseline: Baseline,
     max_env_steps: int,
     folder: Path,

@@ -73,7 +73,7 @@ def learning_curves(
     return figure
 
 
-def sensitivity(rows: Sequence[Obtained], title: str) -> "Figure":
+def sensitivity_figure(rows: Sequence[Obtained], title: str) -> "Figure":
     """Draw obtained against desired returns (section 3.5, Figure 6), one line per run.
 
     As in the paper, error bars are the standard deviation of the episodes' returns.

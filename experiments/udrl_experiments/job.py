@@ -23,7 +23,7 @@ from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 
 
@@ -77,7 +77,7 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
         (folder / "done.json").unlink(missing_ok=True)
     if job.algorithm == "UDRL":
         settings = Settings(job.config, Budget(max_env_steps=job.max_env_steps), Fleet())
-        status = train(settings, folder / "run", stop, resume=True)
+        status = run_training(settings, folder / "run", stop, resume=True)
         if status.problem:
             raise RunFailed(status.problem)
         table = folder / "evaluations.csv"
@@ -87,7 +87,7 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
             rows |= {row.env_steps: row for row in read(table, EvaluationRecord)}
         write(table, EvaluationRecord, (rows[steps] for steps in sorted(rows)))
     else:
-        baselines.run(
+        baselines.train_baseline(
             baselines.Baseline(
                 algorithm=job.algorithm, config=job.config, hyperparameters=job.hyperparameters
             ),

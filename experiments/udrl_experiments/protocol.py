@@ -17,7 +17,7 @@ Algorithm = Literal["UDRL", BaselineAlgorithm]
 Participant = Literal["UDRL", "UDRL-paper", BaselineAlgorithm]
 #: The participants in Figures 4 and 5.
 DEFAULT_PARTICIPANTS: tuple[Participant, ...] = ("UDRL", "DQN", "A2C")
-Scale = Literal["small", "paper"]
+StudyScale = Literal["small", "paper"]
 
 #: Number of evaluations in a score (Appendix B).
 LAST = 20
@@ -92,7 +92,7 @@ class StudyPlan(NamedTuple):
         assignments: ``NAME=VALUE``, changes to UDRL's presets.
     """
 
-    scale: Scale = "small"
+    scale: StudyScale = "small"
     seeds: tuple[int, ...] | None = None
     max_env_steps: int | None = None
     assignments: tuple[str, ...] = ()

@@ -40,7 +40,7 @@ from udrl_replay.creation import as_toml
 
 #: Configurations per algorithm and env steps per run at the small scale.
 SMALL_CONFIGURATIONS = 8
-SMALL_STEPS = 500_000
+SMALL_SEARCH_STEPS = 500_000
 
 
 class Scored(msgspec.Struct, frozen=True, kw_only=True):
@@ -289,7 +289,7 @@ def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> i
 
 
 def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
-    steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_STEPS)
+    steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_SEARCH_STEPS)
     space, variant = subject.space, f"configuration {number}"
     drawn = space.draw(algorithm, number)
     networks = {name: drawn.pop(name) for name in space.networks}

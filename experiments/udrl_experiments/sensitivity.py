@@ -91,4 +91,4 @@ def _evaluate_agent(run: Job, root: Path, task: Task, episodes: int) -> list[Obt
 
 def draw(table: Path, title: str) -> None:
     """Draw the figure from its table."""
-    figures.save(figures.sensitivity(read(table, Obtained), title), table.with_suffix(""))
+    figures.save(figures.sensitivity_figure(read(table, Obtained), title), table.with_suffix(""))

@@ -16,8 +16,8 @@ from udrl_experiments.protocol import (
     TASKS,
     Algorithm,
     Participant,
-    Scale,
     StudyPlan,
+    StudyScale,
     parse_seeds,
     tasks,
 )
@@ -54,7 +54,7 @@ def study() -> None:
 def _options(command: Command) -> Command:
     """Add the options of all studies."""
     options = (
-        click.option("--scale", type=click.Choice(get_args(Scale)), default="small",
+        click.option("--scale", type=click.Choice(get_args(StudyScale)), default="small",
                      show_default=True, help="Number of seeds and steps: small takes an evening on "
                      "two cores."),
         click.option("--seeds", metavar="SEEDS", help="Seeds of the runs, e.g. 1-20 or 1,2,7-9."),
@@ -100,7 +100,7 @@ def _participants(command: Command) -> Command:
 def _run(
     make: Callable[[StudyPlan], Study],
     *,
-    scale: Scale,
+    scale: StudyScale,
     seeds: str | None,
     max_env_steps: int | None,
     assignments: tuple[str, ...],

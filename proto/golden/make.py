@@ -52,7 +52,7 @@ from udrl_proto.messages import (
     VersionMessage,
     VersionReply,
     Wait,
-    Weights,
+    WeightsMessage,
     WeightsRequest,
 )
 from udrl_proto.reports import (
@@ -232,7 +232,7 @@ EXAMPLES: tuple[Message, ...] = (
     StateRequest(learner="learner-1"),
     StateReply(version=5, weights=b"safetensors", optimizer=b"safetensors"),
     WeightsRequest(version="latest"),
-    Weights(version=5, weights=b"safetensors"),
+    WeightsMessage(version=5, weights=b"safetensors"),
     Progress(iteration=5),
     StatusRequest(),
     COMMANDS,

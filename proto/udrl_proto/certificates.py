@@ -16,7 +16,7 @@ from udrl.errors import ConfigError
 _ANEW = "copy it again, or create new keys with `udrl keys create`"
 
 
-def check(ca: Path, certificate: Path, key: Path, role: str) -> None:
+def check_certificate(ca: Path, certificate: Path, key: Path, role: str) -> None:
     """Check the files with which a service proves its role.
 
     Raises:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from udrl.episode import Episode
 from udrl.errors import ConfigError, InvalidMessage
 from udrl.spaces import ObservationSpace
-from udrl_proto.messages import Array, EpisodeMessage, Message
+from udrl_proto.messages import ArrayMessage, EpisodeMessage, Message
 from udrl_proto.text import printable
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
@@ -77,13 +77,13 @@ def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     return unique
 
 
-def encode_array(array: npt.NDArray[Any]) -> Array:
+def encode_array(array: npt.NDArray[Any]) -> ArrayMessage:
     """Return an array as a message."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return Array(dtype=little.dtype.str, shape=array.shape, data=little.tobytes())
+    return ArrayMessage(dtype=little.dtype.str, shape=array.shape, data=little.tobytes())
 
 
-def decode_array(message: Array) -> npt.NDArray[Any]:
+def decode_array(message: ArrayMessage) -> npt.NDArray[Any]:
     """Return the array in a message, read-only.
 
     Raises:

@@ -94,7 +94,7 @@ class Credentials(NamedTuple):
             return
 
 
-def load(folder: Path, role: str) -> Credentials:
+def load_credentials(folder: Path, role: str) -> Credentials:
     """Return the credentials of a role.
 
     Args:
@@ -113,7 +113,7 @@ def load(folder: Path, role: str) -> Credentials:
         ) from error
     own = (folder / role if (folder / role).is_dir() else folder).absolute()
     found = Credentials(own / CA, own / CERTIFICATE, own / KEY)
-    certificates.check(*found, role)
+    certificates.check_certificate(*found, role)
     file = found.key.stat()
     # A key owned by root, as in Kubernetes, can be made readable for a service only by group.
     may = 0o640 if file.st_uid == 0 and os.geteuid() != 0 else 0o600

@@ -29,7 +29,7 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all messages."""
 
 
-class Array(Message, frozen=True, kw_only=True):
+class ArrayMessage(Message, frozen=True, kw_only=True):
     """An array: C order, little-endian.
 
     Attributes:
@@ -163,9 +163,9 @@ class EpisodeMessage(Message, frozen=True, kw_only=True):
 
     actor: Name
     command_id: Number
-    observations: Array
-    actions: Array
-    rewards: Array
+    observations: ArrayMessage
+    actions: ArrayMessage
+    rewards: ArrayMessage
     terminated: bool
     truncated: bool
 
@@ -260,7 +260,7 @@ class WeightsRequest(Message, frozen=True, kw_only=True):
     version: Number | Literal["latest", "best"]
 
 
-class Weights(Message, frozen=True, kw_only=True):
+class WeightsMessage(Message, frozen=True, kw_only=True):
     """A version's weights, as a reply and as the learner's publication."""
 
     version: Number

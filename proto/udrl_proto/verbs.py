@@ -25,7 +25,7 @@ from udrl_proto.messages import (
     StateRequest,
     VersionMessage,
     VersionReply,
-    Weights,
+    WeightsMessage,
     WeightsRequest,
 )
 from udrl_proto.reports import (
@@ -79,7 +79,7 @@ CHANGES = Verb("changes", ChangesRequest, ChangesReply, _LEARNER, reply_limit=LA
 EPISODES = Verb("episodes", EpisodesRequest, EpisodesReply, _LEARNER, PAGE, LARGEST)
 VERSION = Verb("version", VersionMessage, VersionReply, _LEARNER, LARGEST)
 STATE = Verb("state", StateRequest, StateReply, _LEARNER, reply_limit=LARGEST)
-WEIGHTS = Verb("weights", WeightsRequest, Weights, _ACTOR + _OBSERVER, reply_limit=LARGEST)
+WEIGHTS = Verb("weights", WeightsRequest, WeightsMessage, _ACTOR + _OBSERVER, reply_limit=LARGEST)
 STATUS = Verb("status", StatusRequest, Status, _OBSERVER, reply_limit=REPORT)
 HISTORY = Verb("history", HistoryRequest, History, _OBSERVER)
 CONTENTS = Verb("contents", ContentsRequest, Contents, _OBSERVER)

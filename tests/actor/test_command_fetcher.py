@@ -27,7 +27,7 @@ from udrl_proto.messages import (
     Message,
     Problem,
     Wait,
-    Weights,
+    WeightsMessage,
 )
 from udrl_proto.replay_client import ReplayClient
 from whole_run import wait_for
@@ -78,7 +78,7 @@ class Assigns:
 def replay() -> Scripted:
     scripted = Scripted(HELLO.run_id)
     scripted.answers(verbs.JOIN, lambda _: JoinReply())
-    scripted.answers(verbs.WEIGHTS, lambda r: Weights(version=r.version, weights=WEIGHTS))
+    scripted.answers(verbs.WEIGHTS, lambda r: WeightsMessage(version=r.version, weights=WEIGHTS))
     return scripted
 
 
@@ -132,7 +132,7 @@ def test_published_weights_are_not_requested(
     fetcher = start()
     fetcher.take(1, 0, wait_s=0.0)
     wait_for(lambda: replay.requests(verbs.COMMANDS), "a request", DEADLINE_S)
-    replay.publish(key_expressions.NEW_WEIGHTS, Weights(version=3, weights=WEIGHTS))
+    replay.publish(key_expressions.NEW_WEIGHTS, WeightsMessage(version=3, weights=WEIGHTS))
     replay.answers(verbs.COMMANDS, Assigns(CommandsReply(commands=(command(1, version=3),))))
     (assignment,) = take(fetcher, 1)
     assert assignment.behavior is not None

@@ -29,7 +29,7 @@ def policy() -> Policy:
 
 @pytest.fixture
 def saved(policy: Policy, tmp_path: Path) -> Path:
-    folder.save(tmp_path / "deep" / "agent", policy, "# A card\n")
+    folder.save_folder(tmp_path / "deep" / "agent", policy, "# A card\n")
     return tmp_path / "deep" / "agent"
 
 
@@ -82,7 +82,7 @@ def test_unknown_format_version_is_rejected_and_can_be_overwritten(
     (saved / "config.json").write_text(json.dumps(of_another))
     with pytest.raises(InvalidData, match="format 1, this version of udrl reads 2"):
         udrl.load(saved)
-    folder.save(saved, policy, "# A card\n")
+    folder.save_folder(saved, policy, "# A card\n")
     assert udrl.load(saved).desired_return == policy.desired_return
 
 
@@ -99,7 +99,7 @@ def test_missing_folder_is_rejected(tmp_path: Path, policy: Policy) -> None:
         udrl.load(tmp_path / "nothing")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="name a folder you may write"):
-        folder.save(tmp_path / "file", policy, "")
+        folder.save_folder(tmp_path / "file", policy, "")
 
 
 def test_package_exports_nothing_else() -> None:
@@ -114,7 +114,7 @@ def test_folder_with_other_files_is_not_overwritten(
 ) -> None:
     (tmp_path / "README.md").write_text("precious")
     with pytest.raises(ConfigError, match="something other than an exported agent"):
-        folder.save(tmp_path, policy, "")
+        folder.save_folder(tmp_path, policy, "")
     assert (tmp_path / "README.md").read_text() == "precious"
-    folder.save(saved, policy, "# Another card\n")
+    folder.save_folder(saved, policy, "# Another card\n")
     assert (saved / "README.md").read_text() == "# Another card\n"

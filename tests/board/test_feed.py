@@ -14,7 +14,7 @@ from udrl.spaces import Vector
 from udrl_board.feed import FRESH_S, Feed
 from udrl_board.source import RunLocation
 from udrl_inspect.obedience_report import Agreement, ObediencePoint, ObedienceReport
-from udrl_proto.messages import Hello, Weights
+from udrl_proto.messages import Hello, WeightsMessage
 from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 
 HELLO = Hello(
@@ -91,7 +91,7 @@ class CountingSource:
             desired_horizons=(), versions=(),
         )  # fmt: skip
 
-    def weights(self, version: object) -> Weights:
+    def weights(self, version: object) -> WeightsMessage:
         raise AssertionError("the feed must not request weights")
 
     def obedience(self) -> ObedienceReport | None:

@@ -23,7 +23,7 @@ from udrl.errors import ConfigError, InvalidData
 from udrl.frame_stack import FrameStack
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
-from udrl_experiments.baselines import Baseline, run
+from udrl_experiments.baselines import Baseline, train_baseline
 from udrl_experiments.protocol import TASKS, BaselineAlgorithm, Task
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import PpoHyperparameters, complete, tuned
@@ -130,7 +130,9 @@ def test_baseline_learns(
     algorithm: str, hyperparameters: dict[str, KeywordValue], steps: int, tmp_path: Path
 ) -> None:
     plain = baseline(algorithm, hidden=[64, 64], eval_every=steps // 2, eval_episodes=20)
-    rows = run(msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path)
+    rows = train_baseline(
+        msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path
+    )
     assert [row.env_steps for row in rows] == [steps // 2, steps]
     assert rows[-1].mean > 60  # random actions: 22
     assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
@@ -141,7 +143,7 @@ def test_baseline_learns(
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_baseline_trains_on_images(algorithm: str, tmp_path: Path) -> None:
-    rows = run(pictures(algorithm), 450, tmp_path)
+    rows = train_baseline(pictures(algorithm), 450, tmp_path)
     assert [row.env_steps for row in rows][:2] == [200, 400]
     assert 450 <= rows[-1].env_steps < 460
     assert all(row.mean == 20 for row in rows)
@@ -207,7 +209,7 @@ def test_training_inputs_are_the_most_recent_frames() -> None:
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_reset_seeds_are_from_the_ranges(algorithm: str, tmp_path: Path) -> None:
     config = baseline(algorithm).config
-    run(baseline(algorithm), 400, tmp_path)
+    train_baseline(baseline(algorithm), 400, tmp_path)
     in_training = [s for s in seeds if s is not None and 1_000_000 <= s < 10_000_000]
     in_evaluation = [s for s in seeds if s is not None and 1 <= s < 500_000]
     assert len(in_training) + len(in_evaluation) == len(seeds)
@@ -220,7 +222,7 @@ def test_reset_seeds_are_from_the_ranges(algorithm: str, tmp_path: Path) -> None
 
 
 def test_search_uses_its_own_reset_seeds(tmp_path: Path) -> None:
-    run(baseline("A2C", eval_seeds="search"), 200, tmp_path)
+    train_baseline(baseline("A2C", eval_seeds="search"), 200, tmp_path)
     assert sum(500_000 <= (s or 0) < 1_000_000 for s in seeds) == 4
 
 
@@ -238,14 +240,14 @@ def test_evaluations_act_like_udrl(
         return episodes
 
     monkeypatch.setattr(baselines, "generate_episodes", watched)
-    run(baseline(algorithm), 200, tmp_path)
+    train_baseline(baseline(algorithm), 200, tmp_path)
     assert temperatures == [float(algorithm != "DQN")] * 4
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_evaluations_do_not_change_training(algorithm: str, tmp_path: Path) -> None:
-    often = run(baseline(algorithm), 400, tmp_path / "often")
-    once = run(baseline(algorithm, eval_every=400), 400, tmp_path / "once")
+    often = train_baseline(baseline(algorithm), 400, tmp_path / "often")
+    once = train_baseline(baseline(algorithm, eval_every=400), 400, tmp_path / "once")
     assert (len(often), len(once)) == (2, 1)
     tensors = held(tmp_path / "often")
     others = held(tmp_path / "once")
@@ -261,7 +263,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
     with monkeypatch.context() as patch:
         stop_after(2, patch)
         with pytest.raises(Stopped):
-            run(make(algorithm), 600, tmp_path)
+            train_baseline(make(algorithm), 600, tmp_path)
     saved = held(tmp_path)
 
     restored: list[dict[str, Tensor]] = []
@@ -274,7 +276,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
 
     original = policies.restore
     monkeypatch.setattr(policies, "restore", restore)
-    rows = run(make(algorithm), 600, tmp_path)
+    rows = train_baseline(make(algorithm), 600, tmp_path)
     assert [row.env_steps for row in rows] == [200, 400, 600]
     assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
     assert 0 < rows[0].wall_s < rows[1].wall_s < rows[2].wall_s
@@ -291,7 +293,7 @@ def test_full_replay_buffer_is_restored(tmp_path: Path) -> None:
     small = msgspec.structs.replace(
         baseline("DQN"), hyperparameters=FAST["DQN"] | {"buffer_size": 150, "n_steps": 3}
     )
-    run(small, 200, tmp_path)
+    train_baseline(small, 200, tmp_path)
     model, saved = made(small), held(tmp_path)
     policies.restore(model, saved, {"num_timesteps": 0, "_n_updates": 0, "_n_calls": 0,
                                     "_episode_num": 0, "pos": 50})  # fmt: skip
@@ -319,8 +321,8 @@ def test_run_resumes_after_a_kill_while_saving(
 
     monkeypatch.setattr(safetensors.torch, "save_file", save)
     with pytest.raises(Stopped):
-        run(baseline("DQN"), 600, tmp_path)
-    rows = run(baseline("DQN"), 600, tmp_path)
+        train_baseline(baseline("DQN"), 600, tmp_path)
+    rows = train_baseline(baseline("DQN"), 600, tmp_path)
     assert [row.env_steps for row in rows] == [200, 400, 600]
 
 
@@ -338,17 +340,17 @@ def test_extended_run_keeps_its_exploration_schedule(
         assert model.exploration_rate == pytest.approx(rate)
 
     monkeypatch.setattr(policies, "set_exploration", set_exploration)
-    run(baseline("DQN"), 100, tmp_path / "fraction")
-    run(baseline("DQN"), 100, tmp_path / "said", exploration_steps=250)
-    rows = run(baseline("DQN"), 400, tmp_path / "said", exploration_steps=999)
+    train_baseline(baseline("DQN"), 100, tmp_path / "fraction")
+    train_baseline(baseline("DQN"), 100, tmp_path / "said", exploration_steps=250)
+    rows = train_baseline(baseline("DQN"), 400, tmp_path / "said", exploration_steps=999)
     assert explored == [10, 250, 250]
     assert [row.env_steps for row in rows] == [100, 200, 400]
-    assert run(baseline("DQN"), 300, tmp_path / "said") == rows
+    assert train_baseline(baseline("DQN"), 300, tmp_path / "said") == rows
 
 
 @pytest.mark.parametrize("damage", ["shorter", "other tensors", "no state"])
 def test_damaged_state_is_rejected(damage: str, tmp_path: Path) -> None:
-    run(baseline("DQN"), 200, tmp_path)
+    train_baseline(baseline("DQN"), 200, tmp_path)
     path = tmp_path / "state.safetensors"
     if damage == "shorter":
         path.write_bytes(path.read_bytes()[:-1])
@@ -357,7 +359,7 @@ def test_damaged_state_is_rejected(damage: str, tmp_path: Path) -> None:
             metadata = file.metadata() if damage == "other tensors" else None
         safetensors.torch.save_file({"odd": torch.zeros(1)}, path, metadata)
     with pytest.raises(InvalidData, match=rf"{path}.*delete the folder {tmp_path}"):
-        run(baseline("DQN"), 400, tmp_path)
+        train_baseline(baseline("DQN"), 400, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -380,7 +382,7 @@ def test_missing_stable_baselines3_is_reported(
 ) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(ConfigError, match=r'pip install "udrl\[studies\]"'):
-        run(baseline("DQN"), 100, tmp_path / "run")
+        train_baseline(baseline("DQN"), 100, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Annotation
 
 from udrl.errors import ConfigError
-from udrl_experiments.figures import learning_curves, save, sensitivity
+from udrl_experiments.figures import learning_curves, save, sensitivity_figure
 from udrl_experiments.records import Obtained
 from udrl_experiments.statistics import CurvePoint
 
@@ -99,7 +99,7 @@ def test_labels_name_environments_if_there_are_several() -> None:
         "LunarLanderSparse-v3 UDRL (20 seeds)",
     ]
     there = [msgspec.structs.replace(r, environment="LunarLanderSparse-v3") for r in obtained(1)]
-    assert list(labelled(sensitivity([*obtained(1), *there], "both")))[1:] == [
+    assert list(labelled(sensitivity_figure([*obtained(1), *there], "both")))[1:] == [
         "LunarLander-v3 seed 1",
         "LunarLanderSparse-v3 seed 1",
     ]
@@ -139,7 +139,7 @@ def test_algorithms_have_fixed_styles() -> None:
         lambda: learning_curves(ALL, ""),
         lambda: learning_curves([*ALL, *MANY], ""),
         lambda: learning_curves(MANY, ""),
-        lambda: sensitivity([row for seed in range(1, 21) for row in obtained(seed)], ""),
+        lambda: sensitivity_figure([row for seed in range(1, 21) for row in obtained(seed)], ""),
     ],
 )
 def test_lines_differ_in_greyscale(draw: Callable[[], Figure]) -> None:
@@ -163,7 +163,7 @@ def test_every_line_shows_its_marker_at_any_length() -> None:
 
 def test_sensitivity_has_a_line_for_each_seed_and_the_diagonal() -> None:
     rows = [*obtained(2, [200, 0, 100]), *obtained(1)]
-    figure = sensitivity(rows, "LunarLander")
+    figure = sensitivity_figure(rows, "LunarLander")
     lines = labelled(figure)
     assert list(lines) == ["obtained = desired", "seed 1", "seed 2"]
     (axes,) = figure.axes
@@ -177,7 +177,7 @@ def test_sensitivity_has_a_line_for_each_seed_and_the_diagonal() -> None:
 
 
 def test_error_bars_are_the_standard_deviation() -> None:
-    (axes,) = sensitivity(obtained(1), "").axes
+    (axes,) = sensitivity_figure(obtained(1), "").axes
     (bars,) = axes.collections
     assert isinstance(bars, LineCollection)
     assert [np.asarray(segment)[:, 1].tolist() for segment in bars.get_segments()] == [
@@ -187,7 +187,7 @@ def test_error_bars_are_the_standard_deviation() -> None:
 
 DRAWINGS: list[Callable[[], Figure]] = [
     lambda: learning_curves(ALL, "LunarLander", references={"solved": 200}),
-    lambda: sensitivity([*obtained(1), *obtained(2)], "LunarLander"),
+    lambda: sensitivity_figure([*obtained(1), *obtained(2)], "LunarLander"),
 ]
 
 
@@ -237,7 +237,7 @@ def test_empty_table_is_an_error() -> None:
     with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
         learning_curves([], "lander")
     with pytest.raises(ConfigError, match="lander: the table of the figure is empty; expected"):
-        sensitivity([], "lander")
+        sensitivity_figure([], "lander")
 
 
 @pytest.mark.parametrize("draw", DRAWINGS)

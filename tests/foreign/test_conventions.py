@@ -14,7 +14,7 @@ from udrl.environments import make_environment
 from udrl.episode import Episode
 from udrl.errors import EnvironmentFault, UdrlError
 from udrl.streams import Purpose, stream_key
-from udrl_replay.creation import create
+from udrl_replay.creation import create_run
 
 COMMAND = Command(
     id=0, kind="warm_up", desired_return=0.0, desired_horizon=1, environment_seed=7,
@@ -48,7 +48,7 @@ def test_ambiguous_conventions_are_rejected_when_a_run_is_created(
 ) -> None:
     came, declared = REFUSED[kind]
     with pytest.raises(UdrlError) as refusal:
-        create(tmp_path / "run", config(kind))
+        create_run(tmp_path / "run", config(kind))
     assert isinstance(refusal.value, EnvironmentFault)
     assert came in str(refusal.value)
     assert declared in str(refusal.value)
@@ -77,7 +77,7 @@ def test_error_in_close_is_logged_and_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "udrl"):
-        create(tmp_path / "run", config(ClosesWithAnError)).close()
+        create_run(tmp_path / "run", config(ClosesWithAnError)).close()
     assert "failed in close(): AttributeError: 'NoneType' object" in caplog.text
 
 

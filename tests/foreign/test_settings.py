@@ -18,7 +18,7 @@ from udrl.config import Budget, Config, build, read_toml
 from udrl.environments import make_environment
 from udrl.environments.making import INDEX
 from udrl.errors import UnsupportedEnvironment
-from udrl_replay.creation import create, write_config
+from udrl_replay.creation import create_run, write_config
 
 NESTED = {"layout": ["SF", "FG"], "robot": {"arms": [{"length": 1.5}, {"length": 2}], "on": True}}
 
@@ -35,7 +35,7 @@ def test_keyword_arguments_may_be_lists_and_tables(tmp_path: Path) -> None:
     assert isinstance(layout, Layout)
     assert layout.given == NESTED
     # They can be stored, and written as TOML.
-    create(tmp_path / "run", config).close()
+    create_run(tmp_path / "run", config).close()
     write_config(tmp_path / "run", config, Budget())
     assert read_toml(tmp_path / "run" / "config.toml")["environment_kwargs"] == NESTED
 

@@ -43,7 +43,7 @@ from udrl_proto.messages import (
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
 from udrl_proto.transport import EncodedReply
-from udrl_replay.creation import create
+from udrl_replay.creation import create_run
 from udrl_replay.replay_service import ReplayService
 
 CONFIG = build(
@@ -86,7 +86,7 @@ class World:
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(dir=_MEMORY)
         run_dir = Path(self._folder.name)
-        self._store = create(run_dir, CONFIG)
+        self._store = create_run(run_dir, CONFIG)
         self._exchange = Exchange()
         transport = MemoryTransport(self._exchange)
         budget = Budget(max_env_steps=2**53)

@@ -12,12 +12,14 @@ from tests.foreign.conventions import Plain, ResetsToObservation, register
 from tests.foreign.test_determinism import Unseeded
 from udrl.config import Config, build
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
-from udrl_inspect.checking import check
+from udrl_inspect.checking import check_environment
 from udrl_launch.cli import cli
 
 
 def checked(kind: type[Plain], **settings: Any) -> Any:
-    return check(build(Config, {"environment": register(kind), "return_scale": 0.3} | settings))
+    return check_environment(
+        build(Config, {"environment": register(kind), "return_scale": 0.3} | settings)
+    )
 
 
 def test_report_on_an_environment() -> None:
@@ -76,7 +78,7 @@ def test_unsupported_environment_is_rejected() -> None:
     with pytest.raises(EnvironmentFault, match=r"reset\(\) returned an array"):
         checked(ResetsToObservation)
     with pytest.raises(UnsupportedEnvironment, match="no step limit"):
-        check(build(Config, {"environment": register(Plain, max_steps=None)}))
+        check_environment(build(Config, {"environment": register(Plain, max_steps=None)}))
 
 
 def test_command_checks_the_settings_of_a_preset() -> None:
@@ -103,7 +105,7 @@ def test_command_prints_lines_or_json() -> None:
 
 def test_automatic_settings_are_chosen_and_listed() -> None:
     config = build(Config, {"environment": "FrozenLake-v1"})
-    chosen = check(config, ("baseline", "n_warm_up_episodes", "horizon_scale")).chosen
+    chosen = check_environment(config, ("baseline", "n_warm_up_episodes", "horizon_scale")).chosen
     assert chosen["baseline"] == "action_value"
     assert chosen["horizon_scale"] == 0
     assert int(chosen["n_warm_up_episodes"] or 0) > 300

@@ -10,7 +10,7 @@ import pytest
 
 from udrl.config import Budget, Config
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 from whole_run import Cli, assert_conserved, small
 
@@ -40,7 +40,7 @@ def run(tmp_path: Path) -> Callable[..., Status]:
             Budget(max_env_steps=max_env_steps, stop_return=stop_return),
             Fleet(actors=actors, envs_per_actor=envs),
         )
-        status = train(
+        status = run_training(
             settings,
             run_dir or tmp_path / f"run{number}",
             threading.Event(),
@@ -60,7 +60,7 @@ def ended_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of a short run on CartPole; tests must not change it."""
     run_dir = tmp_path_factory.mktemp("ended") / "cart"
     settings = Settings(small(), Budget(max_env_steps=3000), Fleet(actors=1, envs_per_actor=16))
-    assert train(settings, run_dir, threading.Event(), in_process=True).state == "ended"
+    assert run_training(settings, run_dir, threading.Event(), in_process=True).state == "ended"
     return run_dir
 
 

@@ -13,7 +13,7 @@ from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_folder
 from udrl_launch import api
 from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
-from udrl_replay.creation import create
+from udrl_replay.creation import create_run
 from udrl_replay.reporting import history
 from udrl_replay.store import Store
 from whole_run import SMALL, digests, small
@@ -81,7 +81,7 @@ def test_events_are_passed_once_and_in_order(tmp_path: Path) -> None:
 
 def test_run_stopped_in_its_warm_up_reports_all_iterations_on_resume(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
-    create(run_dir, small()).close()
+    create_run(run_dir, small()).close()
     seen: list[int] = []
     udrl.train(
         "CartPole-v1", run_dir=run_dir, resume=True, max_env_steps=500,
@@ -94,7 +94,7 @@ def test_failed_run_calls_on_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def fail(*_: object, **__: object) -> None:
         raise RunFailed("an environment crashed")
 
-    create(tmp_path / "run", small()).close()
+    create_run(tmp_path / "run", small()).close()
     monkeypatch.setattr(api, "run_training", fail)
     ends: list[Status] = []
     with pytest.raises(RunFailed, match="crashed"):

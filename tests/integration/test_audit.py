@@ -13,7 +13,7 @@ from udrl.episode import Episode
 from udrl.errors import Deceived, UdrlError
 from udrl_inspect.inspection import status_of
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.codec import encode_episode
 from udrl_proto.reports import Status
 from whole_run import assert_conserved, digests, toy
@@ -48,16 +48,16 @@ def test_false_episode_fails_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(udrl_actor.outbox, "encode_episode", deliver_false)
     settings = Settings(toy(lead=2), Budget(max_env_steps=100 * BUDGET), FLEET)
 
-    def run_training(*, resume: bool) -> None:
-        train(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
+    def train(*, resume: bool) -> None:
+        run_training(settings, tmp_path / "run", threading.Event(), in_process=True, audit=1.0,
               resume=resume)  # fmt: skip
 
     with pytest.raises(UdrlError, match=r"false episode|quarantined"):
-        run_training(resume=False)
+        train(resume=False)
     status = status_of(tmp_path / "run")
     assert status.state == "failed"
     assert [actor.id for actor in status.quarantined] == false_actors
     assert f"actor {false_actors[0]} delivered a false episode" in status.problem
     assert_conserved(status)
     with pytest.raises(Deceived, match=false_actors[0]):
-        run_training(resume=True)
+        train(resume=True)

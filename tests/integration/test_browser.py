@@ -25,7 +25,7 @@ from udrl_inspect.inspection import read_status
 from udrl_inspect.obedience_report import measure, plan_commands, save_report
 from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 from whole_run import (
@@ -93,7 +93,7 @@ def obedient(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = Settings(
         build(Config, OBEDIENT), Budget(max_env_steps=1280), Fleet(actors=1, envs_per_actor=8)
     )
-    train(settings, run_dir, threading.Event(), in_process=True)
+    run_training(settings, run_dir, threading.Event(), in_process=True)
     return run_dir
 
 

@@ -32,7 +32,7 @@ def agent(tmp_path: Path) -> Path:
     env.close()
     behavior = ActingFunction(acting_graph(config.network, spec), untrained(config, spec).weights)
     policy = Policy(behavior, config, spec, desired_return=200.0, desired_horizon=300)
-    folder.save(tmp_path / "my-agent", policy, "")
+    folder.save_folder(tmp_path / "my-agent", policy, "")
     return tmp_path
 
 

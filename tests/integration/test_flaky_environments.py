@@ -14,7 +14,7 @@ from udrl.errors import EnvironmentFault, RunFailed
 from udrl_inspect.agents import reproduce
 from udrl_launch.supervisor import Supervisor
 from udrl_proto.reports import Status
-from udrl_replay.creation import create, write_config
+from udrl_replay.creation import create_run, write_config
 from udrl_replay.store import Store
 from whole_run import assert_conserved, digests, free_port, live_status, small, wait_for
 
@@ -49,7 +49,7 @@ def test_command_that_always_hangs_stops_the_run(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
     run_dir = tmp_path / "hung"
     hung = small(environment="flaky_environments:Hung-v0")
-    create(run_dir, hung).close()
+    create_run(run_dir, hung).close()
     write_config(run_dir, hung, Budget(max_env_steps=2000))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     supervisor = Supervisor(tmp_path / "logs")

@@ -12,7 +12,7 @@ from udrl.errors import StoreError
 from udrl_launch.local import Threads
 from udrl_launch.settings import Fleet, Settings
 from udrl_proto.reports import Status
-from udrl_replay.creation import create, write_config
+from udrl_replay.creation import create_run, write_config
 from whole_run import (
     SMALL,
     Cli,
@@ -73,7 +73,7 @@ def test_store_that_cannot_grow_keeps_its_ledgers_balanced(
 ) -> None:
     run_dir = tmp_path / "run"
     settings = Settings(small(), Budget(max_env_steps=BUDGET), Fleet(actors=1, envs_per_actor=4))
-    store = create(run_dir, settings.config)
+    store = create_run(run_dir, settings.config)
     write_config(run_dir, settings.config, settings.budget)
     (pages,) = store._db.execute("PRAGMA page_count").fetchone()
     store._db.execute(f"PRAGMA max_page_count = {pages + more_pages}")

@@ -28,7 +28,7 @@ from udrl_inspect.inspection import read_status
 from udrl_inspect.run_list import find
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 from udrl_show import curve
@@ -260,8 +260,8 @@ def test_folder_of_runs_is_plotted_as_means_over_seeds(ended_run: Path, tmp_path
     runs, figure = tmp_path / "runs", tmp_path / "all.svg"
     for seed in (7, 8):
         settings = Settings(small(seed=seed), Budget(max_env_steps=3000), Fleet(actors=1))
-        train(settings, runs / f"cart-{seed}", threading.Event(), in_process=True)
-    train(
+        run_training(settings, runs / f"cart-{seed}", threading.Event(), in_process=True)
+    run_training(
         Settings(toy(), Budget(max_env_steps=200), Fleet(actors=1)),
         runs / "toy", threading.Event(), in_process=True,
     )  # fmt: skip
@@ -364,7 +364,7 @@ def test_commands_and_values_are_completed(ended_run: Path) -> None:
 def test_kept_versions_can_act_and_others_are_missing(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     settings = Settings(toy(lead=0), Budget(max_env_steps=400, keep_versions=1), Fleet(actors=1))
-    ended = train(settings, run_dir, threading.Event(), in_process=True)
+    ended = run_training(settings, run_dir, threading.Event(), in_process=True)
     assert digests(ended) == digests(reference(toy(lead=0), 400))
     with closing(Store(run_dir, read_only=True)) as store:
         evaluated = {e.iteration for e in store.evaluations(-1, 2**62)}

@@ -25,7 +25,7 @@ from udrl_inspect.obedience_report import (
 from udrl_inspect.obedience_text import answer, markdown
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from whole_run import OBEDIENT
 
 
@@ -43,7 +43,7 @@ def obedient(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = Settings(
         build(Config, OBEDIENT), Budget(max_env_steps=1280), Fleet(actors=1, envs_per_actor=8)
     )
-    train(settings, run_dir, threading.Event(), in_process=True)
+    run_training(settings, run_dir, threading.Event(), in_process=True)
     return run_dir
 
 

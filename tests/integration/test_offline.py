@@ -22,7 +22,7 @@ from udrl.spaces import Image, Vector
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 from whole_run import digests, small
@@ -165,7 +165,7 @@ def test_run_resumes_without_the_dataset(
 def test_changed_dataset_of_the_same_name_is_detected(dataset: str, tmp_path: Path) -> None:
     settings = Settings(offline(dataset, dataset_sha256="0" * 64), Budget(), Fleet())
     with pytest.raises(ConfigError, match=r"expected [0-9a-f]+; restore the dataset"):
-        train(settings, tmp_path / "run", threading.Event(), in_process=True)
+        run_training(settings, tmp_path / "run", threading.Event(), in_process=True)
 
 
 def test_run_with_another_dataset_is_another_configuration(

@@ -23,7 +23,7 @@ from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_proto.session import connect, find_run
 from udrl_proto.zenoh_transport import ZenohTransport
-from udrl_replay.creation import create
+from udrl_replay.creation import create_run
 from whole_run import assert_conserved, digests, free_port, reference, toy
 
 BUDGET = 300
@@ -35,7 +35,7 @@ class Hosted:
     def __init__(self, run_dir: Path) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.stop = threading.Event()
-        store = create(run_dir, toy(lead=0))
+        store = create_run(run_dir, toy(lead=0))
         self._thread = threading.Thread(
             target=roles.replay,
             args=(run_dir, store, Budget(max_env_steps=BUDGET), self.stop),

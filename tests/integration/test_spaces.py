@@ -18,7 +18,7 @@ from udrl.rollout import Rollout
 from udrl_inspect.agents import Agent, evaluation_commands, load_agent
 from udrl_inspect.exporting import export_buffer
 from udrl_launch.settings import Fleet, Settings
-from udrl_launch.training_run import train
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 from whole_run import SMALL, digests, reference
 
@@ -51,7 +51,7 @@ def test_run_with_composite_spaces_equals_the_reference(frame_stack: int, run: R
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("nested") / "run"
     settings = Settings(nested(), Budget(max_env_steps=1000), Fleet(actors=1, envs_per_actor=16))
-    train(settings, made, threading.Event(), in_process=True)
+    run_training(settings, made, threading.Event(), in_process=True)
     return made
 
 

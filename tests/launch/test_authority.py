@@ -14,7 +14,7 @@ from udrl.errors import ConfigError
 from udrl_launch import authority
 from udrl_launch.cli import cli
 from udrl_proto.access import ROLES
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 
 
 def certificate(folder: Path, role: str) -> x509.Certificate:
@@ -30,13 +30,13 @@ def test_command_creates_keys_for_each_role(tmp_path: Path) -> None:
     assert "stays here" in result.output
     now = datetime.now(UTC)
     for role in ROLES:
-        load(folder, role)
+        load_credentials(folder, role)
         left = certificate(folder, role).not_valid_after_utc - now
         assert timedelta(days=9, hours=23) < left <= timedelta(days=10)
 
 
 def test_private_keys_are_owner_only_and_distinct(tmp_path: Path) -> None:
-    authority.create(tmp_path / "keys")
+    authority.create_keys(tmp_path / "keys")
     private = [*tmp_path.rglob("key.pem"), *tmp_path.rglob("ca.key")]
     assert len({path.read_bytes() for path in private}) == len(ROLES) + 1
     assert {stat.S_IMODE(path.stat().st_mode) for path in private} == {0o600}
@@ -46,7 +46,7 @@ def test_private_keys_are_owner_only_and_distinct(tmp_path: Path) -> None:
 
 
 def test_only_the_replay_service_gets_a_server_certificate(tmp_path: Path) -> None:
-    authority.create(tmp_path, ["replay.example.org", "10.0.0.1", "fd00::1", "localhost"])
+    authority.create_keys(tmp_path, ["replay.example.org", "10.0.0.1", "fd00::1", "localhost"])
     for role in ROLES:
         found = certificate(tmp_path, role).extensions
         purposes = found.get_extension_for_class(x509.ExtendedKeyUsage).value
@@ -66,15 +66,15 @@ def test_only_the_replay_service_gets_a_server_certificate(tmp_path: Path) -> No
 @pytest.mark.parametrize("host", ["", "a b", "tls/a:1", "a:1", "-a", "a..b", "ä", "a" * 64, "*.a"])
 def test_invalid_host_is_rejected_and_nothing_is_written(host: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--host .*: expected a host name or an IP address"):
-        authority.create(tmp_path / "keys", [host])
+        authority.create_keys(tmp_path / "keys", [host])
     assert not (tmp_path / "keys").exists()
 
 
 def test_existing_keys_are_not_overwritten(tmp_path: Path) -> None:
-    authority.create(tmp_path)
+    authority.create_keys(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
     with pytest.raises(ConfigError, match=r"is not empty.*never overwritten.*another folder"):
-        authority.create(tmp_path)
+        authority.create_keys(tmp_path)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.pem")}
 
 
@@ -92,11 +92,11 @@ def test_empty_folders_may_exist_and_existing_keys_may_be_reused(tmp_path: Path)
 
 
 def test_reused_keys_must_be_valid_for_the_hosts(tmp_path: Path) -> None:
-    authority.create(tmp_path / "keys", ["10.0.0.1"])
+    authority.create_keys(tmp_path / "keys", ["10.0.0.1"])
     assert authority.has_keys(tmp_path / "keys", ["localhost", "10.0.0.1"])
     with pytest.raises(ConfigError, match=r"not valid for --host 10\.0\.0\.2; remove them"):
         authority.has_keys(tmp_path / "keys", ["10.0.0.1", "10.0.0.2"])
-    authority.create(tmp_path / "old", valid=timedelta(seconds=-1))
+    authority.create_keys(tmp_path / "old", valid=timedelta(seconds=-1))
     with pytest.raises(ConfigError, match="expired"):
         authority.has_keys(tmp_path / "old")
 
@@ -107,7 +107,7 @@ def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
         with pytest.raises(
             ConfigError, match=rf"cannot write keys to {folder}: (File exists|Not a directory)"
         ):
-            authority.create(folder)
+            authority.create_keys(folder)
 
 
 def test_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,5 +41,5 @@ def test_stop_while_connecting_prints_how_to_resume(
     settings = gather("Figure2-v0", preset_name="none", options=TOY)
     command = f"udrl train Figure2-v0 --run-dir {tmp_path / 'run'} --resume"
     with pytest.raises(Interrupted, match=f"^stopped; resume with: {command}$"):
-        training_run.train(settings, tmp_path / "run", stop, in_process=True)
+        training_run.run_training(settings, tmp_path / "run", stop, in_process=True)
     assert UnresponsiveServices.ended

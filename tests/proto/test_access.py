@@ -21,7 +21,7 @@ from udrl_launch import authority
 from udrl_proto import key_expressions, verbs
 from udrl_proto import session as sessions
 from udrl_proto.access import RIGHTS, ROLES
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from whole_run import configured_router, wait_for
 
 DEADLINE_S = 10.0
@@ -70,7 +70,7 @@ class Replay:
 
 @pytest.fixture(params=["hosts the router", "connects to a router"])
 def replay(request: pytest.FixtureRequest, endpoint: str, keys_dir: Path) -> Iterator[Replay]:
-    secure, credentials = endpoint.replace("tcp", "tls"), load(keys_dir, "replay")
+    secure, credentials = endpoint.replace("tcp", "tls"), load_credentials(keys_dir, "replay")
     hosts_router = request.param == "hosts the router"
     with ExitStack() as stack:
         if hosts_router:
@@ -87,7 +87,7 @@ def connect(replay: Replay, secure_endpoint: str, keys_dir: Path) -> Iterator[Co
     with ExitStack() as stack:
 
         def client(role: str) -> zenoh.Session:
-            credentials = load(keys_dir, role)
+            credentials = load_credentials(keys_dir, role)
             session = sessions.connect(secure_endpoint, DEADLINE_S, credentials=credentials)
             return stack.enter_context(session)
 
@@ -160,7 +160,7 @@ def test_connection_without_certificate_is_refused(
 def test_key_of_another_authority_is_refused_by_both_sides(
     replay: Replay, secure_endpoint: str, keys_dir: Path, foreign_keys_dir: Path
 ) -> None:
-    foreign = load(foreign_keys_dir, "actor")
+    foreign = load_credentials(foreign_keys_dir, "actor")
     with pytest.raises(ConfigError, match=r"not trusted.*same `udrl keys create`"):
         sessions.connect(secure_endpoint, DEADLINE_S, credentials=foreign)
     # A client that trusts this server is still not trusted by it.
@@ -174,39 +174,43 @@ def test_only_the_replay_service_can_be_a_server(
     role: str, secure_endpoint: str, keys_dir: Path
 ) -> None:
     with (
-        sessions.listen(secure_endpoint, credentials=load(keys_dir, role)),
+        sessions.listen(secure_endpoint, credentials=load_credentials(keys_dir, role)),
         pytest.raises(ConfigError, match="is not trusted"),
     ):
-        sessions.connect(secure_endpoint, DEADLINE_S, credentials=load(keys_dir, "learner"))
+        sessions.connect(
+            secure_endpoint, DEADLINE_S, credentials=load_credentials(keys_dir, "learner")
+        )
 
 
 def test_server_of_another_name_is_refused(secure_endpoint: str, keys_dir: Path) -> None:
     everywhere = secure_endpoint.replace("127.0.0.1", "0.0.0.0")
     other = secure_endpoint.replace("127.0.0.1", "127.0.0.2")
     with (
-        sessions.listen(everywhere, credentials=load(keys_dir, "replay")),
+        sessions.listen(everywhere, credentials=load_credentials(keys_dir, "replay")),
         pytest.raises(ConfigError, match=r"not trusted.*mismatch.* --host 127\.0\.0\.2"),
     ):
-        sessions.connect(other, DEADLINE_S, credentials=load(keys_dir, "actor"))
+        sessions.connect(other, DEADLINE_S, credentials=load_credentials(keys_dir, "actor"))
 
 
 def test_connecting_to_a_secure_endpoint_without_router_times_out(
     secure_endpoint: str, keys_dir: Path
 ) -> None:
     with pytest.raises(Unreachable, match="no reply from"):
-        sessions.connect(secure_endpoint, 0.1, credentials=load(keys_dir, "actor"))
+        sessions.connect(secure_endpoint, 0.1, credentials=load_credentials(keys_dir, "actor"))
 
 
 def test_link_is_closed_when_the_keys_expire(secure_endpoint: str, tmp_path: Path) -> None:
-    authority.create(tmp_path, valid=timedelta(seconds=4))
+    authority.create_keys(tmp_path, valid=timedelta(seconds=4))
     with (
-        sessions.listen(secure_endpoint, credentials=load(tmp_path, "replay")),
-        sessions.connect(secure_endpoint, 3, credentials=load(tmp_path, "actor")) as client,
+        sessions.listen(secure_endpoint, credentials=load_credentials(tmp_path, "replay")),
+        sessions.connect(
+            secure_endpoint, 3, credentials=load_credentials(tmp_path, "actor")
+        ) as client,
     ):
         assert list(client.info.routers_zid())
         wait_for(lambda: not list(client.info.routers_zid()), "the link to close")
     with pytest.raises(ConfigError, match="expired"):
-        load(tmp_path, "actor")
+        load_credentials(tmp_path, "actor")
 
 
 # Requests and replies.
@@ -263,7 +267,7 @@ def test_actor_cannot_impersonate_the_replay_service(replay: Replay, connect: Co
 def test_peer_with_an_actors_key_has_the_rights_of_a_client(
     replay: Replay, connect: Connect, secure_endpoint: str, keys_dir: Path
 ) -> None:
-    own = load(keys_dir, "actor")
+    own = load_credentials(keys_dir, "actor")
     tls = {
         "root_ca_certificate": own.ca,
         "connect_certificate": own.certificate,

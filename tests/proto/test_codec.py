@@ -30,7 +30,7 @@ from udrl_proto.codec import (
     encode_episode,
 )
 from udrl_proto.messages import (
-    Array,
+    ArrayMessage,
     CommandsRequest,
     EpisodeMessage,
     Hello,
@@ -39,7 +39,7 @@ from udrl_proto.messages import (
     Problem,
     VersionMessage,
     Wait,
-    Weights,
+    WeightsMessage,
     WeightsRequest,
 )
 
@@ -127,13 +127,13 @@ def packed(**fields: Any) -> bytes:
         (b"\x80\x80", HelloRequest, "extra data"),
         (b"\x90", HelloRequest, "Expected `object`"),
         (packed(surplus=1), HelloRequest, "unknown field `surplus`"),
-        (packed(version=1), Weights, "missing required field `weights`"),
+        (packed(version=1), WeightsMessage, "missing required field `weights`"),
         (packed(version="newest"), WeightsRequest, "newest"),
         (packed(version=1.0), WeightsRequest, "`$.version`"),
         (packed(version=True), WeightsRequest, "`$.version`"),
         (packed(version=-1), WeightsRequest, ">= 0"),
         (packed(version=2**63), WeightsRequest, "<= 4611686018427387904"),
-        (packed(version=1, weights="AAAA"), Weights, "Expected `bytes`"),
+        (packed(version=1, weights="AAAA"), WeightsMessage, "Expected `bytes`"),
         (packed(code="a/b", message=""), Problem, "`$.code`"),
         (packed(code="*", message=""), Problem, "`$.code`"),
         (packed(code="a\n", message=""), Problem, "`$.code`"),
@@ -239,16 +239,16 @@ def test_size_is_checked_before_decoding(monkeypatch: pytest.MonkeyPatch) -> Non
         pytest.fail("decoded")
 
     monkeypatch.setattr(msgpack, "unpackb", unpackb)
-    with pytest.raises(InvalidMessage, match=r"^Weights: 11 bytes, at most 10 are allowed$"):
-        decode(bytes(11), Weights, limit=10)
+    with pytest.raises(InvalidMessage, match=r"^WeightsMessage: 11 bytes, at most 10 are allowed$"):
+        decode(bytes(11), WeightsMessage, limit=10)
 
 
 def test_bytes_of_a_message_may_fill_its_limit() -> None:
-    message = Weights(version=1, weights=bytes(2 * SMALL))
+    message = WeightsMessage(version=1, weights=bytes(2 * SMALL))
     data = encode(message)
-    assert decode(data, Weights, len(data)) == message
+    assert decode(data, WeightsMessage, len(data)) == message
     with pytest.raises(InvalidMessage, match="at most"):
-        decode(data, Weights, len(data) - 1)
+        decode(data, WeightsMessage, len(data) - 1)
 
 
 def test_invalid_unicode_is_replaced_when_encoded() -> None:
@@ -271,7 +271,7 @@ shapes = arrays.array_shapes(min_dims=0, max_dims=4, max_side=5)
 
 @given(arrays.arrays(dtypes, shapes))
 def test_array_round_trips(array: np.typing.NDArray[Any]) -> None:
-    decoded = decode_array(decode(encode(encode_array(array)), Array))
+    decoded = decode_array(decode(encode(encode_array(array)), ArrayMessage))
     assert decoded.dtype == array.dtype
     assert decoded.shape == array.shape
     assert decoded.tobytes() == array.tobytes()
@@ -284,7 +284,9 @@ def test_array_round_trips(array: np.typing.NDArray[Any]) -> None:
 )
 def test_array_is_encoded_little_endian_and_row_major(arrange: Callable[[Any], Any]) -> None:
     rows = np.arange(6, dtype="<f4").reshape(2, 3)
-    assert encode_array(arrange(rows)) == Array(dtype="<f4", shape=(2, 3), data=rows.tobytes())
+    assert encode_array(arrange(rows)) == ArrayMessage(
+        dtype="<f4", shape=(2, 3), data=rows.tobytes()
+    )
 
 
 def test_decoded_array_is_read_only() -> None:
@@ -295,7 +297,7 @@ def test_decoded_array_is_read_only() -> None:
     "shape", [(), (2,), (4, 1), (3, 2), (2**62,), (2**62, 4), (2**62,) * 4, (2**32, 2**32)]
 )
 def test_array_whose_bytes_do_not_match_its_shape_is_rejected(shape: tuple[int, ...]) -> None:
-    message = decode(packed(dtype="<f4", shape=shape, data=bytes(12)), Array)
+    message = decode(packed(dtype="<f4", shape=shape, data=bytes(12)), ArrayMessage)
     with pytest.raises(InvalidMessage, match="12 bytes for <f4"):
         decode_array(message)
 
@@ -316,8 +318,8 @@ def test_array_whose_bytes_do_not_match_its_shape_is_rejected(shape: tuple[int, 
     ],
 )
 def test_invalid_array_is_rejected(fields: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(InvalidMessage, match=r"^Array: ") as caught:
-        decode(packed(**{"dtype": "<f4", "shape": [1], "data": bytes(4), **fields}), Array)
+    with pytest.raises(InvalidMessage, match=r"^ArrayMessage: ") as caught:
+        decode(packed(**{"dtype": "<f4", "shape": [1], "data": bytes(4), **fields}), ArrayMessage)
     assert complaint in str(caught.value)
 
 

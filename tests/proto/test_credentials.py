@@ -14,7 +14,7 @@ import zenoh
 from udrl.errors import ConfigError
 from udrl_launch import authority
 from udrl_proto.access import ROLES
-from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
+from udrl_proto.credentials import CA, CERTIFICATE, KEY, load_credentials
 
 
 @pytest.fixture
@@ -25,18 +25,18 @@ def folder(keys_dir: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("role", ROLES)
 def test_shared_folder_and_own_folder_give_the_same_credentials(role: str, keys_dir: Path) -> None:
-    assert load(keys_dir, role) == load(keys_dir / role, role)
+    assert load_credentials(keys_dir, role) == load_credentials(keys_dir / role, role)
 
 
 def test_copied_folder_may_have_any_name(folder: Path) -> None:
-    assert load(folder, "actor").key == folder / KEY
+    assert load_credentials(folder, "actor").key == folder / KEY
 
 
 @pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
 def test_missing_file_is_reported(name: str, folder: Path) -> None:
     (folder / name).unlink()
     with pytest.raises(ConfigError, match=rf"{name}: No such file.*`udrl keys create`.*actor$"):
-        load(folder, "actor")
+        load_credentials(folder, "actor")
 
 
 @pytest.mark.parametrize("name", [CA, CERTIFICATE, KEY])
@@ -44,7 +44,7 @@ def test_unreadable_file_is_reported(name: str, folder: Path) -> None:
     (folder / name).unlink()
     (folder / name).mkdir()  # root can read files of any mode
     with pytest.raises(ConfigError, match=rf"{name}: Is a directory.*`udrl keys create`"):
-        load(folder, "actor")
+        load_credentials(folder, "actor")
 
 
 @pytest.mark.parametrize(
@@ -57,34 +57,34 @@ def test_unreadable_file_is_reported(name: str, folder: Path) -> None:
 def test_damaged_file_is_reported(name: str, kind: str, content: bytes, folder: Path) -> None:
     (folder / name).write_bytes(content)
     with pytest.raises(ConfigError, match=rf"{name}: not {kind} in PEM.*copy it again"):
-        load(folder, "actor")
+        load_credentials(folder, "actor")
 
 
 def test_key_of_another_certificate_is_reported(folder: Path, keys_dir: Path) -> None:
     shutil.copy(keys_dir / "learner" / KEY, folder)
     with pytest.raises(ConfigError, match=r"key\.pem is not the key of .*cert\.pem; copy both"):
-        load(folder, "actor")
+        load_credentials(folder, "actor")
 
 
 def test_certificate_of_another_authority_is_reported(folder: Path, foreign_keys_dir: Path) -> None:
     shutil.copy(foreign_keys_dir / "actor" / CA, folder)
     with pytest.raises(ConfigError, match=r"cert\.pem was not issued by .*ca\.pem; copy both"):
-        load(folder, "actor")
+        load_credentials(folder, "actor")
 
 
 def test_certificate_of_another_role_is_reported(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"for the role 'actor', expected 'learner'.*folder"):
-        load(folder, "learner")
+        load_credentials(folder, "learner")
 
 
 def _until_a_minute_ago(folder: Path) -> None:
-    authority.create(folder, valid=timedelta(minutes=-1))
+    authority.create_keys(folder, valid=timedelta(minutes=-1))
 
 
 def _from_tomorrow(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(authority, "_CLOCKS_DIFFER", timedelta(days=-1))
-        authority.create(folder, valid=timedelta(days=2))
+        authority.create_keys(folder, valid=timedelta(days=2))
 
 
 @pytest.mark.parametrize(
@@ -99,16 +99,16 @@ def test_certificate_outside_its_validity_period_is_reported(
 ) -> None:
     make(tmp_path)
     with pytest.raises(ConfigError, match=rf"ca\.pem.*{message}"):
-        load(tmp_path, "actor")
+        load_credentials(tmp_path, "actor")
 
 
 def test_key_readable_by_others_is_warned_of(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    load(folder, "actor")
+    load_credentials(folder, "actor")
     assert caplog.messages == []
     (folder / KEY).chmod(0o640)
-    load(folder, "actor")
+    load_credentials(folder, "actor")
     assert caplog.messages == [f"{folder / KEY} can be read by others; chmod 600 it"]
 
 
@@ -123,13 +123,13 @@ def test_key_owned_by_root_may_be_group_readable(
 ) -> None:
     (folder / KEY).chmod(mode)
     monkeypatch.setattr(os, "geteuid", lambda: 10001)
-    load(folder, "actor")
+    load_credentials(folder, "actor")
     assert len(caplog.messages) == warnings
 
 
 def test_settings_contain_paths_and_no_secrets(folder: Path) -> None:
     config = zenoh.Config()
-    for name, value in load(folder, "actor").settings().items():
+    for name, value in load_credentials(folder, "actor").settings().items():
         config.insert_json5(name, json.dumps(value))
     assert str(folder / KEY) in str(config)
     assert (folder / KEY).read_text().splitlines()[1] not in str(config)
@@ -140,4 +140,4 @@ def test_missing_extra_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.delattr("udrl_proto.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)
     with pytest.raises(ConfigError, match=r'--keys needs .*pip install "udrl\[secure\]"'):
-        load(folder, "actor")
+        load_credentials(folder, "actor")

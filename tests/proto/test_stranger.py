@@ -31,7 +31,7 @@ from udrl.training import untrained
 from udrl_learner.learner_service import LearnerService
 from udrl_proto.session import find_run
 from udrl_proto.zenoh_transport import ZenohTransport
-from udrl_replay.creation import create
+from udrl_replay.creation import create_run
 from udrl_replay.replay_service import ReplayService
 
 CONFIG = build(
@@ -214,7 +214,7 @@ def test_stranger_serves_a_run(
     budget = Budget(max_env_steps=300)
     stop = threading.Event()
     with ExitStack() as stack:
-        store = create(tmp_path, CONFIG)
+        store = create_run(tmp_path, CONFIG)
         stack.callback(store.close)
         service = ReplayService(ZenohTransport(router), store, budget, tmp_path)
         stack.callback(service.close)

@@ -27,7 +27,7 @@ from udrl.spaces import Vector
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello, JoinRequest
-from udrl_replay.arrival import Arrival, inspect
+from udrl_replay.arrival import Arrival, inspect_episode
 from udrl_replay.progress import RunProgress
 from udrl_replay.run import StoredRun
 from udrl_replay.run_state import RunState
@@ -106,7 +106,7 @@ def episode(command: Command, weights: bytes, other: bool = False) -> Episode:
 
 def arrive(made: Episode, actor: str = "a") -> Arrival:
     """Encode, decode and check an episode."""
-    return inspect(decode(encode_episode(made, actor), EpisodeMessage), SPEC)
+    return inspect_episode(decode(encode_episode(made, actor), EpisodeMessage), SPEC)
 
 
 def entry(made: Episode) -> Entry:

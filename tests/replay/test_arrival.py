@@ -14,8 +14,8 @@ from udrl.errors import InvalidMessage
 from udrl.replay import Entry
 from udrl.spaces import Vector
 from udrl_proto.codec import decode, decode_episode, encode_array, encode_episode
-from udrl_proto.messages import Array, EpisodeMessage
-from udrl_replay.arrival import inspect
+from udrl_proto.messages import ArrayMessage, EpisodeMessage
+from udrl_replay.arrival import inspect_episode
 
 SPEC = EnvironmentSpec(
     observation_space=Vector(size=2), action_space=Categorical(n=3), max_episode_steps=4
@@ -40,7 +40,7 @@ def message(made: Episode) -> EpisodeMessage:
 
 
 def test_valid_episode_has_return_length_and_digest() -> None:
-    arrival = inspect(message(episode()), SPEC)
+    arrival = inspect_episode(message(episode()), SPEC)
     assert arrival.actor == "actor-1"
     assert arrival.entry == Entry(1.5, 7, 3)
     assert arrival.digest == episode_digest(episode())
@@ -51,12 +51,12 @@ def test_valid_episode_has_return_length_and_digest() -> None:
 @pytest.mark.parametrize("flags", [(True, False), (False, True), (True, True)])
 def test_episode_may_terminate_or_be_truncated_or_both(flags: tuple[bool, bool]) -> None:
     made = episode(terminated=flags[0], truncated=flags[1])
-    assert inspect(message(made), SPEC).digest == episode_digest(made)
+    assert inspect_episode(message(made), SPEC).digest == episode_digest(made)
 
 
 def test_digest_does_not_depend_on_the_actor() -> None:
     theirs = replace(message(episode()), actor="actor-2")
-    assert inspect(theirs, SPEC).digest == inspect(message(episode()), SPEC).digest
+    assert inspect_episode(theirs, SPEC).digest == inspect_episode(message(episode()), SPEC).digest
 
 
 def ones(*shape: int) -> np.typing.NDArray[np.float32]:
@@ -90,32 +90,32 @@ def test_invalid_episode_is_rejected_with_the_fault(
     changes: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(InvalidMessage, match=rf"^episode 7: {complaint}"):
-        inspect(message(episode(**changes)), SPEC)
+        inspect_episode(message(episode(**changes)), SPEC)
 
 
 def test_actions_of_large_action_spaces_are_signed_and_checked() -> None:
     spec = replace(SPEC, action_space=Categorical(n=1000))
     good = episode(actions=np.array([0, 1, 999], np.int32))
-    assert inspect(message(good), spec).entry.id == 7
+    assert inspect_episode(message(good), spec).entry.id == 7
     for bad in (-1, 1000):
         with pytest.raises(InvalidMessage, match=r"actions are from .*, expected 0 to 999"):
-            inspect(message(episode(actions=np.array([0, 1, bad], np.int32))), spec)
+            inspect_episode(message(episode(actions=np.array([0, 1, bad], np.int32))), spec)
 
 
 def test_array_whose_bytes_do_not_match_its_shape_is_rejected() -> None:
-    short = Array(dtype="<f4", shape=(3,), data=bytes(11))
+    short = ArrayMessage(dtype="<f4", shape=(3,), data=bytes(11))
     with pytest.raises(InvalidMessage, match=r"11 bytes for <f4 \[3\], expected 12"):
-        inspect(replace(message(episode()), rewards=short), SPEC)
+        inspect_episode(replace(message(episode()), rewards=short), SPEC)
 
 
 def test_return_is_summed_in_order_in_float64() -> None:
     rewards = np.array([1e8, 1.0, -1e8], np.float32)
-    assert inspect(message(episode(rewards=rewards)), SPEC).entry.episode_return == 1.0
+    assert inspect_episode(message(episode(rewards=rewards)), SPEC).entry.episode_return == 1.0
 
 
 def test_longest_episode_is_accepted() -> None:
     made = episode(
         observations=ones(4, 2), actions=np.zeros(4, np.uint8), rewards=ones(4), truncated=True
     )
-    assert inspect(message(made), SPEC).entry.length == SPEC.max_episode_steps
+    assert inspect_episode(message(made), SPEC).entry.length == SPEC.max_episode_steps
     assert encode_array(made.rewards).shape == (4,)

@@ -21,7 +21,7 @@ from udrl.version import __version__
 from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.messages import Hello
 from udrl_replay import creation
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.resuming import resume
 from udrl_replay.store import Store
@@ -31,7 +31,7 @@ TOY = Config(environment="Figure2-v0", max_return=2.0)
 
 @pytest.fixture
 def created(stack: ExitStack, tmp_path: Path) -> Store:
-    return stack.enter_context(closing(creation.create(tmp_path, TOY)))
+    return stack.enter_context(closing(creation.create_run(tmp_path, TOY)))
 
 
 def test_hello_of_a_new_run_is_complete(created: Store) -> None:
@@ -58,7 +58,7 @@ def test_hello_has_the_spaces_after_automatic_settings(
     environment: str, shown: bool, tmp_path: Path
 ) -> None:
     config = Config(environment=environment)
-    with closing(creation.create(tmp_path, config, automatic=["observe_time"])) as store:
+    with closing(creation.create_run(tmp_path, config, automatic=["observe_time"])) as store:
         hello = store.fact("hello", Hello)
     assert hello.config.observe_time is shown
     with closing(EpisodeGenerator(hello.config, 1)) as generator:
@@ -71,7 +71,7 @@ def test_environment_that_does_not_replay_marks_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(creation, "repeated_digest", lambda generator: "")
-    with closing(creation.create(tmp_path, TOY)) as store:
+    with closing(creation.create_run(tmp_path, TOY)) as store:
         progress = store.fact("progress", RunProgress)
         assert not progress.exact
         hello = store.fact("hello", Hello)
@@ -84,7 +84,7 @@ def test_environment_that_does_not_replay_marks_the_run(
 
 def test_unknown_environment_creates_no_run(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedEnvironment, match="Nowhere-v0"):
-        creation.create(tmp_path / "run", Config(environment="Nowhere-v0"))
+        creation.create_run(tmp_path / "run", Config(environment="Nowhere-v0"))
     assert not creation.exists(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
 
@@ -114,20 +114,20 @@ def test_other_configuration_is_rejected_with_both_values(created: Store, tmp_pa
 
 
 def test_resuming_without_a_run_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=rf"holds no run \({FILE} is missing\)"):
+    with pytest.raises(StoreError, match=rf"holds no run \({STORE_FILE} is missing\)"):
         resume(tmp_path, TOY)
 
 
 @pytest.mark.parametrize("name", ["run", "My Run.2", "-", "x" * 200, "läufe", "a" * 49 + "--b"])
 def test_run_id_is_valid_in_a_key_expression(name: str, tmp_path: Path) -> None:
-    with closing(creation.create(tmp_path / name, TOY)) as store:
+    with closing(creation.create_run(tmp_path / name, TOY)) as store:
         assert key_expressions.RUN_ID.fullmatch(store.fact("hello", Hello).run_id)
 
 
 def test_runs_of_equal_names_have_different_ids(tmp_path: Path) -> None:
     ids = set()
     for parent in ("one", "two"):
-        with closing(creation.create(tmp_path / parent / "run", TOY)) as store:
+        with closing(creation.create_run(tmp_path / parent / "run", TOY)) as store:
             ids.add(store.fact("hello", Hello).run_id)
     assert len(ids) == 2
 

@@ -18,7 +18,7 @@ from tests.replay.synthetic import BLOB, create, edit, finish, reference, result
 from udrl.config import Budget
 from udrl.errors import DamagedStore, OtherConfiguration
 from udrl_proto.codec import LARGEST
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.run import StoredRun
 from udrl_replay.schema import SEALED, seal
 from udrl_replay.store import Store, Version
@@ -34,7 +34,7 @@ def written(tmp_path: Path) -> Path:
         with store.transaction():
             store.add_version(Version(1000, b"digest", 0.5, BLOB, BLOB), 0.1)
             store.add_episode(store.buffer(1000)[0].entry._replace(id=10**9), b"digest", BLOB)
-    return tmp_path / FILE
+    return tmp_path / STORE_FILE
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def unfinished(tmp_path: Path) -> Path:
         run = StoredRun(store, Budget(max_env_steps=1000))
         for _ in range(8):
             work(run)
-    return tmp_path / FILE
+    return tmp_path / STORE_FILE
 
 
 def read_everything(run_dir: Path) -> object:
@@ -223,7 +223,7 @@ def test_restored_old_table_is_detected(tmp_path: Path) -> None:
 
     with closing(create(tmp_path)) as store:
         work_on(store)
-    file = tmp_path / FILE
+    file = tmp_path / STORE_FILE
     edit(file, "CREATE TABLE before AS SELECT * FROM commands")
     with closing(Store(tmp_path)) as store:
         work_on(store)
@@ -268,7 +268,7 @@ def test_damaged_journal_costs_work_but_changes_no_result(tmp_path: Path) -> Non
         for number in range(20):  # the state after a power cut: the file and its journal
             shutil.copytree(tmp_path / "whole", tmp_path / f"cut{number}")
     for number in range(20):
-        journal = tmp_path / f"cut{number}" / f"{FILE}-wal"
+        journal = tmp_path / f"cut{number}" / f"{STORE_FILE}-wal"
         held = bytearray(journal.read_bytes())
         assert held
         if number % 2:

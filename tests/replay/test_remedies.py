@@ -11,7 +11,7 @@ import pytest
 from tests.replay.synthetic import create, reference, result, work
 from udrl.config import Budget
 from udrl.errors import StoreError
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.remedies import database_remedy, unwritable
 from udrl_replay.reporting import MetricsFile
 from udrl_replay.run import StoredRun
@@ -63,13 +63,13 @@ def set_fact(store: Store, value: str = "x") -> None:
 
 def test_locked_file_is_not_reported_as_a_full_disk(store: Store, tmp_path: Path) -> None:
     store._db.execute("PRAGMA busy_timeout = 0")
-    with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as other:
+    with closing(sqlite3.connect(tmp_path / STORE_FILE, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreError) as locked:
             set_fact(store)
     assert str(locked.value) == (
-        f"{tmp_path / FILE} cannot be used: database is locked; nothing acknowledged is lost: "
-        "close the other program that uses the file, and restart with --resume"
+        f"{tmp_path / STORE_FILE} cannot be used: database is locked; nothing acknowledged is "
+        "lost: close the other program that uses the file, and restart with --resume"
     )
 
 
@@ -112,8 +112,8 @@ def test_reader_is_not_to_resume_the_run(store: Store, tmp_path: Path) -> None:
         with pytest.raises(StoreError) as no:
             reader.fact("schema", int)
     assert str(no.value) == (
-        f"{tmp_path / FILE} cannot be read: Cannot operate on a closed database.; check the disk "
-        "and the file, and try again"
+        f"{tmp_path / STORE_FILE} cannot be read: Cannot operate on a closed database.; check the "
+        "disk and the file, and try again"
     )
 
 

@@ -15,7 +15,7 @@ from udrl.config import Budget
 from udrl.errors import DamagedStore, OtherConfiguration, RunInUse, StoreError
 from udrl.evaluation import summarise
 from udrl_proto.codec import LARGEST
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.run import StoredRun
 from udrl_replay.schema import SCHEMA
 from udrl_replay.store import EvaluationRow, Store, Version
@@ -50,10 +50,10 @@ def test_failed_creation_leaves_no_run(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_existing_run_is_not_overwritten(tmp_path: Path) -> None:
     create(tmp_path).close()
-    before = (tmp_path / FILE).read_bytes()
+    before = (tmp_path / STORE_FILE).read_bytes()
     with pytest.raises(StoreError, match="holds a run already; add --resume"):
         create(tmp_path)
-    assert (tmp_path / FILE).read_bytes() == before
+    assert (tmp_path / STORE_FILE).read_bytes() == before
 
 
 def test_folder_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_folder_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
 
 
 def test_folder_without_a_run_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=rf"{tmp_path} holds no run \({FILE} is missing\)"):
+    with pytest.raises(StoreError, match=rf"{tmp_path} holds no run \({STORE_FILE} is missing\)"):
         Store(tmp_path)
 
 
@@ -72,7 +72,7 @@ def test_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
     create(tmp_path / name).close()
     with closing(Store(tmp_path / name)) as store:
         assert store.fact("schema", int) == SCHEMA
-    assert (tmp_path / name / FILE).exists()
+    assert (tmp_path / name / STORE_FILE).exists()
 
 
 # Locks and permissions.
@@ -124,12 +124,12 @@ def test_reader_cannot_write(store: Store, tmp_path: Path) -> None:
 
 def test_file_of_another_schema_is_rejected(tmp_path: Path) -> None:
     create(tmp_path).close()
-    edit(tmp_path / FILE, "UPDATE facts SET value = '99' WHERE name = 'schema'")
+    edit(tmp_path / STORE_FILE, "UPDATE facts SET value = '99' WHERE name = 'schema'")
     other = f"schema 99, this version of udrl reads {SCHEMA}; use"
     with pytest.raises(OtherConfiguration, match=other):
         Store(tmp_path)
     # The failed attempt has released the lock.
-    edit(tmp_path / FILE, "UPDATE facts SET value = ? WHERE name = 'schema'", b"%d" % SCHEMA)
+    edit(tmp_path / STORE_FILE, "UPDATE facts SET value = ? WHERE name = 'schema'", b"%d" % SCHEMA)
     Store(tmp_path).close()
 
 

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from udrl.environments import engine_keeper
-from udrl.environments.downsampling import AreaAverage, Image
+from udrl.environments.downsampling import AreaAverage, Pixels
 
 _SCREEN = (120, 160)
 
@@ -22,7 +22,7 @@ _mark = uuid.uuid4().hex
 _keeper: int | None = None
 
 
-class Doom(gym.Env[Image, np.int64]):
+class Doom(gym.Env[Pixels, np.int64]):
     """A ViZDoom scenario: action i presses its button i; the observation is the screen.
 
     An episode depends only on its seed and actions. The engine is a separate process; when it dies,
@@ -74,20 +74,20 @@ class Doom(gym.Env[Image, np.int64]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Image, dict[str, Any]]:
+    ) -> tuple[Pixels, dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
         self._game.set_seed(int(self.np_random.integers(2**31)))
         self._game.new_episode()
         return self._observe(), {}
 
-    def step(self, action: np.int64) -> tuple[Image, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64) -> tuple[Pixels, float, bool, bool, dict[str, Any]]:
         """Press a button for ``frame_skip`` tics. The last step returns the last known screen."""
         reward = self._game.make_action(self._buttons[action], self._frame_skip)
         terminated = self._game.is_episode_finished()
         return self._observe(), float(reward), terminated, False, {}
 
-    def render(self) -> Image | None:
+    def render(self) -> Pixels | None:
         """Return the screen, uint8 [120, 160, 3]."""
         if self.render_mode is None:
             return None
@@ -99,7 +99,7 @@ class Doom(gym.Env[Image, np.int64]):
         self._game.close()
         self._folder.cleanup()
 
-    def _observe(self) -> Image:
+    def _observe(self) -> Pixels:
         state = self._game.get_state()
         if state is not None:
             self._screen = state.screen_buffer

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from udrl.environments.conversions import channel_axis, is_image, leaves_within
 from udrl.errors import UnsupportedEnvironment
 
-Image = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 
 class Downsample(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -119,7 +119,7 @@ class AreaAverage:
         self._rows = _covered(height, to_height, exact)
         self._columns = _covered(width, to_width, exact)
 
-    def __call__(self, image: Image) -> Image:
+    def __call__(self, image: Pixels) -> Pixels:
         """Return the smaller image.
 
         Args:
@@ -134,7 +134,7 @@ class AreaAverage:
         sums = np.einsum("kj,kj...->j...", shares, image[rows])
         columns, shares = self._columns
         sums = np.einsum("kj,ikj...->ij...", shares, sums[:, columns])
-        out: Image = ((2 * sums + self._area) // (2 * self._area)).astype(np.uint8)
+        out: Pixels = ((2 * sums + self._area) // (2 * self._area)).astype(np.uint8)
         return out
 
 

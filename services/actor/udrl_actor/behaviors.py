@@ -9,7 +9,7 @@ from udrl.inference import ActingFunction
 from udrl.weights import decode_behavior
 from udrl_proto import verbs
 from udrl_proto.codec import LARGEST, decode
-from udrl_proto.messages import Hello, Weights, WeightsRequest
+from udrl_proto.messages import Hello, WeightsMessage, WeightsRequest
 from udrl_proto.replay_client import ReplayClient
 
 log = logging.getLogger("udrl")
@@ -56,7 +56,7 @@ class Behaviors:
         if payload is None:
             return
         try:
-            self._decode(decode(payload, Weights, LARGEST))
+            self._decode(decode(payload, WeightsMessage, LARGEST))
         except InvalidMessage as error:
             log.warning("an announcement of weights was ignored: %s", error)
 
@@ -82,7 +82,7 @@ class Behaviors:
                 self._changed.wait_for(lambda: self.is_announced, left)
             self.decode_announced()
 
-    def _decode(self, message: Weights) -> None:
+    def _decode(self, message: WeightsMessage) -> None:
         self._kept[message.version] = decode_behavior(self._hello.graph, message.weights)
         self.newest = max(self.newest, message.version)
         # Commands of lead + 1 iterations are outstanding, each with its own version. Discard in

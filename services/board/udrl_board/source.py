@@ -16,7 +16,7 @@ from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
 from udrl_inspect.obedience_report import ObedienceReport, load_report
 from udrl_proto import verbs
-from udrl_proto.messages import Hello, Weights, WeightsRequest
+from udrl_proto.messages import Hello, WeightsMessage, WeightsRequest
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import (
     Contents,
@@ -79,7 +79,7 @@ class Source(Protocol):
         """Return the contents of the replay buffer."""
         ...
 
-    def weights(self, version: Wanted) -> Weights:
+    def weights(self, version: Wanted) -> WeightsMessage:
         """Return a weights version that is kept."""
         ...
 
@@ -129,10 +129,10 @@ class Stored:
         with closing(Store(self._run_dir, read_only=True)) as store:
             return contents(read_run(self._run_dir, store))
 
-    def weights(self, version: Wanted) -> Weights:
+    def weights(self, version: Wanted) -> WeightsMessage:
         """Return a weights version that is kept."""
         agent = load_agent(self._run_dir, version)
-        return Weights(version=agent.version, weights=agent.weights)
+        return WeightsMessage(version=agent.version, weights=agent.weights)
 
     def obedience(self) -> ObedienceReport | None:
         """Return the report in the run's directory, or None."""
@@ -181,7 +181,7 @@ class Served:
         """Return the contents of the replay buffer."""
         return self._query(lambda client: client.request(verbs.CONTENTS, ContentsRequest()))
 
-    def weights(self, version: Wanted) -> Weights:
+    def weights(self, version: Wanted) -> WeightsMessage:
         """Return a weights version that is kept."""
         request = WeightsRequest(version=version)
         return self._query(lambda client: client.request(verbs.WEIGHTS, request))
@@ -263,7 +263,7 @@ class Directory:
         """Return the contents of the replay buffer."""
         return self._query(lambda source: source.contents())
 
-    def weights(self, version: Wanted) -> Weights:
+    def weights(self, version: Wanted) -> WeightsMessage:
         """Return a weights version that is kept."""
         return self._query(lambda source: source.weights(version))
 

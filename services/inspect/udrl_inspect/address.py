@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from udrl_proto import session as sessions
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from udrl_proto.messages import Hello
 from udrl_proto.transport import Transport
 from udrl_proto.zenoh_transport import ZenohTransport
@@ -62,7 +62,7 @@ def connected(
         Interrupted: ``stop`` was set.
     """
     endpoint, run_id, patience_s, keys = address
-    credentials = load(keys, role) if keys else None
+    credentials = load_credentials(keys, role) if keys else None
     session = sessions.connect(endpoint, patience_s, stop, credentials)
     with sessions.closed_at_the_end(session):
         yield ZenohTransport(session), sessions.find_run(session, run_id, patience_s, stop)

@@ -16,7 +16,7 @@ from udrl.environments.making import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import Evaluation, summarise
-from udrl.folder import load as load_folder
+from udrl.folder import load_folder
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.replay import ReplayBuffer
@@ -24,7 +24,7 @@ from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_inspect.hub import HUB_SCHEME, download
 from udrl_proto.messages import Hello
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
@@ -120,7 +120,7 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
         Unreachable: the Hub does not answer.
     """
     is_on_hub = isinstance(path, str) and path.startswith(HUB_SCHEME)
-    if (Path(path) / FILE).exists() and not is_on_hub:
+    if (Path(path) / STORE_FILE).exists() and not is_on_hub:
         return load_agent(Path(path), weights).policy
     if weights != "latest":
         raise ConfigError(
@@ -164,7 +164,7 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
         faulthandler.cancel_dump_traceback_later()
 
 
-class Result(NamedTuple):
+class EvaluationResult(NamedTuple):
     """The command of an evaluation, and its results.
 
     Attributes:
@@ -224,7 +224,7 @@ def evaluation_commands(
     ]
 
 
-def evaluate(agent: Agent, commands: Sequence[Command], environments: int = 16) -> Result:
+def evaluate(agent: Agent, commands: Sequence[Command], environments: int = 16) -> EvaluationResult:
     """Evaluate an agent with given commands (:func:`evaluation_commands`).
 
     With the run's own settings this repeats its final evaluation exactly.
@@ -241,7 +241,7 @@ def evaluate_all(
     evaluations: Sequence[Sequence[Command]],
     environments: int = 16,
     ended: Callable[[], object] = lambda: None,
-) -> list[Result]:
+) -> list[EvaluationResult]:
     """Run several evaluations together, so that all environments stay busy.
 
     Each result equals that of :func:`evaluate`: an episode depends only on its command.
@@ -273,7 +273,7 @@ def evaluate_all(
         returns, lengths = zip(*islice(following, len(commands)), strict=True)
         command = commands[0]
         results.append(
-            Result(
+            EvaluationResult(
                 command.desired_return, command.desired_horizon, command.temperature,
                 summarise(returns), list(returns), list(lengths),
             )

@@ -80,7 +80,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     advice: tuple[str, ...]
 
 
-def check(config: Config, automatic: Collection[str] = ()) -> Check:
+def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
     """Create an environment, check it, and play random episodes.
 
     Args:

@@ -19,7 +19,7 @@ from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.creation import write_config
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
@@ -112,7 +112,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None
         InvalidData: the report is damaged.
         StoreError: the run cannot be read.
     """
-    if (folder / FILE).exists():
+    if (folder / STORE_FILE).exists():
         raise ConfigError(f"{folder} is the directory of a run; use another folder")
     with closing(Store(run_dir, read_only=True)) as store:
         progress = store.fact("progress", RunProgress)
@@ -121,7 +121,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None
     if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
     report, again = report_of_agent(agent, run_dir), _again(agent, progress)
-    folders.save(folder, policy, _card(agent, address or folder.name, found, report, again))
+    folders.save_folder(folder, policy, _card(agent, address or folder.name, found, report, again))
     # The card promises that a run with these settings keeps the exported version.
     write_config(folder, agent.config, change(budget_of(run_dir), keep_versions=None))
 

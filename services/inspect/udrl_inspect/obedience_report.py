@@ -28,7 +28,7 @@ from udrl.obedience_statistics import (
 from udrl.setting_groups import Temperature
 from udrl.strategies import nearest
 from udrl.targets import ReturnInTime
-from udrl_inspect.agents import Agent, Result, evaluate_all, evaluation_commands
+from udrl_inspect.agents import Agent, EvaluationResult, evaluate_all, evaluation_commands
 
 #: Name of the report in a run's directory.
 FILE = "obedience.json"
@@ -249,7 +249,7 @@ def measure(
     )
 
 
-def _point(result: Result) -> ObediencePoint:
+def _point(result: EvaluationResult) -> ObediencePoint:
     returns, lengths = result.evaluation, summarise(result.lengths)
     return ObediencePoint(
         desired_return=result.desired_return,

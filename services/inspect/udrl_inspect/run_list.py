@@ -11,7 +11,7 @@ from udrl.errors import ConfigError, UdrlError
 from udrl_inspect.address import served_at
 from udrl_inspect.inspection import budget_of
 from udrl_proto.messages import Hello
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 
@@ -67,7 +67,7 @@ def run_directories(folder: Path, seen: set[Path] | None = None) -> Iterator[Pat
         if real in seen:  # links may form a loop
             return
         seen.add(real)
-        if (folder / FILE).exists():
+        if (folder / STORE_FILE).exists():
             yield folder
             return
         below = sorted(f for f in folder.iterdir() if f.is_dir())
@@ -80,7 +80,7 @@ def run_directories(folder: Path, seen: set[Path] | None = None) -> Iterator[Pat
 def summarise(run_dir: Path) -> Summary:
     """Return the summary of a run, even if it cannot be read."""
     # Without the -shm file, which readers write too.
-    changed = max(map(_changed, (run_dir / FILE, run_dir / f"{FILE}-wal")))
+    changed = max(map(_changed, (run_dir / STORE_FILE, run_dir / f"{STORE_FILE}-wal")))
     try:
         with closing(Store(run_dir, read_only=True)) as store:
             config = store.fact("hello", Hello).config

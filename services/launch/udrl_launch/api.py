@@ -24,7 +24,7 @@ from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import last_iteration, read_status, settings_of
 from udrl_launch.paths import new_run_dir
 from udrl_launch.settings import gather
-from udrl_launch.training_run import train as run_training
+from udrl_launch.training_run import run_training
 from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
 from udrl_replay.creation import directory_name, exists
 from udrl_replay.store import EVALUATION_COLUMNS

@@ -19,7 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from udrl.errors import ConfigError
 from udrl_proto.access import REPLAY, ROLES
-from udrl_proto.credentials import CA, CERTIFICATE, KEY, load
+from udrl_proto.credentials import CA, CERTIFICATE, KEY, load_credentials
 
 #: Folder of the authority itself, which is not copied to other machines, and its key file.
 AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
@@ -31,7 +31,7 @@ _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(?:\.{_LABEL})*")
 _CLOCKS_DIFFER = timedelta(hours=1)
 
 
-def create(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta(365)) -> None:
+def create_keys(folder: Path, hosts: Iterable[str] = (), valid: timedelta = timedelta(365)) -> None:
     """Create an authority, and a folder with key and certificate for each role.
 
     Args:
@@ -79,7 +79,7 @@ def has_keys(folder: Path, hosts: Iterable[str] = ()) -> bool:
     if not all(file.is_file() for file in files):
         return False
     for role in ROLES:
-        load(folder, role)
+        load_credentials(folder, role)
     certificate = x509.load_pem_x509_certificate((folder / REPLAY / CERTIFICATE).read_bytes())
     named = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     for host in hosts:

@@ -15,7 +15,7 @@ from udrl_launch.process import switch_threads_soon
 from udrl_launch.settings import Settings
 from udrl_launch.supervisor import END_S, Supervisor
 from udrl_proto.access import REPLAY
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 
@@ -137,7 +137,7 @@ class Threads:
                 self._stop,
                 listen=endpoint,
                 insecure=insecure,
-                credentials=load(keys, REPLAY) if keys else None,
+                credentials=load_credentials(keys, REPLAY) if keys else None,
                 audit=audit,
             ),
         )

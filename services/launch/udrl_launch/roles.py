@@ -17,7 +17,7 @@ from udrl_proto.credentials import Credentials
 from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import (
     config_of,
-    create,
+    create_run,
     exists,
     no_empty_folder_left,
     write_config,
@@ -67,7 +67,7 @@ def open_run(
         with no_empty_folder_left(run_dir):
             if listen is not None:
                 sessions.check_listening(listen, insecure=insecure, secure=secure)
-            store = create(
+            store = create_run(
                 run_dir, settings.config, automatic=settings.automatic, allow_inexact=allow_inexact
             )
     with closed_on_error(store):

@@ -20,7 +20,7 @@ from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto import verbs
 from udrl_proto.access import ROLES
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.creation import config_of
@@ -87,7 +87,7 @@ _CHECK_S, _POLL_S = 0.1, 0.5
 _START_S = 60.0
 
 
-def train(
+def run_training(
     settings: Settings,
     run_dir: Path,
     stop: threading.Event,
@@ -128,7 +128,7 @@ def train(
     sessions.check_endpoint(endpoint, secure=keys is not None)
     if keys is not None:
         for role in ROLES:
-            load(keys, role)
+            load_credentials(keys, role)
     store = open_run(
         run_dir, settings, resume=resume, allow_inexact=allow_inexact, listen=endpoint,
         insecure=insecure, secure=keys is not None,

@@ -34,7 +34,7 @@ from udrl_proto.messages import (
     JoinRequest,
     StateRequest,
     VersionMessage,
-    Weights,
+    WeightsMessage,
 )
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.transport import Transport
@@ -281,7 +281,7 @@ class LearnerService:
         self._delivered = True
         # Without acknowledgement, so that a stopped actor cannot stall training. An actor that
         # misses this requests the weights from the replay service.
-        announcement = encode(Weights(version=message.version, weights=message.weights))
+        announcement = encode(WeightsMessage(version=message.version, weights=message.weights))
         self._transport.publish(
             key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS), announcement
         )

@@ -36,7 +36,7 @@ class Malformed(NamedTuple):
     error: InvalidMessage
 
 
-def inspect(message: EpisodeMessage, spec: EnvironmentSpec) -> Arrival:
+def inspect_episode(message: EpisodeMessage, spec: EnvironmentSpec) -> Arrival:
     """Check an episode and return what the run needs of it.
 
     Raises:

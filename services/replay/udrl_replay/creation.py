@@ -27,8 +27,8 @@ from udrl.version import __version__
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
-from udrl_replay.arrival import inspect
-from udrl_replay.database import FILE
+from udrl_replay.arrival import inspect_episode
+from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.remedies import remedy
 from udrl_replay.resuming import closed_on_error
@@ -56,7 +56,7 @@ def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:50].rstrip("-") or "run"
 
 
-def create(
+def create_run(
     run_dir: Path,
     config: Config,
     *,
@@ -142,7 +142,7 @@ def _begin_with(store: Store, episodes: list[Episode]) -> None:
     with store.transaction():
         for episode in episodes:
             message = decode(encode_episode(episode, OFFLINE), EpisodeMessage, LARGEST)
-            run.accept(inspect(message, spec), 0.0)
+            run.accept(inspect_episode(message, spec), 0.0)
         run.save()
 
 
@@ -188,4 +188,4 @@ def as_toml(value: object) -> str:
 
 def exists(run_dir: Path) -> bool:
     """Return whether a directory holds a run."""
-    return (run_dir / FILE).exists()
+    return (run_dir / STORE_FILE).exists()

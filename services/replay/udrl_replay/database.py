@@ -21,7 +21,7 @@ from udrl_replay.remedies import database_remedy, primary_code, remedy
 from udrl_replay.schema import SCHEMA, SEALED, TABLES, Value, marks, seal
 from udrl_replay.tallies import TALLIES, Tallies, Tally
 
-FILE = "run.sqlite"
+STORE_FILE = "run.sqlite"
 LOCK = "lock"
 #: Seconds to retry for the lock; :func:`is_locked` holds it only briefly.
 _LOOK_S = 0.2
@@ -49,9 +49,9 @@ class Database:
     """
 
     def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
-        self._path = run_dir / FILE
+        self._path = run_dir / STORE_FILE
         if not self._path.exists():
-            raise StoreError(f"{run_dir} holds no run ({FILE} is missing); check the path")
+            raise StoreError(f"{run_dir} holds no run ({STORE_FILE} is missing); check the path")
         self.read_only = read_only
         self._lock = None if read_only else _lock(run_dir)
         try:
@@ -95,7 +95,7 @@ class Database:
 
     def _connect_to_read(self) -> sqlite3.Connection:
         """Connect and start a transaction, so that all reads see one snapshot."""
-        wal = self._path.with_name(f"{FILE}-wal")
+        wal = self._path.with_name(f"{STORE_FILE}-wal")
         # While a file is read, SQLite keeps an index beside it. In a read-only directory it can do
         # without (immutable) if no process can change the file.
         may_write = os.access(self._path.parent, os.W_OK)
@@ -138,7 +138,7 @@ class Database:
             StoreError: the directory already holds a run, or cannot be written.
             RunInUse: another replay service has the lock.
         """
-        path = run_dir / FILE
+        path = run_dir / STORE_FILE
         try:
             _make(run_dir)
             with _lock(run_dir):

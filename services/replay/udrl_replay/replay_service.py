@@ -46,7 +46,7 @@ from udrl_proto.messages import (
     VersionMessage,
     VersionReply,
     Wait,
-    Weights,
+    WeightsMessage,
     WeightsRequest,
 )
 from udrl_proto.reports import ContentsRequest, HistoryRequest, StatusRequest
@@ -54,7 +54,7 @@ from udrl_proto.serving import ReceivedRequest, serve
 from udrl_proto.text import printable
 from udrl_proto.transport import Declaration, Presence, Transport
 from udrl_replay.admission import Admission
-from udrl_replay.arrival import Arrival, Malformed, inspect
+from udrl_replay.arrival import Arrival, Malformed, inspect_episode
 from udrl_replay.reporting import (
     MetricsFile,
     Throughput,
@@ -188,7 +188,7 @@ class ReplayService:
 
         def arrive(message: EpisodeMessage) -> Arrival | Malformed:
             try:
-                return inspect(message, spec)
+                return inspect_episode(message, spec)
             except InvalidMessage as error:
                 return Malformed(message.actor, error)
 
@@ -379,7 +379,7 @@ class ReplayService:
             version=version.version, weights=version.weights, optimizer=version.optimizer
         )
 
-    def _weights(self, request: WeightsRequest, now: float) -> Weights:
+    def _weights(self, request: WeightsRequest, now: float) -> WeightsMessage:
         progress = self.run.progress
         named = {"latest": progress.latest_version, "best": progress.best_version}
         wanted = request.version if isinstance(request.version, int) else named[request.version]
@@ -390,7 +390,7 @@ class ReplayService:
                 "unknown_version",
                 f"weights version {wanted} is not kept; request one of {kept}",
             )
-        return Weights(version=version.version, weights=version.weights)
+        return WeightsMessage(version=version.version, weights=version.weights)
 
     def _status(self, request: StatusRequest, now: float) -> Message:
         return status(self.run, self._throughput, self._waits, self._lag_s, now)

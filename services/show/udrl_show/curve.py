@@ -20,7 +20,7 @@ from udrl.errors import StoreError, UdrlError
 from udrl.evaluation import Evaluation
 from udrl_inspect.run_list import run_directories
 from udrl_proto.messages import Hello
-from udrl_replay.database import FILE
+from udrl_replay.database import STORE_FILE
 from udrl_replay.store import EvaluationRow, Store
 from udrl_show import pictures
 from udrl_show.styles import line_style
@@ -192,7 +192,7 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
     missing: list[str] = []
     drawn: set[Path] = set()
     for place in places:
-        is_run = any((place / name).exists() for name in (_METRICS, FILE))
+        is_run = any((place / name).exists() for name in (_METRICS, STORE_FILE))
         below = [] if is_run else list(run_directories(place))
         by_settings: dict[bytes, Line] = {}
         for run_dir in below or [place]:

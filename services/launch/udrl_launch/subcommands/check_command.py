@@ -6,8 +6,7 @@ from pathlib import Path
 import click
 
 from udrl.config import UNSET
-from udrl_inspect.checking import Check
-from udrl_inspect.checking import check as check_environment
+from udrl_inspect.checking import Check, check_environment
 from udrl_launch import completions
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown

@@ -43,7 +43,7 @@ def create(directory: Path, hosts: tuple[str, ...], days: int, if_missing: bool)
     if if_missing and authority.has_keys(directory, hosts):
         click.echo(f"{directory} already has keys for every role")
         return 0
-    authority.create(directory, hosts, timedelta(days))
+    authority.create_keys(directory, hosts, timedelta(days))
     for role in ROLES:
         click.echo(f"{directory / role}: copy to machines with the role {role}")
     click.echo(f"{directory / authority.AUTHORITY}: stays here; it can issue keys for every role")

@@ -12,7 +12,7 @@ from udrl.errors import ConfigError
 from udrl_inspect.address import Address
 from udrl_launch import completions
 from udrl_launch.settings import read_steps
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from udrl_proto.session import check_endpoint
 
 #: Largest accepted absolute value of a return.
@@ -75,7 +75,7 @@ def place(
         ConfigError: neither or both are given, or the endpoint or the keys cannot be used.
     """
     if keys is not None:
-        load(keys, "observer")
+        load_credentials(keys, "observer")
     if run_dir is not None and connect is None:
         return run_dir
     if connect is not None and run_dir is None:

@@ -35,7 +35,7 @@ from udrl_launch.subcommands.options import (
 )
 from udrl_launch.subcommands.settings_options import gather_settings, settings_options
 from udrl_proto.access import REPLAY
-from udrl_proto.credentials import load
+from udrl_proto.credentials import load_credentials
 from udrl_proto.session import check_endpoint
 from udrl_replay.creation import directory_name
 
@@ -86,7 +86,7 @@ def replay(
     if (listen is None) == (connect is None):
         raise ConfigError("give either --listen ENDPOINT or --connect ENDPOINT")
     check_endpoint(listen or connect or "", secure=keys is not None)
-    credentials = load(keys, REPLAY) if keys else None
+    credentials = load_credentials(keys, REPLAY) if keys else None
     settings = gather_settings(env, given, run_dir, resume=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
 

@@ -26,8 +26,7 @@ from udrl_launch.subcommands.options import (
     RUN_DIR_OPTION,
 )
 from udrl_launch.subcommands.settings_options import gather_settings, settings_options
-from udrl_launch.training_run import Adviser, Watchers
-from udrl_launch.training_run import train as run_training
+from udrl_launch.training_run import Adviser, Watchers, run_training
 from udrl_proto.reports import Status
 from udrl_proto.text import printable
 from udrl_replay.creation import directory_name
