@@ -205,7 +205,7 @@ def test_run_with_records_only_starts_from_the_beginning(
     def fail(*arguments: Any, **others: Any) -> None:
         raise RunFailed("later")
 
-    monkeypatch.setattr(job_module, "train", fail)
+    monkeypatch.setattr(job_module, "run_training", fail)
     (tmp_path / "done.json").write_text("{}")
     if state:
         (tmp_path / state).touch()

@@ -113,7 +113,7 @@ def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
             (folder / "done.json").write_text(json.dumps({"max_env_steps": job.max_env_steps}))
             (folder / "job.json").write_bytes(msgspec.json.encode(job))
 
-    monkeypatch.setattr(search_module, "run_jobs", run)
+    monkeypatch.setattr(search_module, "run_jobs_on_ray", run)
     plan = StudyPlan(seeds=(1,), max_env_steps=50_000)
     study = search(plan, [TASKS["lander"]], ["UDRL"], 4, Final(2, 100_000))
     study.run_jobs(study.jobs, tmp_path, 1, threading.Event(), print)

@@ -29,7 +29,7 @@ class Plain(gym.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
-        self.t, self.seed = 0, float(self.np_random.integers(100))
+        self.t, self.seed = 0, float(self.np_random.integers(100_000)) / 1000
         return self.seen(), {}
 
     def step(self, action: Any) -> Any:

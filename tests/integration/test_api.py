@@ -141,7 +141,7 @@ def test_run_directory_can_be_loaded(ended_run: Path, tmp_path: Path) -> None:
 def test_run_that_ends_with_its_warm_up_has_no_agent(tmp_path: Path) -> None:
     trained = udrl.train("CartPole-v1", run_dir=tmp_path / "run", max_env_steps=1, **SETTINGS)
     assert trained.status.state == "ended"
-    with pytest.raises(StoreError, match="nothing was trained"):
+    with pytest.raises(StoreError, match="nothing has been trained"):
         _ = trained.policy
 
 
