@@ -41,7 +41,7 @@ def interval_text(mean: float, half: float) -> str:
     if half == 0:
         return f"{return_text(mean)} ± 0.0"
     decimals = min(max(1, math.ceil(-math.log10(half))), 6)
-    return f"{mean:.{decimals}f} ± {half:.{decimals}f}"
+    return f"{round(mean, decimals) + 0.0:.{decimals}f} ± {half:.{decimals}f}"
 
 
 def summarise(returns: Sequence[float]) -> Evaluation:

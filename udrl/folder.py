@@ -23,7 +23,7 @@ FORMAT = 2
 
 _WEIGHTS, _DESCRIPTION, _CARD = "model.safetensors", "config.json", "README.md"
 _GRAPH = "graph.onnx"
-#: The files that :func:`load` reads.
+#: The files that :func:`load_folder` reads.
 FILES = _DESCRIPTION, _WEIGHTS, _GRAPH
 #: Maximum size of a file.
 MAX_BYTES = 4 << 30
@@ -91,7 +91,7 @@ def save_folder(folder: Path, policy: Policy, card: str) -> None:
 
 
 def load_folder(folder: str | Path) -> Policy:
-    """Return a policy written by :func:`save`.
+    """Return a policy written by :func:`save_folder`.
 
     Its ``desired_return`` and ``desired_horizon`` are those of evaluation commands.
 

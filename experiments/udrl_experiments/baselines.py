@@ -100,7 +100,7 @@ def train_baseline(
 
     Raises:
         ConfigError: Stable-Baselines3 is not installed.
-        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        UnsupportedEnvironment: the environment cannot be created or is not supported.
         EnvironmentFault: the environment failed repeatedly in an evaluation.
         InvalidData: the state in the folder is damaged.
         Interrupted: ``stop`` was set.

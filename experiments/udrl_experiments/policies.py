@@ -105,7 +105,7 @@ def make(
         part: number of evaluations before this process; a resumed run has other random numbers.
 
     Raises:
-        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        UnsupportedEnvironment: the environment cannot be created or is not supported.
     """
     chosen = dict(hyperparameters)
     envs = DummyVecEnv(

@@ -147,7 +147,7 @@ def search_environment(
     Raises:
         ConfigError: as for :func:`search`, or the file is not a valid space, or an algorithm does
             not support the environment.
-        UnsupportedEnvironment: the environment cannot be made or is not supported.
+        UnsupportedEnvironment: the environment cannot be created or is not supported.
         EnvironmentFault: the environment failed repeatedly.
     """
     space = read_space(environment, file)

@@ -30,7 +30,7 @@ _SAME_KEYS = "both sides need keys from the same `udrl keys create`"
 
 
 class Credentials(NamedTuple):
-    """The files with which a service proves its role, checked by :func:`load`.
+    """The files with which a service proves its role, checked by :func:`load_credentials`.
 
     Attributes:
         ca: certificate of the authority; peers without a certificate issued by it are rejected.

@@ -52,6 +52,8 @@ class Doors(gym.Env[Any, Any]):
             mask = np.array([256, 1, 2, 1])
         if self.fault == "too short":
             mask = np.ones(3, np.int8)
+        if self.fault == "ragged":
+            mask = [1, 0, [1, 1], 0]
         absent = self.fault == "no mask" or (self.fault == "only at reset" and self.t > 0)
         info = {} if absent else {"action_mask": mask}
         flat = np.concatenate(mask) if self.two else mask
@@ -166,6 +168,7 @@ def test_rollout_takes_allowed_actions_only() -> None:
             {"fault": "too short"},
             r"info\['action_mask'\] an array of int8, shape \(3,\), expected 4",
         ),
+        ({"fault": "ragged"}, r"info\['action_mask'\] a list .*, expected 4"),
     ],
 )
 def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], message: str) -> None:
@@ -173,6 +176,12 @@ def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], mess
     commands = CommandSampler(config(), generator.spec).warm_up()
     with pytest.raises(EnvironmentFault, match=message):
         generate_episodes(generator, commands, None)
+
+
+def test_ragged_mask_entry_is_a_fault_of_the_observation() -> None:
+    env = make_environment(config("doors", {"fault": "ragged", "shows": True}))
+    with pytest.raises(EnvironmentFault, match=r"reset\(\) returned.*'doors'"):
+        env.reset(seed=1)
 
 
 @pytest.mark.parametrize("previous", [False, True])

@@ -142,14 +142,9 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
         n = game.get_available_buttons_size()
     except Exception as error:
         _discard(game, folder)
-        remedy = (
-            "reinstall it: pip install --force-reinstall vizdoom"
-            if path == shipped
-            else "correct the files and the map that it names, such as doom_scenario_path"
-        )
         raise RuntimeError(
             f"scenario {str(path)!r}: ViZDoom does not start with it: {type(error).__name__}: "
-            f"{error}; {remedy}"
+            f"{error}"
         ) from error
     if n == 0:
         _discard(game, folder)

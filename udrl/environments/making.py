@@ -246,9 +246,10 @@ def _remedy(error: Exception, config: Config) -> str:
         return "remove arguments that it does not accept from environment_kwargs"
     if isinstance(error, TypeError) and "missing" in text and "required" in text:
         return "pass the argument, e.g. --set 'environment_kwargs={NAME=VALUE}'"
+    arguments = "".join(f", {name}={value!r}" for name, value in config.environment_kwargs.items())
     return (
-        f"the cause is in the environment or its arguments; in Python, "
-        f"gymnasium.make({config.environment!r}) shows where"
+        f"the cause is in the environment, its files or its arguments; in Python, "
+        f"gymnasium.make({config.environment!r}{arguments}) shows where"
     )
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from udrl.environments.conversions import as_array, describe
-from udrl.errors import EnvironmentFault
+from udrl.errors import EnvironmentFault, InvalidData
 from udrl.spaces import Key
 
 #: Key of the mask in ``info``, and in observations.
@@ -93,8 +93,11 @@ class CheckMask(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
         while isinstance(observation, Mapping):
             if self._entry in observation:
                 name = f"observation[{self._entry!r}]"
-                mask = as_array(name, observation[self._entry]).reshape(-1)
                 # Other faults are found when the observation is converted.
+                try:
+                    mask = as_array(name, observation[self._entry]).reshape(-1)
+                except InvalidData:
+                    return
                 if mask.size == sum(self._components) and mask.dtype.kind in "biuf":
                     _checked(name, mask, self._components, where, is_over=is_over)
                 return
@@ -122,16 +125,22 @@ def mask_in(
             f"{where}() returned {describe(info)} as info, without {MASK!r}; set "
             f"action_mask only where every info has it"
         ) from error
-    if isinstance(given, tuple):
-        mask = np.concatenate([np.asarray(part).reshape(-1) for part in given])
-    else:
-        mask = np.asarray(given).reshape(-1)
     size = sum(components)
+    try:
+        mask = _flat(given)
+    except ValueError:  # lists of unequal lengths
+        mask = np.empty(0)
     if mask.size != size or mask.dtype.kind not in "biuf":
         raise EnvironmentFault(
             f"{where}() returned as {_NAME} {describe(given)}, expected {size} numbers, 0 or 1"
         )
     return _checked(_NAME, mask, components, where, is_over=is_over)
+
+
+def _flat(given: Any) -> npt.NDArray[Any]:
+    if isinstance(given, tuple) and given:
+        return np.concatenate([np.asarray(part).reshape(-1) for part in given])
+    return np.asarray(given).reshape(-1)
 
 
 def _checked(

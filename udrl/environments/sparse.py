@@ -8,8 +8,8 @@ import gymnasium as gym
 class RewardAtEnd(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """Withholds the rewards of an episode and returns their sum, a float, at the last step.
 
-    Apply it outside the time limit, so that it sees truncations. Gymnasium applies a registration's
-    ``additional_wrappers`` there.
+    Apply it outside the ``TimeLimit`` wrapper, so that it sees truncations. Gymnasium applies a
+    registration's ``additional_wrappers`` there.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:

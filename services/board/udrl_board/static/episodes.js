@@ -13,7 +13,7 @@ export class Episodes {
   add(m) {
     this.ended.push(m);
     $("ended").hidden = false;
-    const how = [m.temperature === 0 ? "greedy" : "sampled", m.is_changed ? "command changed" : "", m.truncated ? "time limit" : ""].filter(Boolean).join(", ");
+    const how = [m.temperature === 0 ? "greedy" : "sampled", m.is_changed ? "command changed" : "", m.truncated ? "step limit" : ""].filter(Boolean).join(", ");
     const row = $("episodes").tBodies[0].insertRow(0);
     for (const value of [number(m.commanded_return), number(m.obtained), number(m.commanded_horizon), number(m.step), m.seed, m.version, how]) row.insertCell().textContent = value;
     this.draw();
