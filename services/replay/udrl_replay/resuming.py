@@ -96,7 +96,7 @@ def _changed(store: Store, hello: Hello) -> str | None:
         if environment_digest(generator) != hello.environment_digest:
             return "its first steps differ"
     except EnvironmentFault as fault:
-        # Whatever --allow-inexact permits, the run cannot continue with such an environment.
+        # Even with --allow-inexact, the run cannot continue with such an environment.
         raise EnvironmentFault(
             f"{fault}; it did not fail when the run was created: restore the versions of its "
             f"package and dependencies, and what it needs, such as a server"
