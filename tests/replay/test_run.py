@@ -662,8 +662,8 @@ def test_command_that_kills_its_actors_stops_the_run(
     assert vanish(run, "f") == {0}
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
-        "command 0 ended 3 actors that ran nothing else: its environment hangs or "
-        "crashes; reproduce it with: udrl reproduce RUN_DIR 0"
+        "command 0 failed 3 times, 3 of them by ending an actor that ran nothing else: its "
+        "environment hangs or crashes; reproduce it with: udrl reproduce RUN_DIR 0"
     )
     run = reopened(run)
     finish(run)

@@ -185,18 +185,12 @@ class StoredRun(RunState):
             return
         cause = cause[:3000]  # so that the status has the rest, too
         command_id, ended = item.command.id, len(item.ended)
-        attempts = len(item.failures) + ended
-        if ended == 0:
-            why = f"command {command_id} failed {attempts} times: {cause}"
-        elif ended == attempts:
-            why = f"command {command_id} ended {ended} actors that ran nothing else: {cause}"
-        else:
-            why = (
-                f"command {command_id} failed {attempts} times, {ended} of them by ending an actor "
-                f"that ran nothing else: {cause}"
-            )
+        how = f", {ended} of them by ending an actor that ran nothing else" if ended else ""
         self.progress.state = "failed"
-        self.progress.problem = f"{why}; reproduce it with: udrl reproduce RUN_DIR {command_id}"
+        self.progress.problem = (
+            f"command {command_id} failed {len(item.failures) + ended} times{how}: {cause}; "
+            f"reproduce it with: udrl reproduce RUN_DIR {command_id}"
+        )
         log.error("%s", RunFailed(self.progress.problem))
 
     # Iterations.
