@@ -167,3 +167,14 @@ def test_resume_command_repeats_the_options_that_are_not_stored(tmp_path: Path) 
     context = train.make_context("train", ["X-v0", *given, "--actors", "1", "--in-process"])
     with context:
         assert _options_to_repeat() == ["--actors", "1", "--in-process", "--log", "tensorboard"]
+
+
+def test_crash_in_native_code_leaves_a_traceback() -> None:
+    crash = "import faulthandler; faulthandler._sigsegv()"
+    command = f"from udrl_launch import cli; cli.cli = lambda **_: exec({crash!r}); cli.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", command], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode < 0
+    assert "Fatal Python error: Segmentation fault" in done.stderr
+    assert "in main" in done.stderr

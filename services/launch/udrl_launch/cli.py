@@ -1,5 +1,6 @@
 """The command ``udrl``."""
 
+import faulthandler
 import inspect
 import os
 import re
@@ -47,6 +48,8 @@ def main() -> NoReturn:
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     extend_module_path()
+    if sys.stderr is not None:
+        faulthandler.enable()  # a crash in native code leaves the traceback of every thread
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
     try:

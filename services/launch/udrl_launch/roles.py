@@ -5,6 +5,7 @@ import threading
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from udrl.config import Budget, Config
 from udrl.errors import ConfigError, Deceived, RunFailed
@@ -26,6 +27,9 @@ from udrl_replay.replay_service import ReplayService
 from udrl_replay.resuming import closed_on_error
 from udrl_replay.resuming import resume as resume_run
 from udrl_replay.store import Store
+
+if TYPE_CHECKING:
+    from udrl_learner.learner_service import LearnerService
 
 log = logging.getLogger("udrl")
 
@@ -145,12 +149,22 @@ def learner(address: Address, stop: threading.Event) -> None:
     Raises:
         ConfigError: torch or the run's device is missing.
     """
-    require_torch()
-    from udrl_learner.learner_service import LearnerService  # the only one that needs torch
-
+    service = load_learner_service()
     with connected("learner", address, stop) as (transport, hello):
         require_device(hello.config)
-        LearnerService(transport, hello, unique_name("learner"), stop).run()
+        service(transport, hello, unique_name("learner"), stop).run()
+
+
+def load_learner_service() -> "type[LearnerService]":
+    """Import the learner service, the only one that needs torch.
+
+    Raises:
+        ConfigError: torch is missing.
+    """
+    require_torch()
+    from udrl_learner.learner_service import LearnerService
+
+    return LearnerService
 
 
 def actor(
