@@ -47,3 +47,18 @@ def test_training_without_torch_names_the_extra(program: str) -> None:
     done = python(program)
     assert done.returncode == 1
     assert 'training needs torch; install it with: pip install "udrl[train]"' in done.stderr
+
+
+def test_training_does_not_import_torchs_compiler() -> None:
+    program = (
+        "import sys; from udrl.algorithm1 import algorithm1; "
+        "from udrl.config import Budget, Config, build; "
+        "config = build(Config, {'environment': 'Figure2-v0', 'max_return': 2.0, "
+        "'n_warm_up_episodes': 3, 'n_updates_per_iter': 2, 'lead': 0}); "
+        "run = algorithm1(config, Budget(max_env_steps=20)); "
+        "assert run.iteration > 0; print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.stdout == "False\n", done.stderr

@@ -134,7 +134,9 @@ class CategoryEncoder(Encoder):
     ) -> None:
         super().__init__(activation, precision)
         sizes = torch.tensor(ns * length)
-        self.embedding = nn.utils.skip_init(nn.Embedding, int(sizes.sum()), width)
+        # Not skip_init: it imports torch's compiler if it makes an embedding.
+        vectors = torch.empty(int(sizes.sum()), width)
+        self.embedding = nn.Embedding.from_pretrained(vectors, freeze=False)
         self.bias = nn.Parameter(torch.zeros(width))
         self.register_buffer("first", sizes.cumsum(0) - sizes, persistent=False)
         self.first: Tensor

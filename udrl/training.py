@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from udrl.adam import Adam
 from udrl.architecture import state_sizes
 from udrl.batches import Batch, Batches, Draw, SeenTensors, draw_examples
 from udrl.behavior import BehaviorFunction, initialise
@@ -42,7 +43,7 @@ class TrainingState:
     version: int
     behavior: BehaviorFunction
     critic: Critic | None
-    optimizer: torch.optim.Adam
+    optimizer: Adam
     loss: float = float("nan")
 
     @property
@@ -58,7 +59,7 @@ class TrainingState:
 #: Rounds of updates after a reset (``reset_every``). Fewer rounds learn the buffer less well.
 RESET_ROUNDS = 24
 #: Settings found by each active :func:`exact_arithmetic`, in order of entry.
-_found_settings: list[tuple[bool, bool, str | None]] = []
+_found_settings: list[tuple[int, str | None]] = []
 _settings_lock = threading.Lock()
 #: Environment variable without which CUDA's matrix products are not deterministic.
 _WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
@@ -74,7 +75,8 @@ def compute_deterministically() -> None:
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     os.environ.setdefault(_WORKSPACE, ":4096:8")
-    torch.use_deterministic_algorithms(mode=True)
+    # As use_deterministic_algorithms() does, which imports torch's compiler.
+    torch.set_deterministic_debug_mode("error")
 
 
 @contextlib.contextmanager
@@ -86,12 +88,7 @@ def exact_arithmetic() -> Iterator[None]:
     """
     threads = torch.get_num_threads()  # torch has one value for each thread
     with _settings_lock:
-        found = (
-            torch.are_deterministic_algorithms_enabled(),
-            torch.is_deterministic_algorithms_warn_only_enabled(),
-            os.environ.get(_WORKSPACE),
-        )
-        _found_settings.append(found)
+        _found_settings.append((torch.get_deterministic_debug_mode(), os.environ.get(_WORKSPACE)))
         compute_deterministically()
     try:
         yield
@@ -99,8 +96,8 @@ def exact_arithmetic() -> Iterator[None]:
         torch.set_num_threads(threads)
         with _settings_lock:
             # Whichever thread exits last pops the first entry, which has the original settings.
-            deterministic, warns_only, workspace = _found_settings.pop()
-            torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
+            mode, workspace = _found_settings.pop()
+            torch.set_deterministic_debug_mode(mode)
             if workspace is None:
                 os.environ.pop(_WORKSPACE, None)
 
@@ -128,7 +125,7 @@ def assemble(
     if critic is not None:
         critic.to(config.arithmetic.device)
     parameters = trainable_parameters(behavior, critic).values()
-    adam = torch.optim.Adam(parameters, lr=config.training.learning_rate, fused=True)
+    adam = Adam(parameters, lr=config.training.learning_rate, fused=True)
     return TrainingState(version, behavior, critic, adam)
 
 
