@@ -156,7 +156,7 @@ def some_episodes(n: int, longest: int = 70) -> list[Episode]:
     return episodes
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_training_learns_and_resumes_from_a_checkpoint(precision: str) -> None:
     config = settings(precision=precision, learning_rate=3e-3, n_updates_per_iter=60)
     experience = Experience(config, TAKE_COVER)

@@ -32,7 +32,9 @@ def test_services_at_lead_0_equal_the_reference(
     assert status.evaluation.mean == expected.evaluations[status.evaluation.iteration].mean
 
 
-@pytest.mark.parametrize("lead", [0, pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize(
+    "lead", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow), 3]
+)
 @pytest.mark.parametrize(("make", "budget"), CASES)
 def test_result_is_independent_of_actors_and_environments(
     make: Callable[..., Config], budget: int, lead: int, run: Runner

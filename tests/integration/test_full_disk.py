@@ -67,7 +67,9 @@ def test_run_stops_on_a_full_disk_and_resumes_with_free_space(
     assert digests(status) == digests(run(small(), BUDGET))
 
 
-@pytest.mark.parametrize("more_pages", [4, 10, 20, 40])
+@pytest.mark.parametrize(
+    "more_pages", [10, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 20, 40))]
+)
 def test_store_that_cannot_grow_keeps_its_ledgers_balanced(
     more_pages: int, run: Callable[..., Status], tmp_path: Path
 ) -> None:

@@ -58,6 +58,7 @@ def test_killed_services_are_restarted_and_the_result_is_the_same(
     assert digests(status) == undisturbed["digests"]
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_from_its_directory(
     cli: Callable[..., Cli], run: Callable[..., Status], tmp_path: Path
 ) -> None:

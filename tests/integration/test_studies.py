@@ -90,6 +90,7 @@ def test_comparison_is_interrupted_and_resumed(
     assert len(rows(folder / "reached.csv")) == 6 * 3
 
 
+@pytest.mark.slow
 def test_run_of_a_study_equals_a_run_with_its_settings(
     study: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ def test_settings_cover_the_preset() -> None:
     assert preset("TakeCover-v0").keys() - {"max_env_steps"} <= TAKE_COVER.keys()
 
 
+@pytest.mark.slow
 def test_services_equal_the_reference(run: Runner, tmp_path: Path) -> None:
     expected = reference(settings(), BUDGET)
     assert expected.evaluations

@@ -68,6 +68,7 @@ def obedience(run_dir: Path) -> dict[str, Any]:
     return report
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)  # Two trainings, 26 s on one core.
 def test_tutorial_runs_and_has_the_printed_output(tmp_path: Path) -> None:
     printed = ""
