@@ -84,7 +84,7 @@ class ReplayClient:
             if waited >= self._patience_s:
                 raise Unreachable(
                     f"{self._who} got no reply to {verb.name!r} from the replay service of "
-                    f"{self._run_id} in {waited:.0f} s; restart it, or check the network"
+                    f"{self._run_id} in {waited:.0f} s; restart that service, or check the network"
                 )
             if waited >= warn_at:
                 log.warning(

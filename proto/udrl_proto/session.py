@@ -209,7 +209,7 @@ def connect(
             if waited >= patience_s:
                 raise Unreachable(
                     f"no reply from {endpoint!r} after {waited:.0f} s; start `udrl replay ENV "
-                    f"--listen {endpoint}` there, or correct the endpoint"
+                    f"--listen {endpoint}` or a Zenoh router there, or correct the endpoint"
                 ) from error
         if waited >= warn_at:
             log.warning(
@@ -266,7 +266,8 @@ def find_run(
             found = {name: hello for name, hello in found.items() if name == run_id}
         if len(found) > 1:
             raise ConfigError(
-                f"found several runs: {printable(', '.join(sorted(found)))}; choose one: --run RUN"
+                f"found several runs: {printable(', '.join(sorted(found)))}; choose one with "
+                f"--run RUN_ID"
             )
         if found:
             ((protocol, payload),) = found.values()

@@ -175,16 +175,16 @@ def test_model_card_has_the_report_of_its_weights(run_dir: Path, tmp_path: Path)
     version = load_agent(run_dir).version
     assert f"udrl obedience {run_dir} --weights {version}" in hint
     card = tmp_path / "agent" / "README.md"
-    assert "Which returns it delivers" not in card.read_text()
+    assert "Which returns it obtains" not in card.read_text()
     call("obedience", run_dir, "--episodes", 2, "--points", 2)
     report = load_report(run_dir)
     assert report is not None
     assert call("export", run_dir, "--folder", tmp_path / "agent")[1] == ""
-    assert f"## Which returns it delivers\n\n{markdown(report)}\n" in card.read_text()
+    assert f"## Which returns it obtains\n\n{markdown(report)}\n" in card.read_text()
     for other in ({"weights_version": version + 1}, {"run_id": "another"}):
         save_report(run_dir, msgspec.structs.replace(report, **other))
         call("export", run_dir, "--folder", tmp_path / "agent")
-        assert "Which returns it delivers" not in card.read_text()
+        assert "Which returns it obtains" not in card.read_text()
     (run_dir / "obedience.json").write_text("{}")
     with pytest.raises(UdrlError, match="measure again"):
         call("export", run_dir, "--folder", tmp_path / "agent")

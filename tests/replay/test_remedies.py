@@ -50,6 +50,22 @@ def test_full_disk_is_reported(tmp_path: Path) -> None:
     assert "No space left on device; free some disk space, and restart with" in str(error)
 
 
+def test_forbidden_file_is_not_reported_as_a_full_disk(tmp_path: Path) -> None:
+    error = unwritable(tmp_path / "file", PermissionError(13, "Permission denied"))
+    assert "make the file and its directory readable and writable, and restart with" in str(error)
+
+
+def test_full_disk_is_not_reported_as_a_directory_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replace(self: Path, target: Path) -> Path:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(StoreError, match=r"No space left on device; free some disk space$"):
+        create(tmp_path / "run")
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     with closing(create(tmp_path)) as made:

@@ -65,7 +65,7 @@ class Downsample(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstruc
         if size[0] < height or size[1] < width:
             raise UnsupportedEnvironment(
                 f"an image has {size[0]} x {size[1]} pixels; expected at least {height} x {width}, "
-                f"the size after downsampling; choose a smaller one"
+                f"the size after downsampling; choose a smaller height or width"
             )
         shape = list(self._size)
         if axis is not None:

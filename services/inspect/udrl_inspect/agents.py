@@ -81,8 +81,9 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         found = store.version(wanted)
         if progress.latest_version == 0:
             raise StoreError(
-                f"{run_dir} has no weights yet: nothing has been trained since the warm-up; resume "
-                f"the run, with a larger max_env_steps if its budget is spent"
+                f"{run_dir} has no weights yet: nothing has been trained since the warm-up; wait "
+                f"for the first version, or resume the run if it is not running, with a larger "
+                f"max_env_steps if its budget is spent"
             )
         if found is None or not found.weights:
             raise StoreError(

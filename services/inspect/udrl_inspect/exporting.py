@@ -57,7 +57,7 @@ folder. {again}
 """
 
 _OBEDIENCE = """\
-## Which returns it delivers
+## Which returns it obtains
 
 {report}
 

@@ -68,7 +68,10 @@ class Processes:
                 self._supervisor.start(name, *arguments, *secured)
             except OSError as error:
                 self._supervisor.end()
-                raise UdrlError(f"cannot start {name}: {error}; free that resource") from error
+                raise UdrlError(
+                    f"cannot start {name}: {error}; free memory, processes or open files, or "
+                    f"raise their limits"
+                ) from error
 
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",

@@ -170,7 +170,7 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
         # A full disk must not destroy the old budget.
         write_atomically(path, ("\n".join(lines) + "\n").encode())
     except OSError as error:
-        what_to_do = remedy(error, "free some disk space, or use a writable directory")
+        what_to_do = remedy(error, "use a writable directory")
         raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error
 
 

@@ -8,9 +8,13 @@ from pathlib import Path
 from udrl.errors import StoreError
 
 _OUT_OF_FILES = {errno.EMFILE, errno.ENFILE}
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 _CLOSE = "close the other program that uses the file"
 _PERMIT = "make the file and its directory readable and writable"
+_FREE_DISK = "free some disk space"
+_CHECK = "check the disk and the file"
 #: By SQLite's primary result codes, what to do before the file can be used again.
 _REMEDIES = {
     sqlite3.SQLITE_BUSY: _CLOSE,
@@ -19,17 +23,17 @@ _REMEDIES = {
     sqlite3.SQLITE_PERM: _PERMIT,
     sqlite3.SQLITE_READONLY: _PERMIT,
     sqlite3.SQLITE_CANTOPEN: _PERMIT,
-    sqlite3.SQLITE_FULL: "free some disk space",
+    sqlite3.SQLITE_FULL: _FREE_DISK,
     sqlite3.SQLITE_IOERR: "repair the disk, or raise its quota",
     sqlite3.SQLITE_NOMEM: "free some memory",
 }
 
 
 def remedy(error: OSError | sqlite3.Error, otherwise: str) -> str:
-    """Return the remedy for an error: ``otherwise``, unless there are too many open files."""
+    """Return the remedy for too many open files or a full disk, else ``otherwise``."""
     if _is_out_of_files(error):
         return "raise the limit of open files, e.g. ulimit -n 4096"
-    return otherwise
+    return _FREE_DISK if _is_disk_full(error) else otherwise
 
 
 def database_remedy(error: sqlite3.Error, *, read_only: bool) -> str:
@@ -45,7 +49,7 @@ def database_remedy(error: sqlite3.Error, *, read_only: bool) -> str:
             "a row has at most 1 GB; start a new run with a smaller network or shorter episodes, "
             "in another --run-dir"
         )
-    first = remedy(error, _REMEDIES.get(code, "check the disk and the file"))
+    first = remedy(error, _REMEDIES.get(code, _CHECK))
     return f"{first}, and {'try again' if read_only else 'restart with --resume'}"
 
 
@@ -64,9 +68,15 @@ def _is_out_of_files(error: OSError | sqlite3.Error) -> bool:
     return False
 
 
+def _is_disk_full(error: OSError | sqlite3.Error) -> bool:
+    if isinstance(error, OSError):
+        return error.errno in _DISK_FULL
+    return primary_code(error) == sqlite3.SQLITE_FULL
+
+
 def unwritable(path: Path, error: OSError) -> StoreError:
     """Return the error for a file beside the store."""
-    what_to_do = remedy(error, "free some disk space")
+    what_to_do = remedy(error, _PERMIT if error.errno in _FORBIDDEN else _CHECK)
     return StoreError(
         f"{path} cannot be written: {error}; {what_to_do}, and restart with --resume; nothing is "
         f"lost"

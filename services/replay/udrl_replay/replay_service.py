@@ -145,7 +145,7 @@ class ReplayService:
         declared = self.open()
         log.info("serving run %s", run_id)
         if self.run.progress.state == "ended":
-            log.info("the run has ended; increase --max-env-steps to continue it")
+            log.info("the run has ended; raise --max-env-steps or --stop-return to continue it")
         try:
             self._answer_until_ended(stop)
             # Not after an error: then memory may be ahead of the disk.

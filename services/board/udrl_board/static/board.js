@@ -48,7 +48,7 @@ function showObeyed() {
   const isOther = obeyed && obeyed.weights_version !== status.weights_version;
   setText($("obeys"), obeyed
     ? obeyed.answer + (isOther ? ` Measured with weights version ${obeyed.weights_version}; the latest is ${status.weights_version}.` : "")
-    : `Measure the returns that the agent delivers: ${commands(known).obedience}`);
+    : `Measure the returns that the agent obtains: ${commands(known).obedience}`);
 }
 
 async function update() {

@@ -79,7 +79,7 @@ export class CommandForm {
       ["active command", "cross", "active"],
       ["episode in the buffer", "dot", "episode"],
       ["no similar episodes", "band", "unseen"],
-      ...(obeys ? [["returns that the agent delivers", "band", "obeys"]] : []),
+      ...(obeys ? [["returns that the agent obtains", "band", "obeys"]] : []),
     ]);
     setText($("map-said"), `Click the map to choose a command. Arrows at the edge mark commands outside it.${outside(contents, this.map)}`);
   }

@@ -26,9 +26,9 @@ from udrl_launch.subcommands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, vers
 @click.option(
     "--hub", "repo_id", metavar="REPO_ID",
     help="Upload the agent to the Hugging Face Hub, e.g. OWNER/NAME: weights, ONNX model, settings "
-    "and model card. The repository is private.",
+    "and model card. A new repository is private.",
 )  # fmt: skip
-@click.option("--public", is_flag=True, help="With --hub: make the repository public.")
+@click.option("--public", is_flag=True, help="With --hub: upload to a public repository.")
 @click.option(
     "--minari", metavar="NAME",
     help="Write the replay buffer as a Minari dataset, e.g. LunarLander/mine-v0.",
@@ -69,7 +69,7 @@ def export(
         click.echo(f'Hub: {url}; in Python: udrl.load("{HUB_SCHEME}{repo_id}")')
     if (folder or repo_id) and report_of_agent(agent, run_dir) is None:
         click.echo(
-            "The model card does not say which returns this agent can deliver. Measure them "
+            "The model card does not say which returns this agent can obtain. Measure them "
             f"and export again, with: udrl obedience {run_dir} --weights {agent.version}",
             err=True,
         )

@@ -39,8 +39,8 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
     there = [name for name in found if is_of_this_machine(name, role)]
     if not there:
         raise Unreachable(
-            f"no {role} of this machine ({host_name(role)}) has joined run {hello.run_id}; see its "
-            f"log"
+            f"no {role} of this machine ({host_name(role)}) has joined run {hello.run_id}; see the "
+            f"log of the {role}"
         )
     click.echo(f"{there[0]} has joined run {hello.run_id}")
     return 0

@@ -38,7 +38,7 @@ _NAME = Path(reports.FILE)
               "lowest 5 %.")  # fmt: skip
 @click.option("--tolerance", type=click.FloatRange(0, 1e9), metavar="NUMBER",
               help="Largest difference between desired and mean obtained return that counts as "
-              "obeyed. Default: 10 % of the range of returns in the replay buffer.")  # fmt: skip
+              "obeyed. Default: 10 % of the default range of desired returns.")  # fmt: skip
 @TEMPERATURE
 @GREEDY
 @WEIGHTS
