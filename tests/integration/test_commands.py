@@ -89,8 +89,12 @@ def test_budget_spent_in_the_warm_up_trains_nothing(
 
 def test_resuming_an_ended_run_returns_at_once(cli: Callable[..., Cli], tmp_path: Path) -> None:
     given = arguments(TOY, 100, tmp_path / "run")
-    ended = cli(*given, "--in-process").status()
-    assert cli(*given, "--resume").status(timeout=20) == ended
+    code, out, error = cli(*given, "--in-process", "--resume").finish()
+    assert code == 0, error
+    assert error.startswith("there is no run in run to resume; starting a new one\n")
+    code, again, error = cli(*given, "--resume").finish(timeout=20)
+    assert (code, again) == (0, out)
+    assert "starting a new one" not in error
 
 
 def test_status_of_a_live_run_by_its_endpoint(cli: Callable[..., Cli], tmp_path: Path) -> None:

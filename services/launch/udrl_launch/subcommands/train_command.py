@@ -29,7 +29,7 @@ from udrl_launch.subcommands.settings_options import gather_settings, settings_o
 from udrl_launch.training_run import Adviser, Watchers, run_training
 from udrl_proto.reports import Status
 from udrl_proto.text import printable
-from udrl_replay.creation import directory_name
+from udrl_replay.creation import directory_name, exists
 from udrl_show.curve import draw
 from udrl_show.display import Display
 from udrl_show.prometheus import Exporter
@@ -99,6 +99,8 @@ def train(
         raise ConfigError("--resume needs --run-dir, the directory of the run to resume")
     settings = gather_settings(env, given, run_dir, resume=resume)
     run_dir = run_dir or new_run_dir(directory_name(settings.config))
+    if resume and not exists(run_dir):
+        click.echo(f"there is no run in {shown(run_dir)} to resume; starting a new one", err=True)
     log_to_stderr(logging.WARNING)
     warn_of_idle_environments(settings)
 
