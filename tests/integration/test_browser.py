@@ -448,6 +448,20 @@ def test_several_runs_are_compared(
     expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
 
 
+def test_numbers_round_to_zero_without_a_sign(
+    obedient: Path, board: Callable[..., str], pages: Callable[..., Page]
+) -> None:
+    page = pages(board(obedient))
+    shown = page.evaluate(
+        """async () => {
+            const { evaluated, number } = await import("./format.js");
+            const evaluation = { mean: -0.01, ci95_low: -1.5, ci95_high: 1.5 };
+            return [number(-0.04, 1), number(-0.06, 1), number(-0), evaluated(evaluation)];
+        }"""
+    )
+    assert shown == ["0.0", "-0.1", "0", "0.0 ± 1.5"]
+
+
 def test_quarantined_actors_are_listed(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
 ) -> None:

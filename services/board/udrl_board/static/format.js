@@ -1,11 +1,12 @@
 // Numbers, counts and times as text.
 
-// One decimal; two significant digits below one; integers without decimals.
+// One decimal; two significant digits below one; integers without decimals; no minus before zero.
 export function number(x, digits) {
   if (x == null) return "–";
   const isSmall = digits === undefined && Math.abs(x) < 1;
   const decimals = digits ?? (Number.isInteger(x) ? 0 : 1);
-  return x.toLocaleString("en", isSmall ? { maximumSignificantDigits: 2 } : { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
+  const digitsShown = isSmall ? { maximumSignificantDigits: 2 } : { minimumFractionDigits: decimals, maximumFractionDigits: decimals };
+  return x.toLocaleString("en", { ...digitsShown, signDisplay: "negative" });
 }
 
 export const count = (n, one, many = `${one}s`) => `${number(n)} ${n === 1 ? one : many}`;
