@@ -1,14 +1,15 @@
 """A run's status as metrics for Prometheus; each is explained in ``docs/metrics.md``."""
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 from udrl.errors import ConfigError
-from udrl_proto.reports import EvaluationStatus, Status
+from udrl_proto.messages import Message
+from udrl_proto.reports import Status
 
-STATES = ("running", "finishing", "ended", "failed", "stopped")
+_STATES = ("running", "finishing", "ended", "failed", "stopped")
 
-#: Name, status field and description of each metric, and whether it is a counter.
+#: Name, status field and description of each number of a run, and whether it is a counter.
 _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
     ("udrl_iteration", "iteration", "Last completed iteration.", False),
     ("udrl_env_steps", "env_steps", "Steps of warm-up and exploratory episodes.", True),
@@ -25,6 +26,38 @@ _NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
     ("udrl_useful_concurrency", "useful_concurrency", "Episodes that can run at once.", False),
     ("udrl_exact", "exact", "1: the result depends only on the configuration.", False),
 )
+
+#: The same of each actor.
+_ACTOR_NUMBERS: tuple[tuple[str, str, str, bool], ...] = (
+    (
+        "udrl_actor_env_steps_per_second",
+        "env_steps_per_s",
+        "Env steps per second, as reported by the actor.",
+        False,
+    ),
+    ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
+    ("udrl_actor_reruns", "reruns", "Commands that had been assigned before.", True),
+    ("udrl_actor_failures", "failures", "Commands that failed.", True),
+    ("udrl_actor_last_seen_seconds", "last_seen_s", "Time since its last message.", False),
+)
+
+
+class _Metric(NamedTuple):
+    """A metric of a run.
+
+    Attributes:
+        name: its name in Prometheus.
+        about: its description.
+        labels: names of its labels.
+        rows: values of the labels, and the number; numbers that are None are not exported.
+        is_counter: whether it is a counter, not a gauge.
+    """
+
+    name: str
+    about: str
+    labels: tuple[str, ...]
+    rows: Sequence[tuple[Sequence[str], float | None]]
+    is_counter: bool = False
 
 
 class StatusCollector:
@@ -45,94 +78,59 @@ class StatusCollector:
         """Yield the current metrics of the run."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        def labelled(
-            name: str,
-            about: str,
-            labels: list[str],
-            rows: list[tuple[list[str], float | None]],
-            *,
-            grows: bool = False,
-        ) -> Any:
-            family = (CounterMetricFamily if grows else GaugeMetricFamily)(
-                name, about, labels=labels
-            )
-            for values, number in rows:
+        for metric in _metrics(self._get()):
+            kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
+            family = kind(metric.name, metric.about, labels=metric.labels)
+            for values, number in metric.rows:
                 if number is not None:
-                    family.add_metric(values, number)
-            return family
-
-        status = self._get()
-        yield GaugeMetricFamily(
-            "udrl_up", "1: the status is known.", value=float(status is not None)
-        )
-        if status is None:
-            return
-        for name, attribute, about, grows in _NUMBERS:
-            number = getattr(status, attribute)
-            if number is not None:
-                kind = CounterMetricFamily if grows else GaugeMetricFamily
-                yield kind(name, about, value=float(number))
-        yield labelled(
-            "udrl_run_info", "Run id and environment; always 1.", ["run_id", "environment"],
-            [([status.run_id, status.environment], 1.0)],
-        )  # fmt: skip
-        yield labelled(
-            "udrl_state", "1 for the current state of the run.", ["state"],
-            [([s], float(s == status.state)) for s in STATES],
-        )  # fmt: skip
-        for name, found in (
-            ("udrl_eval_return", status.evaluation),
-            ("udrl_final_eval_return", status.final_evaluation),
-        ):
-            yield labelled(name, "Returns of the evaluation.", ["stat"], _stats(found))
-        held = status.buffer
-        yield labelled(
-            "udrl_replay_return", "Returns in the replay buffer.", ["stat"],
-            [(["min"], held.return_min), (["mean"], held.return_mean), (["max"], held.return_max)],
-        )  # fmt: skip
-        yield GaugeMetricFamily(
-            "udrl_replay_episodes", "Episodes in the replay buffer.", value=held.episodes
-        )
-        for name, ledger in (
-            ("udrl_commands", status.commands),
-            ("udrl_episodes", status.episodes),
-        ):
-            fields = ledger.__struct_fields__
-            yield labelled(
-                name, "Conservation ledger.", ["state"],
-                [([field], float(getattr(ledger, field))) for field in fields],
-            )  # fmt: skip
-        actors = status.actors
-        yield GaugeMetricFamily("udrl_actors", "Connected actors.", value=len(actors))
-        for name, attribute, about, grows in (
-            (
-                "udrl_actor_env_steps_per_second",
-                "env_steps_per_s",
-                "Env steps per second, as reported by the actor.",
-                False,
-            ),
-            ("udrl_actor_weights_lag_versions", "weights_lag", "Versions behind.", False),
-            ("udrl_actor_reruns", "reruns", "Commands that had been assigned before.", True),
-            ("udrl_actor_failures", "failures", "Commands that failed.", True),
-            ("udrl_actor_last_seen_seconds", "last_seen_s", "Time since its last message.", False),
-        ):
-            yield labelled(
-                name, about, ["actor", "host"],
-                [([a.id, a.host], float(getattr(a, attribute))) for a in actors],
-                grows=grows,
-            )  # fmt: skip
-        yield labelled(
-            "udrl_waiting_seconds", "Waiting time of a service.", ["who", "for"],
-            [([w.who, w.on], w.seconds) for w in status.waiting],
-        )  # fmt: skip
-        yield GaugeMetricFamily(
-            "udrl_quarantined_actors", "Quarantined actors.", value=len(status.quarantined)
-        )
+                    family.add_metric(values, float(number))
+            yield family
 
 
-def _stats(found: EvaluationStatus | None) -> list[tuple[list[str], float | None]]:
-    names = ("mean", "std", "ci95_low", "ci95_high")
-    return [([name], getattr(found, name)) for name in names] if found is not None else []
+def _metrics(status: Status | None) -> Iterator[_Metric]:
+    yield _single("udrl_up", "1: the status is known.", status is not None)
+    if status is None:
+        return
+    for name, field, about, is_counter in _NUMBERS:
+        if (number := getattr(status, field)) is not None:
+            yield _single(name, about, number, is_counter)
+    run = (status.run_id, status.environment)
+    yield _Metric(
+        "udrl_run_info", "Run id and environment; always 1.", ("run_id", "environment"), [(run, 1)]
+    )
+    states = [((state,), state == status.state) for state in _STATES]
+    yield _Metric("udrl_state", "1 for the current state of the run.", ("state",), states)
+    for name, found in (
+        ("udrl_eval_return", status.evaluation),
+        ("udrl_final_eval_return", status.final_evaluation),
+    ):
+        stats = _fields(found, ("mean", "std", "ci95_low", "ci95_high")) if found else []
+        yield _Metric(name, "Returns of the evaluation.", ("stat",), stats)
+    returns = _fields(status.buffer, ("min", "mean", "max"), prefix="return_")
+    yield _Metric("udrl_replay_return", "Returns in the replay buffer.", ("stat",), returns)
+    yield _single("udrl_replay_episodes", "Episodes in the replay buffer.", status.buffer.episodes)
+    for name, ledger in (("udrl_commands", status.commands), ("udrl_episodes", status.episodes)):
+        counts = _fields(ledger, ledger.__struct_fields__)
+        yield _Metric(name, "Conservation ledger.", ("state",), counts)
+    yield _single("udrl_actors", "Connected actors.", len(status.actors))
+    for name, field, about, is_counter in _ACTOR_NUMBERS:
+        numbers = [((a.id, a.host), getattr(a, field)) for a in status.actors]
+        yield _Metric(name, about, ("actor", "host"), numbers, is_counter)
+    waits = [((wait.who, wait.on), wait.seconds) for wait in status.waiting]
+    yield _Metric("udrl_waiting_seconds", "Waiting time of a service.", ("who", "for"), waits)
+    yield _single("udrl_quarantined_actors", "Quarantined actors.", len(status.quarantined))
+
+
+def _single(name: str, about: str, number: float, is_counter: bool = False) -> _Metric:
+    """Return a metric without labels."""
+    return _Metric(name, about, (), [((), number)], is_counter)
+
+
+def _fields(
+    message: Message, names: Iterable[str], prefix: str = ""
+) -> list[tuple[tuple[str], float | None]]:
+    """Return a row for each of a message's fields, labelled with its name without the prefix."""
+    return [((name,), getattr(message, prefix + name)) for name in names]
 
 
 class Exporter:
