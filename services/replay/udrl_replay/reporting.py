@@ -145,46 +145,28 @@ class Waits:
 
 def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
-    progress, dispatcher, config = run.progress, run.dispatcher, run.config
-    returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
+    progress = run.progress
     latest = run.store.version(progress.latest_version)
-    rate = throughput.per_second(now)
-    left = max(0, run.budget.max_env_steps - progress.env_steps)
-    spent = progress.env_steps / run.wall_s if run.wall_s > 0 else 0.0
-    actors = tuple(
-        ActorStatus(
-            id=name,
-            host=actor.join.host[:_LONGEST_HOST],
-            environments=actor.join.environments,
-            env_steps_per_s=round(actor.request.env_steps_per_s, 1),
-            weights_version=actor.request.weights_version,
-            weights_lag=max(0, progress.latest_version - actor.request.weights_version),
-            running=len(actor.holds),
-            reruns=actor.reruns,
-            failures=actor.failures,
-            last_seen_s=round(now - actor.last_seen, 3),
-        )
-        for name, actor in sorted(dispatcher.actors.items())
-    )
+    actors = _actor_statuses(run, now)
+    final = run.store.last_evaluation(is_final=True) if progress.state == "ended" else None
+    wall_s = run.wall_s if progress.state in ("running", "finishing") else progress.wall_s
     return Status(
         run_id=run.hello.run_id,
         state=progress.state,
-        environment=config.environment,
+        environment=run.config.environment,
         iteration=max(progress.iteration, 0),
         env_steps=progress.env_steps,
         eval_env_steps=progress.eval_env_steps,
-        env_steps_per_s=round(rate, 1),
-        wall_s=round(
-            run.wall_s if progress.state in ("running", "finishing") else progress.wall_s, 3
-        ),
+        env_steps_per_s=round(throughput.per_second(now), 1),
+        wall_s=round(wall_s, 3),
         max_env_steps=run.budget.max_env_steps,
         stop_return=run.budget.stop_return,
-        time_left_s=round(left / spent, 1) if spent and progress.state == "running" else None,
+        time_left_s=_time_left_s(run),
         commands=CommandLedger(
             issued=progress.issued,
             accepted=progress.accepted,
             cancelled=progress.cancelled,
-            outstanding=len(dispatcher.outstanding),
+            outstanding=len(run.dispatcher.outstanding),
         ),
         episodes=EpisodeLedger(
             delivered=progress.delivered,
@@ -192,12 +174,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
             duplicate=progress.duplicate,
             rejected=progress.rejected,
         ),
-        buffer=BufferStatus(
-            episodes=len(returns),
-            return_min=returns[0] if returns else None,
-            return_mean=math.fsum(returns) / len(returns) if returns else None,
-            return_max=returns[-1] if returns else None,
-        ),
+        buffer=_buffer_status(run),
         weights_version=progress.latest_version,
         weights_lag=max((a.weights_lag for a in actors), default=0),
         weights_lag_s=round(lag_s, 4),
@@ -206,12 +183,10 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         weights_kept=tuple(run.store.versions_kept()),
         loss=latest.loss if latest else None,
         evaluation=_evaluation(run.store.last_evaluation(is_final=False)),
-        final_evaluation=_evaluation(run.store.last_evaluation(is_final=True))
-        if progress.state == "ended"
-        else None,
+        final_evaluation=_evaluation(final),
         exact=progress.exact,
         inexact_reason=progress.inexact_reason[:_LONGEST_TEXT],
-        useful_concurrency=episodes_due(config.commands, run.buffer) * (config.lead + 1),
+        useful_concurrency=episodes_due(run.config.commands, run.buffer) * (run.config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
         waiting=waits.list(now),
@@ -226,6 +201,43 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         ),
         quarantined=tuple(Quarantined(id=n, why=w) for n, w in run.quarantined.reasons.items()),
     )
+
+
+def _actor_statuses(run: RunState, now: float) -> tuple[ActorStatus, ...]:
+    return tuple(
+        ActorStatus(
+            id=name,
+            host=actor.join.host[:_LONGEST_HOST],
+            environments=actor.join.environments,
+            env_steps_per_s=round(actor.request.env_steps_per_s, 1),
+            weights_version=actor.request.weights_version,
+            weights_lag=max(0, run.progress.latest_version - actor.request.weights_version),
+            running=len(actor.holds),
+            reruns=actor.reruns,
+            failures=actor.failures,
+            last_seen_s=round(now - actor.last_seen, 3),
+        )
+        for name, actor in sorted(run.dispatcher.actors.items())
+    )
+
+
+def _buffer_status(run: RunState) -> BufferStatus:
+    returns = [e.episode_return for e in run.buffer.best(run.config.buffer.replay_size)]
+    return BufferStatus(
+        episodes=len(returns),
+        return_min=returns[0] if returns else None,
+        return_mean=math.fsum(returns) / len(returns) if returns else None,
+        return_max=returns[-1] if returns else None,
+    )
+
+
+def _time_left_s(run: RunState) -> float | None:
+    """Return the time until the budget is spent at the run's mean speed; None: unknown."""
+    env_steps, wall_s = run.progress.env_steps, run.wall_s
+    if run.progress.state != "running" or not env_steps or wall_s <= 0:
+        return None
+    left = max(0, run.budget.max_env_steps - env_steps)
+    return round(left / (env_steps / wall_s), 1)
 
 
 def _evaluation(row: EvaluationRow | None) -> EvaluationStatus | None:
