@@ -24,7 +24,7 @@ from udrl_replay.dispatching import SUSPICIOUS, Outstanding
 from udrl_replay.enforcement import Enforcement
 from udrl_replay.progress import STOPPED
 from udrl_replay.run_state import RunState
-from udrl_replay.store import EvaluationRow, Store, Version
+from udrl_replay.store import EvaluationRow, Store, StoredEpisode, Version
 from udrl_replay.versions import is_known
 
 log = logging.getLogger("udrl")
@@ -216,38 +216,11 @@ class StoredRun(RunState):
         progress.eval_env_steps += sum(e.length for e in evaluated)
         progress.iteration = iteration
 
-        evicted = {e.id for e in self.buffer.admit(p.entry for p in explored)}
-        admitted = [p for p in explored if p.entry.id not in evicted]
-        self.store.admit(iteration, (p.entry.id for p in admitted), sorted(evicted - set(ids)))
-        self.store.remove_episodes(sorted(set(ids) - {p.entry.id for p in admitted}))
-        self.digests |= {p.entry.id: p.digest for p in admitted}
-        for gone in evicted & self.digests.keys():
-            del self.digests[gone]
-
+        self._admit(iteration, set(ids), explored)
         if evaluated:
             self._note_evaluation(commands[evaluated[0].id], evaluated, is_final=False)
-        version = weights_version(iteration, self.config.lead)
-        best = self.buffer.best(self.config.buffer.replay_size)
-        returns = [e.episode_return for e in best]
         desired = [c.desired_return for c in commands.values() if c.kind == "explore"]
-        self.store.add_iteration(
-            IterationStatus(
-                iteration=iteration,
-                commands=len(ids),
-                env_steps=progress.env_steps,
-                eval_env_steps=progress.eval_env_steps,
-                wall_s=round(self.wall_s, 3),
-                weights_version=version,
-                loss=self.store.loss_of(version),
-                return_min=returns[0],
-                return_mean=math.fsum(returns) / len(returns),
-                return_max=returns[-1],
-                explored_return=math.fsum(p.entry.episode_return for p in explored) / len(explored),
-                commanded_min=min(desired, default=None),
-                commanded_max=max(desired, default=None),
-                admitted=sum(e.iteration == iteration for e in best),
-            )
-        )
+        self._note_iteration(len(ids), [p.entry.episode_return for p in explored], desired)
         self.store.remove_commands(ids)
 
         due = evaluation_due(
@@ -260,6 +233,47 @@ class StoredRun(RunState):
             due = False
         if why := self._spent():
             self._begin_final_evaluation(why)
+
+    def _admit(self, iteration: int, ids: set[int], explored: list[StoredEpisode]) -> None:
+        """Admit an iteration's exploratory episodes to the buffer; delete the others of ``ids``."""
+        evicted = {e.id for e in self.buffer.admit(p.entry for p in explored)}
+        admitted = {p.entry.id: p.digest for p in explored if p.entry.id not in evicted}
+        self.store.admit(iteration, admitted, sorted(evicted - ids))
+        self.store.remove_episodes(sorted(ids - admitted.keys()))
+        self.digests |= admitted
+        for gone in evicted & self.digests.keys():
+            del self.digests[gone]
+
+    def _note_iteration(self, commands: int, explored: list[float], desired: list[float]) -> None:
+        """Record the iteration that is now complete.
+
+        Args:
+            commands: number of its commands.
+            explored: returns of its exploratory episodes.
+            desired: desired returns of its exploratory commands; none in the warm-up.
+        """
+        progress = self.progress
+        version = weights_version(progress.iteration, self.config.lead)
+        best = self.buffer.best(self.config.buffer.replay_size)
+        returns = [e.episode_return for e in best]
+        self.store.add_iteration(
+            IterationStatus(
+                iteration=progress.iteration,
+                commands=commands,
+                env_steps=progress.env_steps,
+                eval_env_steps=progress.eval_env_steps,
+                wall_s=round(self.wall_s, 3),
+                weights_version=version,
+                loss=self.store.loss_of(version),
+                return_min=returns[0],
+                return_mean=math.fsum(returns) / len(returns),
+                return_max=returns[-1],
+                explored_return=math.fsum(explored) / len(explored),
+                commanded_min=min(desired, default=None),
+                commanded_max=max(desired, default=None),
+                admitted=sum(e.iteration == progress.iteration for e in best),
+            )
+        )
 
     def _note_evaluation(self, command: Command, entries: list[Entry], *, is_final: bool) -> None:
         """Record the returns of an evaluation's episodes; ``command`` is one of its commands."""
