@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from udrl.evaluation import interval_text, return_text
-from udrl_proto.reports import EvaluationStatus, Status, Waiting
+from udrl_proto.reports import AuditStatus, EvaluationStatus, Status, Waiting
 from udrl_proto.text import printable
 
 _PLAIN_EVERY_S = 5.0
@@ -103,50 +103,26 @@ def panel(status: Status) -> Table:
     def add(name: str, *phrases: str) -> None:
         table.add_row(name, Phrases(phrases))
 
-    exact = "" if status.exact else ", NOT exact"
     add("run", status.run_id)
     add("environment", status.environment)
-    add("state", f"{_STATES[status.state]}{exact}")
+    add("state", f"{_STATES[status.state]}{'' if status.exact else ', NOT exact'}")
     table.add_row("progress", _progress(status))
     if status.stop_return is not None:
         add("target", f"mean return {return_text(status.stop_return)} in an evaluation")
-    steps = [f"{status.env_steps:,}", f"{status.env_steps_per_s:,.0f} per second"]
-    if status.eval_env_steps:
-        steps.append(f"{status.eval_env_steps:,} more in evaluations")
-    add("env steps", *_separated(steps))
+    add("env steps", *_separated(_env_steps(status)))
     add("iteration", f"{status.iteration:,}")
     add("evaluation", *_evaluation(status.evaluation))
     if status.final_evaluation:
         add("final evaluation", *_evaluation(status.final_evaluation))
     add("replay buffer", *_separated(returns(status)))
-    weights = [f"version {status.weights_version:,}"]
-    if status.loss is not None:
-        weights.append(f"loss {status.loss:.3f}")
-    lag = _counted(status.weights_lag, "version")
-    weights.append(f"lag {lag} and {status.weights_lag_s:.2f} s")
-    add("weights", *_separated(weights))
+    add("weights", *_separated(_weights(status)))
     if status.weights_kept:
         add("weights kept", *_kept(status.weights_kept))
-    running = sum(a.running for a in status.actors)
-    add(
-        "actors",
-        f"{len(status.actors)} with",
-        f"{_counted(sum(a.environments for a in status.actors), 'environment')};",
-        f"{running} of at most {_counted(status.useful_concurrency, 'episode')} running",
-    )
-    times = [f"{duration(status.wall_s)} elapsed"]
-    if status.time_left_s is not None:
-        times.append(time_left(status))
-    add("time", *_separated(times))
+    add("actors", *_actors(status))
+    left = [time_left(status)] if status.time_left_s is not None else []
+    add("time", *_separated([f"{duration(status.wall_s)} elapsed", *left]))
     if status.audit.rate:
-        audit = status.audit
-        add(
-            "audit",
-            f"{100 * audit.rate:g} % of the episodes;",
-            *_separated(
-                [f"{audit.agreed} agreed", f"{audit.open} open", f"{audit.disputed} disputed"]
-            ),
-        )
+        add("audit", *_separated(_audit(status.audit)))
     if status.ended_because:
         add("because", status.ended_because)
     if status.advice:
@@ -193,6 +169,33 @@ def wrapped(phrases: Iterable[str], width: int) -> list[str]:
 def _separated(phrases: Sequence[str]) -> list[str]:
     """Return phrases with a semicolon after each but the last."""
     return [f"{phrase};" for phrase in phrases[:-1]] + list(phrases[-1:])
+
+
+def _env_steps(status: Status) -> list[str]:
+    evaluating = status.eval_env_steps
+    more = [f"{evaluating:,} more in evaluations"] if evaluating else []
+    return [f"{status.env_steps:,}", f"{status.env_steps_per_s:,.0f} per second", *more]
+
+
+def _weights(status: Status) -> list[str]:
+    loss = [f"loss {status.loss:.3f}"] if status.loss is not None else []
+    lag = f"lag {_counted(status.weights_lag, 'version')} and {status.weights_lag_s:.2f} s"
+    return [f"version {status.weights_version:,}", *loss, lag]
+
+
+def _actors(status: Status) -> list[str]:
+    environments = sum(actor.environments for actor in status.actors)
+    running = sum(actor.running for actor in status.actors)
+    return [
+        f"{len(status.actors)} with",
+        f"{_counted(environments, 'environment')};",
+        f"{running} of at most {_counted(status.useful_concurrency, 'episode')} running",
+    ]
+
+
+def _audit(audit: AuditStatus) -> list[str]:
+    counts = [f"{audit.agreed} agreed", f"{audit.open} open", f"{audit.disputed} disputed"]
+    return [f"{100 * audit.rate:g} % of the episodes", *counts]
 
 
 def _kept(versions: Sequence[int]) -> list[str]:
