@@ -81,19 +81,15 @@ def board(
     proxies = tuple(map(_host_of, origins))
     if origins or not is_local:
         token = token or secrets.token_urlsafe(18)
-    if token is not None and not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
-        raise ConfigError(
-            "--token: expected only letters, digits and . _ ~ -, since it is part of an address"
-        )
+    if token is not None:
+        _check_token(token)
     log_to_stderr(logging.WARNING)
     app = make_app(
         *map(Feed, sources), hosts=(*_LOOPBACK, host, *proxies) if is_local else (),
         token=token or "", origins=origins,
     )  # fmt: skip
     with _listening(host, port) as listener:
-        shown = socket.gethostname() if host in _EVERYWHERE else host
-        shown = f"[{shown}]" if ":" in shown else shown
-        address = f"http://{shown}:{listener.getsockname()[1]}/{f'?token={token}' if token else ''}"
+        address = _address(host, listener.getsockname()[1], token)
         server = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -122,6 +118,20 @@ def _serve(server: "uvicorn.Server", listener: socket.socket, stop: threading.Ev
         pass
     server.should_exit = True
     thread.join(GRACE_S)
+
+
+def _check_token(token: str) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
+        raise ConfigError(
+            "--token: expected only letters, digits and . _ ~ -, since it is part of an address"
+        )
+
+
+def _address(host: str, port: int, token: str | None) -> str:
+    """Return the address for the browser."""
+    shown = socket.gethostname() if host in _EVERYWHERE else host
+    shown = f"[{shown}]" if ":" in shown else shown
+    return f"http://{shown}:{port}/{f'?token={token}' if token else ''}"
 
 
 def _is_loopback(host: str) -> bool:
