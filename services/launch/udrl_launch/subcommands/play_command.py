@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from udrl.evaluation import return_text
-from udrl_inspect.agents import evaluation_commands, load_agent
+from udrl.rollout import Rollout
+from udrl_inspect.agents import Agent, evaluation_commands, load_agent
 from udrl_inspect.greedy import caution
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
@@ -89,26 +90,36 @@ def play(
     for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
         obtained.append(rollout.episode_return)
         if as_json:
-            report = {
-                "environment_seed": rollout.command.environment_seed,
-                "weights_version": agent.version,
-                "temperature": command.temperature,
-                "desired_return": command.desired_return,
-                "desired_horizon": command.desired_horizon,
-                "episode_return": rollout.episode_return,
-                "length": rollout.steps,
-                "terminated": rollout.terminated,
-                "truncated": rollout.truncated,
-            }
-            print_json(report)
+            print_json(_record(agent, rollout))
         else:
-            ending = "" if rollout.terminated else " (step limit reached)"
-            click.echo(
-                f"seed {rollout.command.environment_seed}: return "
-                f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
-            )
+            click.echo(_line(rollout))
     if warning := caution(agent, run_dir, command, obtained):
         click.echo(warning, err=True)
     if video is not None and not as_json:
         click.echo(f"video: {shown(video)}")
     return 0
+
+
+def _record(agent: Agent, rollout: Rollout) -> dict[str, float]:
+    """Return an episode as a line of ``--json``."""
+    command = rollout.command
+    return {
+        "environment_seed": command.environment_seed,
+        "weights_version": agent.version,
+        "temperature": command.temperature,
+        "desired_return": command.desired_return,
+        "desired_horizon": command.desired_horizon,
+        "episode_return": rollout.episode_return,
+        "length": rollout.steps,
+        "terminated": rollout.terminated,
+        "truncated": rollout.truncated,
+    }
+
+
+def _line(rollout: Rollout) -> str:
+    """Return an episode as a line of text."""
+    ending = "" if rollout.terminated else " (step limit reached)"
+    return (
+        f"seed {rollout.command.environment_seed}: return "
+        f"{return_text(rollout.episode_return)} in {rollout.steps} steps{ending}"
+    )
