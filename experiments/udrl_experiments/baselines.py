@@ -18,11 +18,12 @@ from torch import Tensor
 
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.atomic_files import replacing
-from udrl.commands import Command, CommandSampler
+from udrl.commands import CommandSampler
 from udrl.config import Config, KeywordValue, change
 from udrl.errors import ConfigError, Interrupted, InvalidData
-from udrl.evaluation import summarise
+from udrl.evaluation import Evaluation, summarise
 from udrl.frame_stack import FrameStack
+from udrl.inference import Acting
 from udrl.numerics import resolve_arithmetic
 from udrl.replay import Entry, ReplayBuffer
 from udrl_experiments.protocol import BaselineAlgorithm
@@ -112,17 +113,16 @@ def train_baseline(
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     config, hyperparameters = resolve_arithmetic(baseline.config), baseline.complete()
-    path = folder / "state.safetensors"
-    tensors: dict[str, Tensor] = {}
+    path, table = folder / "state.safetensors", folder / "evaluations.csv"
     if path.exists():
-        with _reading(path):
-            state, tensors = _load(path)
+        state, tensors = _load(path)
         # The process may have ended after it saved the state, and before it wrote the table.
-        write(folder / "evaluations.csv", EvaluationRecord, state.rows)
+        write(table, EvaluationRecord, state.rows)
     else:
         if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
             exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
         state = _State(exploration_steps=exploration_steps or 0, counters={}, rows=[])
+        tensors = {}
     rows = state.rows
     began = time.monotonic() - (rows[-1].wall_s if rows else 0.0)
 
@@ -150,10 +150,8 @@ def train_baseline(
             )
             if stop.is_set():
                 raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
-            behavior = policies.ModelPolicy(model, shape)
-            commands = _commands(baseline, generator, len(rows) + 1)
-            episodes = generate_episodes(generator, commands, behavior)
-            evaluation = summarise([episode.episode_return for episode in episodes])
+            policy = policies.ModelPolicy(model, shape)
+            evaluation = _evaluate(baseline, generator, policy, len(rows) + 1)
             row = EvaluationRecord(
                 environment=config.environment, algorithm=baseline.algorithm, variant="",
                 seed=config.seed, env_steps=model.num_timesteps,
@@ -163,7 +161,7 @@ def train_baseline(
             rows.append(row)
             state = msgspec.structs.replace(state, counters=policies.counters(model))
             _save(path, state, policies.tensors(model))
-            write(folder / "evaluations.csv", EvaluationRecord, rows)
+            write(table, EvaluationRecord, rows)
     return rows
 
 
@@ -177,15 +175,18 @@ def _require_stable_baselines3() -> None:
         ) from error
 
 
-def _commands(baseline: Baseline, generator: EpisodeGenerator, number: int) -> list[Command]:
-    """Return the commands of an evaluation, with the seeds of UDRL's in iteration ``number``."""
+def _evaluate(
+    baseline: Baseline, generator: EpisodeGenerator, policy: Acting, number: int
+) -> Evaluation:
+    """Evaluate a policy with the seeds of UDRL's evaluation in iteration ``number``."""
     config = baseline.config
     if baseline.algorithm == "DQN":
         config = change(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec)
     # Desired returns and horizons come from the buffer. The policy ignores them.
     buffer = ReplayBuffer(config.buffer, [Entry(0.0, 0, 1)])
-    return sampler.evaluate(number, buffer)
+    episodes = generate_episodes(generator, sampler.evaluate(number, buffer), policy)
+    return summarise([episode.episode_return for episode in episodes])
 
 
 def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:
@@ -195,7 +196,7 @@ def _save(path: Path, state: _State, tensors: dict[str, Tensor]) -> None:
 
 
 def _load(path: Path) -> tuple[_State, dict[str, Tensor]]:
-    with safetensors.safe_open(path, "pt") as file:
+    with _reading(path), safetensors.safe_open(path, "pt") as file:
         state = msgspec.json.decode(file.metadata()["state"], type=_State)
         return state, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
