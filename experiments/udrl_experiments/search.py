@@ -3,8 +3,10 @@
 import json
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -222,22 +224,6 @@ def _study(
         longer = plan._replace(max_env_steps=final.max_env_steps)
         return runs_of(environment, algorithm, number, longer)
 
-    def finalists(root: Path) -> list[Job]:
-        if final is None:
-            return []
-        found: list[Job] = []
-        for environment, subject in by_environment.items():
-            for algorithm in subject.algorithms:
-                scored = [
-                    (value, key)
-                    for key, runs in jobs.items()
-                    if key[:2] == (environment, algorithm)
-                    and (value := _score(runs, root)) is not None
-                ]
-                best = sorted(scored, key=lambda pair: -pair[0])[: final.configurations]
-                found += [job for _, key in best for job in in_final(*key)]
-        return found
-
     def run_all(
         planned: Sequence[Job],
         root: Path,
@@ -246,7 +232,8 @@ def _study(
         echo: Callable[[str], None],
     ) -> None:
         run_jobs_on_ray(planned, root, side_by_side, stop, echo)
-        if longer := finalists(root):
+        if final is not None and (best := _finalists(jobs, final.configurations, root)):
+            longer = [run for key in best for run in in_final(*key)]
             run_jobs_on_ray(longer, root, side_by_side, stop, echo)
 
     def report(folders: StudyFolders) -> str:
@@ -274,6 +261,23 @@ def _study(
     planned = [run for runs in jobs.values() for run in runs]
     possible = [run for key in jobs for run in in_final(*key)]
     return Study(name, planned, report, run_all, needs=("ray",), possible=possible)
+
+
+def _finalists(
+    jobs: Mapping[tuple[str, Algorithm, int], Sequence[Job]], most: int, root: Path
+) -> list[tuple[str, Algorithm, int]]:
+    """Return the configurations with the best scores, ``most`` of each environment and algorithm.
+
+    Args:
+        jobs: runs of each configuration, ordered by environment and algorithm.
+        most: number of configurations.
+        root: folder of the runs.
+    """
+    found: list[tuple[str, Algorithm, int]] = []
+    for _, keys in groupby(jobs, key=itemgetter(0, 1)):
+        scores = {key: value for key in keys if (value := _score(jobs[key], root)) is not None}
+        found += sorted(scores, key=lambda key: -scores[key])[:most]
+    return found
 
 
 def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:
