@@ -45,7 +45,7 @@ FlatSettings = dict[str, KeywordValue | list[int | str] | Keywords | None]
 #: The import path of a wrapper, with arguments if it needs any.
 Wrapper = Annotated[str, Meta(min_length=1, max_length=200)]
 
-Kind = TypeVar("Kind", bound=msgspec.Struct)
+AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 
 #: Command ids are ``iteration * COMMANDS_PER_ITERATION + index`` (see :mod:`udrl.commands`).
 COMMANDS_PER_ITERATION = 1_000_000
@@ -280,7 +280,7 @@ def flat(settings: msgspec.Struct) -> dict[str, Any]:
     return {n: list(value) if isinstance(value, tuple) else value for n, value in values.items()}
 
 
-def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
+def build(kind: type[AnyStruct], values: Mapping[str, Any]) -> AnyStruct:
     """Return settings of a kind, in their groups, after checking every value's type and range.
 
     Args:
@@ -305,7 +305,7 @@ def build(kind: type[Kind], values: Mapping[str, Any]) -> Kind:
         raise ConfigError(f"{value}{error}") from error
 
 
-def change(settings: Kind, **values: Any) -> Kind:
+def change(settings: AnyStruct, **values: Any) -> AnyStruct:
     """Return settings with some values changed, in any group.
 
     Raises:

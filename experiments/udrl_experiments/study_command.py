@@ -34,7 +34,7 @@ from udrl_launch import completions
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.subcommands.options import FILE, STEPS
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 
 _FOLDER = click.option(
@@ -51,7 +51,7 @@ def study() -> None:
     """
 
 
-def _options(command: Command) -> Command:
+def _options(command: Decorated) -> Decorated:
     """Add the options of all studies."""
     options = (
         click.option("--scale", type=click.Choice(get_args(StudyScale)), default="small",
@@ -71,7 +71,7 @@ def _options(command: Command) -> Command:
     return command
 
 
-def _runs_from(command: Command) -> Command:
+def _runs_from(command: Decorated) -> Decorated:
     """Add the option ``--runs-from``."""
     return click.option(
         "--runs-from", multiple=True, metavar="DIR",
@@ -80,7 +80,7 @@ def _runs_from(command: Command) -> Command:
     )(command)  # fmt: skip
 
 
-def _tasks(*default: str) -> Callable[[Command], Command]:
+def _tasks(*default: str) -> Callable[[Decorated], Decorated]:
     """Add the option ``--task``."""
     return click.option(
         "--task", "names", multiple=True, type=click.Choice(list(TASKS)), default=default,
@@ -88,7 +88,7 @@ def _tasks(*default: str) -> Callable[[Command], Command]:
     )  # fmt: skip
 
 
-def _participants(command: Command) -> Command:
+def _participants(command: Decorated) -> Decorated:
     """Add the option ``--algorithm`` of comparisons."""
     return click.option(
         "--algorithm", "participants", multiple=True, type=click.Choice(get_args(Participant)),

@@ -12,10 +12,10 @@ import msgspec
 from udrl.atomic_files import write_atomically
 from udrl.errors import InvalidData
 
-Row = TypeVar("Row", bound=msgspec.Struct)
+AnyRow = TypeVar("AnyRow", bound=msgspec.Struct)
 
 
-def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
+def write(path: Path, kind: type[AnyRow], rows: Iterable[AnyRow]) -> None:
     """Write rows below a header with the field names; the file is written atomically."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
@@ -24,7 +24,7 @@ def write(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
     write_atomically(path, text.getvalue().encode())
 
 
-def read(path: Path, kind: type[Row]) -> list[Row]:
+def read(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     """Return the rows of a file.
 
     Raises:

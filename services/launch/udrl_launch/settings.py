@@ -24,7 +24,7 @@ from udrl.config import (
 )
 from udrl.errors import ConfigError
 
-Kind = TypeVar("Kind", bound=msgspec.Struct)
+AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 
 
 #: The name for no preset.
@@ -191,7 +191,7 @@ def gather(
         values |= {name: stored[name] for name in automatic if name in stored}
         automatic.clear()
 
-    def part(kind: type[Kind]) -> Kind:
+    def part(kind: type[AnyStruct]) -> AnyStruct:
         return build(kind, {n: v for n, v in values.items() if n in setting_names(kind)})
 
     config = part(Config)

@@ -13,7 +13,7 @@ from udrl_launch.settings import Settings, gather
 from udrl_launch.subcommands.options import FILE, STEPS
 from udrl_replay.creation import exists
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 
 #: Options for the origins of settings.
@@ -29,14 +29,14 @@ ORIGINS = (
 )  # fmt: skip
 
 
-def origin_options(command: Command) -> Command:
+def origin_options(command: Decorated) -> Decorated:
     """Add the options for the origins of settings."""
     for option in reversed(ORIGINS):
         command = option(command)
     return command
 
 
-def settings_options(command: Command) -> Command:
+def settings_options(command: Decorated) -> Decorated:
     """Add the options for settings."""
     options = (
         *ORIGINS,
