@@ -25,7 +25,7 @@ from typing import NamedTuple
 UDRL = [sys.executable, "-m", "udrl_launch"]
 
 
-class Run(NamedTuple):
+class MeasuredRun(NamedTuple):
     """Figures of a run.
 
     Attributes:
@@ -43,7 +43,7 @@ class Run(NamedTuple):
     start_s: float = 0.0
 
 
-def train(folder: Path, env_steps: int, *, watched: bool) -> Run:
+def train(folder: Path, env_steps: int, *, watched: bool) -> MeasuredRun:
     """Train, and return the figures of the run."""
     run_dir = folder / "run"
     training = subprocess.Popen(
@@ -59,7 +59,7 @@ def train(folder: Path, env_steps: int, *, watched: bool) -> Run:
     middle = next(row for row in rows if row[0] >= env_steps / 2)
     last = rows[-1]
     later = (last[0] - middle[0]) / (last[1] - middle[1])
-    return Run(last[0] / last[1], later, *found)
+    return MeasuredRun(last[0] / last[1], later, *found)
 
 
 def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float, float]:
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--env-steps", type=int, default=600_000)
     parser.add_argument("--times", type=int, default=5)
     options = parser.parse_args()
-    runs: dict[bool, list[Run]] = {False: [], True: []}
+    runs: dict[bool, list[MeasuredRun]] = {False: [], True: []}
     for number in range(options.times):
         for watched in (False, True):
             with tempfile.TemporaryDirectory() as folder:

@@ -65,7 +65,7 @@ class Injection(msgspec.Struct):
     next_iteration: float | None = None
 
 
-class Row(msgspec.Struct):
+class FaultRow(msgspec.Struct):
     """The result of a run with one fault."""
 
     fault: str
@@ -145,7 +145,9 @@ def _undisturbed(options: argparse.Namespace, run_dir: Path) -> tuple[Status, fl
     return run.status(), time.monotonic() - began
 
 
-def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed: Status) -> Row:
+def disturb(
+    fault: Fault, options: argparse.Namespace, folder: Path, undisturbed: Status
+) -> FaultRow:
     """Return the result of a run with one fault."""
     name = fault.name.replace(" ", "-")
     os.environ[SLOW_ONE] = str(folder / f"{name}.slow")
@@ -189,7 +191,7 @@ def disturb(fault: Fault, options: argparse.Namespace, folder: Path, undisturbed
     }
     if fault.shows_in is not None and not counts[fault.shows_in]:
         remarks.append(f"WRONG: the fault did not occur, {fault.shows_in} is 0")
-    return Row(
+    return FaultRow(
         fault=fault.name,
         equal=digests(status) == digests(undisturbed) and status.exact,
         balanced=is_balanced(status) and not run.unbalanced,
@@ -269,7 +271,7 @@ _HEADER = (
 )
 
 
-def _line(row: Row) -> str:
+def _line(row: FaultRow) -> str:
     times = row.injections
     reporters = sorted({t.reported_by for t in times if t.reported_by})
     cells = [

@@ -25,7 +25,7 @@ from udrl_launch.settings import ANY_PRESET, gather
 _EVALUATIONS = 5
 
 
-class Task(NamedTuple):
+class DefaultsTask(NamedTuple):
     """An environment, its budget in env steps, and settings that it needs."""
 
     environment: str
@@ -34,25 +34,29 @@ class Task(NamedTuple):
 
 
 TASKS = {
-    "FrozenLake": Task("FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}),
-    "FrozenLakeSlippery": Task("FrozenLake-v1", 200_000, {}),
+    "FrozenLake": DefaultsTask(
+        "FrozenLake-v1", 20_000, {"environment_kwargs": {"is_slippery": False}}
+    ),
+    "FrozenLakeSlippery": DefaultsTask("FrozenLake-v1", 200_000, {}),
     # Returns vary greatly, so an evaluation needs many episodes.
-    "Blackjack": Task("Blackjack-v1", 60_000, {"eval_episodes": 5_000, "max_episode_steps": 20}),
-    "CliffWalking": Task("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
-    "Taxi": Task("Taxi-v4", 200_000, {}),
-    "CartPole": Task("CartPole-v1", 100_000, {}),
-    "Acrobot": Task("Acrobot-v1", 100_000, {}),
-    "MountainCar": Task("MountainCar-v0", 150_000, {}),
-    "LunarLander": Task("LunarLander-v3", 200_000, {}),
-    "LunarLanderSparse": Task("LunarLanderSparse-v3", 200_000, {}),
-    "Pendulum": Task("Pendulum-v1", 300_000, {"normalise_observations": True}),
-    "MountainCarContinuous": Task(
+    "Blackjack": DefaultsTask(
+        "Blackjack-v1", 60_000, {"eval_episodes": 5_000, "max_episode_steps": 20}
+    ),
+    "CliffWalking": DefaultsTask("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
+    "Taxi": DefaultsTask("Taxi-v4", 200_000, {}),
+    "CartPole": DefaultsTask("CartPole-v1", 100_000, {}),
+    "Acrobot": DefaultsTask("Acrobot-v1", 100_000, {}),
+    "MountainCar": DefaultsTask("MountainCar-v0", 150_000, {}),
+    "LunarLander": DefaultsTask("LunarLander-v3", 200_000, {}),
+    "LunarLanderSparse": DefaultsTask("LunarLanderSparse-v3", 200_000, {}),
+    "Pendulum": DefaultsTask("Pendulum-v1", 300_000, {"normalise_observations": True}),
+    "MountainCarContinuous": DefaultsTask(
         "MountainCarContinuous-v0", 300_000, {"normalise_observations": True}
     ),
 }
 
 
-class Curve(NamedTuple):
+class LearningCurve(NamedTuple):
     """A run: mean return of random actions, those of evaluations by env steps, CPU seconds."""
 
     random: float
@@ -60,7 +64,7 @@ class Curve(NamedTuple):
     cpu_s: float
 
 
-def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
+def learn(name: str, seed: int, preset: str, assignments: list[str]) -> LearningCurve:
     """Train on one task."""
     task = TASKS[name]
     given = {"seed": seed, "lead": 0, "max_env_steps": task.max_env_steps, "eval_episodes": 200}
@@ -78,7 +82,7 @@ def learn(name: str, seed: int, preset: str, assignments: list[str]) -> Curve:
 
     began = time.process_time()
     run = algorithm1(settings.config, settings.budget, report=note, automatic=settings.automatic)
-    return Curve(
+    return LearningCurve(
         _random_return(settings.config),
         [(steps[i - 1], e.mean) for i, e in sorted(run.evaluations.items())],
         time.process_time() - began,

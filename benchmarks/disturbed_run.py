@@ -27,7 +27,7 @@ _POLL_S = 0.02
 _LINE = re.compile(r"(\d{4}-\S+ [\d:]+,\d+) (\w+) +(.*)")
 
 
-class Moment(NamedTuple):
+class ProgressPoint(NamedTuple):
     """The progress of a run at one moment."""
 
     at: float
@@ -84,7 +84,7 @@ class DisturbedRun:
         self.settings = settings
         self.link = link
         self.unbalanced: list[str] = []
-        self.moments: list[Moment] = []
+        self.moments: list[ProgressPoint] = []
         self._hang_s = hang_s
         self._deadline = time.monotonic() + limit_s
         create_run(run_dir, settings.config).close()
@@ -165,7 +165,7 @@ class DisturbedRun:
             self.unbalanced.append(f"the store could not be read: {error}")
             return
         now = time.time()
-        self.moments.append(Moment(now, progress.accepted, progress.iteration))
+        self.moments.append(ProgressPoint(now, progress.accepted, progress.iteration))
         commands = progress.accepted + progress.cancelled + len(waiting)
         episodes = progress.accepted + progress.duplicate + progress.rejected
         if (progress.issued, progress.delivered) != (commands, episodes) and progress.issued:

@@ -62,7 +62,7 @@ class Measured(msgspec.Struct, frozen=True):
 
 
 @dataclass
-class Actor:
+class LogicalActor:
     """A logical actor: its commands, and its current request."""
 
     name: str
@@ -75,12 +75,14 @@ class Actor:
     query: int = 0
 
 
-class Fleet:
+class LogicalFleet:
     """All logical actors, driven by one thread. Replies come through one queue."""
 
     def __init__(self, load: Load) -> None:
         self._load = load
-        self._answers: queue.SimpleQueue[tuple[Actor, int, bytes | None]] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[tuple[LogicalActor, int, bytes | None]] = (
+            queue.SimpleQueue()
+        )
         self._sessions = [sessions.connect(load.endpoint, 30.0) for _ in range(load.sessions)]
         hello = sessions.find_run(self._sessions[0], RUN, 30.0)
         self._spec = hello.environment
@@ -100,7 +102,7 @@ class Fleet:
             for s in self._sessions
         ]
         actors = [
-            Actor(f"logical-{i}", self._sessions[i % len(self._sessions)])
+            LogicalActor(f"logical-{i}", self._sessions[i % len(self._sessions)])
             for i in range(self._load.actors)
         ]
         for actor in actors:
@@ -112,7 +114,7 @@ class Fleet:
         warm = time.monotonic() + self._load.seconds / 4
         began = 0.0
         end = warm + self._load.seconds
-        pauses: list[tuple[float, Actor]] = []
+        pauses: list[tuple[float, LogicalActor]] = []
         while (now := time.monotonic()) < end:
             if not began and now >= warm:
                 began = now
@@ -143,7 +145,7 @@ class Fleet:
             session.close()
         return measured
 
-    def _join(self, actor: Actor) -> JoinRequest:
+    def _join(self, actor: LogicalActor) -> JoinRequest:
         return JoinRequest(
             role="actor", id=actor.name, host="fleet", pid=os.getpid(), software="0",
             environments=_WANTED, numerics_class="synthetic", environment=self._spec,
@@ -154,14 +156,14 @@ class Fleet:
         self._arrivals[str(version)] = time.monotonic()  # that of the last session
         self._news = True
 
-    def _go_on(self, actor: Actor) -> None:
+    def _go_on(self, actor: LogicalActor) -> None:
         """Repeat a request without a reply, or send the next one."""
         if actor.answered:
             self._next(actor)
         else:
             self._ask(actor)
 
-    def _next(self, actor: Actor) -> None:
+    def _next(self, actor: LogicalActor) -> None:
         """Deliver the next episode, or request commands."""
         if actor.commands:
             command_id = actor.commands[0].id
@@ -173,12 +175,12 @@ class Fleet:
                 actor, verbs.COMMANDS.name, CommandsRequest(actor=actor.name, wanted=_WANTED)
             )
 
-    def _send(self, actor: Actor, verb: str, message: Message) -> None:
+    def _send(self, actor: LogicalActor, verb: str, message: Message) -> None:
         actor.verb, actor.payload = verb, encode(message)
         actor.asked_at, actor.answered = time.monotonic(), False
         self._ask(actor)
 
-    def _ask(self, actor: Actor) -> None:
+    def _ask(self, actor: LogicalActor) -> None:
         actor.query = query = actor.query + 1
 
         def reply(answer: zenoh.Reply) -> None:
@@ -198,7 +200,9 @@ class Fleet:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def _take(self, actor: Actor, query: int, answer: bytes | None) -> tuple[Actor, float] | None:
+    def _take(
+        self, actor: LogicalActor, query: int, answer: bytes | None
+    ) -> tuple[LogicalActor, float] | None:
         """Handle a reply; return the actor and the seconds to wait if it has to wait."""
         if query != actor.query:
             return None  # the end of a query that had a reply
@@ -242,4 +246,4 @@ def _made_up(spec: EnvironmentSpec, steps: int, seed: int) -> EpisodeMessage:
 
 if __name__ == "__main__":
     load = msgspec.json.decode(sys.argv[1], type=Load)
-    Path(sys.argv[2]).write_bytes(msgspec.json.encode(Fleet(load).run()))
+    Path(sys.argv[2]).write_bytes(msgspec.json.encode(LogicalFleet(load).run()))

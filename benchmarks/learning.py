@@ -26,7 +26,7 @@ from udrl_proto.reports import Status
 ENVIRONMENTS = ("LunarLander-v3", "LunarLanderSparse-v3", "CartPole-v1")
 
 
-class Trained(NamedTuple):
+class TrainedRun(NamedTuple):
     """A run: its last status, its evaluations, and an evaluation with greedy actions."""
 
     seed: int
@@ -52,7 +52,7 @@ def main() -> None:
         draw(options.folder / f"{env}.png", env, runs)
 
 
-def train(env: str, seed: int, run_dir: Path) -> Trained:
+def train(env: str, seed: int, run_dir: Path) -> TrainedRun:
     """Train with the preset, unless the run exists."""
     if not (run_dir / "weights.safetensors").exists():
         command = [sys.executable, "-m", "udrl_launch", "train", env, "--seed", str(seed)]
@@ -65,10 +65,12 @@ def train(env: str, seed: int, run_dir: Path) -> Trained:
         agent = load_agent(run_dir)
         result = evaluate(agent, evaluation_commands(agent, episodes=100, temperature=0.0))
         kept.write_text(json.dumps(result.evaluation._asdict()), encoding="utf-8")
-    return Trained(seed, read_status(run_dir), rows, json.loads(kept.read_text(encoding="utf-8")))
+    return TrainedRun(
+        seed, read_status(run_dir), rows, json.loads(kept.read_text(encoding="utf-8"))
+    )
 
 
-def row(env: str, run: Trained) -> str:
+def row(env: str, run: TrainedRun) -> str:
     """Return a run as a row of the table."""
     final = run.status.final_evaluation
     assert final is not None
@@ -82,7 +84,7 @@ def row(env: str, run: Trained) -> str:
     )
 
 
-def write(path: Path, runs: list[Trained]) -> None:
+def write(path: Path, runs: list[TrainedRun]) -> None:
     """Write all evaluations as a tidy table."""
     names = ("eval_at_env_steps", "wall_s", "eval_mean", "eval_std", "eval_ci95_low",
              "eval_ci95_high", "eval_desired_return", "eval_desired_horizon")  # fmt: skip
@@ -93,7 +95,7 @@ def write(path: Path, runs: list[Trained]) -> None:
             writer.writerows([run.seed, *(r[n] for n in names)] for r in run.rows)
 
 
-def draw(path: Path, env: str, runs: list[Trained]) -> None:
+def draw(path: Path, env: str, runs: list[TrainedRun]) -> None:
     """Draw a thin line per seed and a thick one for their mean."""
     figure = Figure(figsize=(7, 4.3), layout="constrained")
     axes = figure.add_subplot()

@@ -31,14 +31,14 @@ from udrl_proto.reports import Status
 _CHUNK = 16 * 1024
 
 
-class Link(NamedTuple):
+class LinkSpeed(NamedTuple):
     """Mbit/s in each direction (0: unlimited), and the one-way delay in milliseconds."""
 
     mbit_s: float
     delay_ms: float
 
     @classmethod
-    def parse(cls, text: str) -> "Link":
+    def parse(cls, text: str) -> "LinkSpeed":
         """Return a link from ``MBIT_S:DELAY_MS``."""
         mbit_s, delay_ms = text.split(":")
         return cls(float(mbit_s), float(delay_ms))
@@ -53,7 +53,7 @@ class Proxy:
         down: bytes sent to clients.
     """
 
-    def __init__(self, link: Link, target: int) -> None:
+    def __init__(self, link: LinkSpeed, target: int) -> None:
         self._link, self._target = link, target
         self.up = self.down = 0
         self._loop = asyncio.new_event_loop()
@@ -144,7 +144,7 @@ def _completed(run_dir: Path, iteration: int) -> Status:
     raise TimeoutError(f"iteration {iteration} was not complete after 600 s")
 
 
-def measure(environment: str, link: Link, seconds: float, run_dir: Path) -> dict[str, float]:
+def measure(environment: str, link: LinkSpeed, seconds: float, run_dir: Path) -> dict[str, float]:
     """Return the figures of one actor over a link, after the first iterations."""
     port = free_port()
     proxy = Proxy(link, port)
@@ -178,8 +178,8 @@ def main() -> None:
     parser.add_argument("--env", default="LunarLander-v3")
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument(
-        "--links", nargs="+", type=Link.parse, metavar="MBIT_S:DELAY_MS",
-        default=[Link(0, 0), Link(100, 10), Link(10, 20), Link(2, 40)],
+        "--links", nargs="+", type=LinkSpeed.parse, metavar="MBIT_S:DELAY_MS",
+        default=[LinkSpeed(0, 0), LinkSpeed(100, 10), LinkSpeed(10, 20), LinkSpeed(2, 40)],
     )  # fmt: skip
     options = parser.parse_args()
     print(f"{options.env}, one actor of 16 environments, {os.cpu_count()} cores")

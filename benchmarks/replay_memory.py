@@ -50,7 +50,7 @@ class NoisyImages(gym.Env[Any, Any]):
 gym.register("NoisyImages-v0", f"{__name__}:NoisyImages")
 
 
-class Memory(NamedTuple):
+class ProcessMemory(NamedTuple):
     """A process: its role and id, its resident memory and the peak of it, in MB."""
 
     role: str
@@ -128,15 +128,15 @@ def _idle_learner(process: "subprocess.Popen[bytes]") -> float:
     return seen[-1]
 
 
-def _forget_peak(memory: Memory) -> None:
+def _forget_peak(memory: ProcessMemory) -> None:
     Path(f"/proc/{memory.pid}/clear_refs").write_text("5", encoding="utf-8")
 
 
-def _find(process: "subprocess.Popen[bytes]", role: str) -> Memory:
+def _find(process: "subprocess.Popen[bytes]", role: str) -> ProcessMemory:
     return next(m for m in _children(process) if m.role == role)
 
 
-def _children(parent: "subprocess.Popen[bytes]") -> list[Memory]:
+def _children(parent: "subprocess.Popen[bytes]") -> list[ProcessMemory]:
     found = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
@@ -147,7 +147,7 @@ def _children(parent: "subprocess.Popen[bytes]") -> list[Memory]:
             arguments = (path / "cmdline").read_bytes().split(b"\0")
             role = arguments[arguments.index(b"udrl_launch") + 1].decode()
             now, peak = (int(status[n].split()[0]) * 1024 / 1e6 for n in ("VmRSS", "VmHWM"))
-            found.append(Memory(role, int(path.name), now, peak))
+            found.append(ProcessMemory(role, int(path.name), now, peak))
         except (FileNotFoundError, ProcessLookupError, ValueError, KeyError):
             continue  # it ended, or is not a service
     return found

@@ -131,7 +131,7 @@ UNITS = (
 )
 
 
-class Sample(NamedTuple):
+class LoadSample(NamedTuple):
     """The replay process at one moment: CPU seconds, resident MB, episodes accepted."""
 
     cpu: float
@@ -183,7 +183,7 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stop = threading.Event()
     announced: list[Announced] = []
-    samples: list[Sample] = []
+    samples: list[LoadSample] = []
     with (
         tempfile.TemporaryDirectory() as folder,
         replay_service(Path(folder) / "run", hello, endpoint) as pid,
@@ -218,11 +218,11 @@ def measure(actors: int, kilobytes: int, options: argparse.Namespace) -> dict[st
     return _figures(load, kilobytes, measured, announced, samples, status)
 
 
-def _sample(pid: int, status: Status) -> Sample:
+def _sample(pid: int, status: Status) -> LoadSample:
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     cpu = (int(fields[11]) + int(fields[12])) / _TICK
-    return Sample(cpu, pages * os.sysconf("SC_PAGE_SIZE") / 1e6, status.episodes.accepted)
+    return LoadSample(cpu, pages * os.sysconf("SC_PAGE_SIZE") / 1e6, status.episodes.accepted)
 
 
 def _figures(
@@ -230,7 +230,7 @@ def _figures(
     kilobytes: int,
     measured: Measured,
     announced: list[Announced],
-    samples: list[Sample],
+    samples: list[LoadSample],
     status: Status,
 ) -> dict[str, float]:
     first, last = samples[len(samples) // 4], samples[-1]

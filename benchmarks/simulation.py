@@ -66,7 +66,7 @@ class Timing(NamedTuple):
 
 
 @dataclass
-class Actor:
+class SimulatedActor:
     """The state of an actor.
 
     Attributes:
@@ -102,7 +102,7 @@ class Simulation:
         self._lead = recorded.config.lead
         self._training_threads = recorded.config.arithmetic.training_threads
         self._last = len(self._lengths) - 1
-        self._actors = [Actor(environments) for _ in range(actors)]
+        self._actors = [SimulatedActor(environments) for _ in range(actors)]
         self._events: list[tuple[float, int, str, Any]] = []
         self._tie = itertools.count()
         self._now = 0.0
@@ -137,12 +137,12 @@ class Simulation:
 
     # Actors.
 
-    def _ask(self, actor: Actor) -> None:
+    def _ask(self, actor: SimulatedActor) -> None:
         if actor.free and not actor.asking:
             actor.asking = True
             self._at(self._costs.answer, "answered", actor)
 
-    def _answered(self, actor: Actor) -> None:
+    def _answered(self, actor: SimulatedActor) -> None:
         actor.asking = False
         share = math.ceil(self._in_play / len(self._actors)) - actor.held
         for _ in range(min(len(self._unassigned), actor.free, share)):
@@ -152,7 +152,7 @@ class Simulation:
             actor.held += 1
         self._step(actor)
 
-    def _step(self, actor: Actor) -> None:
+    def _step(self, actor: SimulatedActor) -> None:
         if actor.load or not actor.running:
             return
         rows = len(actor.running)
@@ -165,7 +165,7 @@ class Simulation:
         # Actors share the cores in proportion to their load: those that sleep need less.
         self._at((cpu + sleep) * max(1.0, self._load / cores), "stepped", actor)
 
-    def _stepped(self, actor: Actor) -> None:
+    def _stepped(self, actor: SimulatedActor) -> None:
         self._load -= actor.load
         actor.load = 0.0
         for command in list(actor.running):
@@ -183,7 +183,7 @@ class Simulation:
 
     # The replay service.
 
-    def _arrived(self, episode: tuple[Actor, int]) -> None:
+    def _arrived(self, episode: tuple[SimulatedActor, int]) -> None:
         actor, iteration = episode
         actor.held -= 1
         self._in_play -= 1

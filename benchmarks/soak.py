@@ -32,7 +32,7 @@ ROLES = ("replay", "learner", "actor")
 _GROWTH = {"MiB": 0.03, "descriptors": 0.0, "threads": 0.0}
 
 
-class Sample(NamedTuple):
+class ProcessSample(NamedTuple):
     """One process at one moment."""
 
     seconds: float
@@ -74,14 +74,14 @@ def main() -> int:
             process.wait(10)
     if options.csv:
         with options.csv.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([Sample._fields, *samples])
+            csv.writer(file).writerows([ProcessSample._fields, *samples])
     return 0 if report(samples, paces) else 1
 
 
 def _watch(
     process: "subprocess.Popen[bytes]", run_dir: Path, seconds: float, every: float
-) -> tuple[list[Sample], list[Pace]]:
-    samples: list[Sample] = []
+) -> tuple[list[ProcessSample], list[Pace]]:
+    samples: list[ProcessSample] = []
     paces: list[Pace] = []
     began = time.monotonic()
     while (now := time.monotonic() - began) < seconds:
@@ -93,7 +93,7 @@ def _watch(
     return samples, paces
 
 
-def _look(parent: int, now: float) -> Iterator[Sample]:
+def _look(parent: int, now: float) -> Iterator[ProcessSample]:
     for path in Path("/proc").glob("[0-9]*"):
         try:
             status = dict(
@@ -106,7 +106,7 @@ def _look(parent: int, now: float) -> Iterator[Sample]:
             role = arguments[arguments.index(b"udrl_launch") + 1].decode()
             mib = int(status["VmRSS"].split()[0]) / 1024
             descriptors = len(list((path / "fd").iterdir()))
-            yield Sample(now, role, int(path.name), mib, descriptors, int(status["Threads"]))
+            yield ProcessSample(now, role, int(path.name), mib, descriptors, int(status["Threads"]))
         except (FileNotFoundError, ProcessLookupError, ValueError, KeyError):
             continue  # it ended, or is not a service
 
@@ -121,7 +121,7 @@ def _pace(run_dir: Path, now: float) -> Iterator[Pace]:
     yield Pace(now, progress.iteration, progress.env_steps, size)
 
 
-def report(samples: list[Sample], paces: list[Pace]) -> bool:
+def report(samples: list[ProcessSample], paces: list[Pace]) -> bool:
     """Print the quarters of the run; return whether nothing grew."""
     end = paces[-1].seconds
     quarters = [(end * i / 4, end * (i + 1) / 4) for i in range(4)]

@@ -62,7 +62,7 @@ _ROWS = 16
 _ROLES = ("actor", "learner", "replay", "train")
 
 
-class Window(NamedTuple):
+class MeasuredWindow(NamedTuple):
     """A part of a run."""
 
     seconds: float
@@ -218,7 +218,7 @@ def _usage(run_dir: Path, parent: int) -> Usage:
     try:
         window = _window(run_dir)
     except (FileNotFoundError, IndexError, ValueError):
-        window = Window(0.0, 0, 0)
+        window = MeasuredWindow(0.0, 0, 0)
     cpu = dict.fromkeys(_ROLES, 0.0)
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # the process has ended
@@ -231,13 +231,13 @@ def _usage(run_dir: Path, parent: int) -> Usage:
     return Usage(window.steps, cpu)
 
 
-def _window(run_dir: Path) -> Window:
+def _window(run_dir: Path) -> MeasuredWindow:
     """Return the part of a run after its warm-up."""
     lines = (run_dir / "metrics.csv").read_text().splitlines()
     names = lines[0].split(",")
     rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
     total = [int(r["env_steps"]) + int(r["eval_env_steps"]) for r in rows]
-    return Window(
+    return MeasuredWindow(
         float(rows[-1]["wall_s"]) - float(rows[0]["wall_s"]), total[-1] - total[0], len(rows) - 1
     )
 
@@ -349,14 +349,14 @@ def _random_speed(config: Config) -> float:
     return steps / (time.perf_counter() - began)
 
 
-def _reference_run(config: Config, steps: int) -> Window:
+def _reference_run(config: Config, steps: int) -> MeasuredWindow:
     """Return the second half of a short run of the reference implementation."""
-    reports: list[Window] = []
+    reports: list[MeasuredWindow] = []
     algorithm1(
         change(config, lead=0, eval_every=2**30),
         Budget(max_env_steps=steps),
         report=lambda run: reports.append(
-            Window(time.perf_counter(), run.env_steps, run.iteration)
+            MeasuredWindow(time.perf_counter(), run.env_steps, run.iteration)
         ),
     )
     first, last = reports[len(reports) // 2], reports[-1]
@@ -364,7 +364,7 @@ def _reference_run(config: Config, steps: int) -> Window:
         raise SystemExit(
             f"--reference-steps {steps}: the warm-up takes {first.steps:,} env steps; raise it"
         )
-    return Window(
+    return MeasuredWindow(
         last.seconds - first.seconds, last.steps - first.steps, last.iterations - first.iterations
     )
 
