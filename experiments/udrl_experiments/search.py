@@ -96,7 +96,7 @@ class Subject(NamedTuple):
     preset: dict[str, Any]
 
 
-def search(
+def search_tasks(
     plan: StudyPlan,
     tasks: Sequence[Task],
     algorithms: Sequence[Algorithm] = (),
@@ -139,16 +139,16 @@ def search_environment(
     or ``any``. Its ``auto`` settings are chosen once for all runs, with seed 1.
 
     Args:
-        plan: as for :func:`search`; its assignments change the preset.
+        plan: as for :func:`search_tasks`; its assignments change the preset.
         environment: Gymnasium's id.
         file: file with the space (:mod:`udrl_experiments.search_space`).
-        algorithms: as for :func:`search`.
-        configurations: as for :func:`search`.
-        final: as for :func:`search`.
+        algorithms: as for :func:`search_tasks`.
+        configurations: as for :func:`search_tasks`.
+        final: as for :func:`search_tasks`.
 
     Raises:
-        ConfigError: as for :func:`search`, or the file is not a valid space, or an algorithm does
-            not support the environment.
+        ConfigError: as for :func:`search_tasks`, or the file is not a valid space, or an algorithm
+            does not support the environment.
         UnsupportedEnvironment: the environment cannot be created or is not supported.
         EnvironmentFault: the environment failed repeatedly.
     """

@@ -19,7 +19,7 @@ from udrl_inspect.inspection import read_status
 EPISODES = 100
 
 
-def sensitivity(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
+def sensitivity_study(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
     """Return the study ``sensitivity``, which uses the agents of Figures 4 and 5.
 
     Args:
@@ -39,7 +39,7 @@ def sensitivity(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES
                 row for run in runs for row in _evaluate_agent(run, folders.root, task, episodes)
             ]
             write(table, Obtained, rows)
-            draw(table, task.title)
+            draw_sensitivity(table, task.title)
             lines += _summary(task, rows)
         return "\n".join(lines)
 
@@ -89,6 +89,6 @@ def _evaluate_agent(run: Job, root: Path, task: Task, episodes: int) -> list[Obt
     ]
 
 
-def draw(table: Path, title: str) -> None:
+def draw_sensitivity(table: Path, title: str) -> None:
     """Draw the figure from its table."""
     figures.save(figures.sensitivity_figure(read(table, Obtained), title), table.with_suffix(""))

@@ -21,15 +21,11 @@ from udrl_experiments.protocol import (
     parse_seeds,
     tasks,
 )
-from udrl_experiments.search import Final, search_environment
-from udrl_experiments.search import search as make_search
-from udrl_experiments.sensitivity import EPISODES
-from udrl_experiments.sensitivity import sensitivity as make_sensitivity
+from udrl_experiments.search import Final, search_environment, search_tasks
+from udrl_experiments.sensitivity import EPISODES, sensitivity_study
 from udrl_experiments.study import Study, run_study
-from udrl_experiments.study_progress import studies, table
-from udrl_experiments.variants import commands as make_commands
-from udrl_experiments.variants import lead as make_lead
-from udrl_experiments.variants import segments as make_segments
+from udrl_experiments.study_progress import progress_table, studies
+from udrl_experiments.variants import commands_study, lead_study, segments_study
 from udrl_launch import completions
 from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.subcommands.options import FILE, STEPS
@@ -140,7 +136,7 @@ def show(names: tuple[str, ...], folder: Path) -> int:
     Example: udrl study show lander --folder runs/studies
     """
     for number, (name, runs) in enumerate(studies(folder, names)):
-        lines = table(name, runs)
+        lines = progress_table(name, runs)
         click.echo("\n".join(["", *lines] if number else lines))
     return 0
 
@@ -191,7 +187,7 @@ def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
 
     Example: udrl study sensitivity --task lander --task sparse
     """
-    return _run(lambda plan: make_sensitivity(plan, tasks(names), episodes), **options)
+    return _run(lambda plan: sensitivity_study(plan, tasks(names), episodes), **options)
 
 
 @study.command()
@@ -203,7 +199,7 @@ def lead(names: tuple[str, ...], **options: Any) -> int:
 
     Example: udrl study lead --side-by-side 1
     """
-    return _run(lambda plan: make_lead(plan, tasks(names)), **options)
+    return _run(lambda plan: lead_study(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -215,7 +211,7 @@ def segments(names: tuple[str, ...], **options: Any) -> int:
 
     Example: udrl study segments --task sparse
     """
-    return _run(lambda plan: make_segments(plan, tasks(names)), **options)
+    return _run(lambda plan: segments_study(plan, tasks(names)), **options)
 
 
 @study.command()
@@ -229,7 +225,7 @@ def commands(names: tuple[str, ...], strategies: tuple[str, ...], **options: Any
 
     Example: udrl study commands --strategy mine.strategies:Patient
     """
-    return _run(lambda plan: make_commands(plan, tasks(names), strategies), **options)
+    return _run(lambda plan: commands_study(plan, tasks(names), strategies), **options)
 
 
 @study.command()
@@ -274,7 +270,7 @@ def search(
         raise ConfigError(f"{given} needs {missing}: udrl study search ENV --space FILE")
     if env is None or file is None:
         return _run(
-            lambda plan: make_search(
+            lambda plan: search_tasks(
                 plan, tasks(names or ("lander",)), algorithms, configurations, final
             ),
             **options,

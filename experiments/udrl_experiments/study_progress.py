@@ -83,7 +83,7 @@ def studies(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, list[JobP
         yield name, [job_progress(job, root) for job in runs]
 
 
-def table(name: str, runs: Sequence[JobProgress]) -> list[str]:
+def progress_table(name: str, runs: Sequence[JobProgress]) -> list[str]:
     """Return the lines of a study: a summary, then one line per run."""
     done = [run for run in runs if run.state == "done"]
     steps, planned = sum(run.env_steps for run in runs), sum(run.job.max_env_steps for run in runs)

@@ -20,20 +20,20 @@ SMALL_STEPS = 1_000_000
 LEADS = (0, 1, 2, 4, 8)
 
 
-def lead(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
+def lead_study(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
     """Return the study of the cost of asynchrony, by env steps and by wall time."""
     variants = {f"lead {n}": {"lead": n} for n in LEADS}
     return _variants("lead", plan, tasks, variants, wall_time=True)
 
 
-def segments(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
+def segments_study(plan: StudyPlan, tasks: Sequence[Task]) -> Study:
     """Return the study of trailing and all segments, 0 <= t1 < t2 <= T (section 2.3.3)."""
     # A baseline allows trailing segments only.
     variants = {name: {"segments": name, "baseline": "none"} for name in ("trailing", "all")}
     return _variants("segments", plan, tasks, variants)
 
 
-def commands(plan: StudyPlan, tasks: Sequence[Task], strategies: Sequence[str]) -> Study:
+def commands_study(plan: StudyPlan, tasks: Sequence[Task], strategies: Sequence[str]) -> Study:
     """Return the study of strategies for exploratory commands (sections 2.3.4 and 6).
 
     Args:

@@ -19,7 +19,7 @@ from udrl_experiments import study_command
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, StudyPlan
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.search import Final, Scored, search, search_environment
+from udrl_experiments.search import Final, Scored, search_environment, search_tasks
 from udrl_experiments.search_space import read_space, shipped_space
 from udrl_experiments.study import StudyFolders
 from udrl_inspect.csv_tables import read, write
@@ -29,7 +29,7 @@ ENVIRONMENTS = [task.environment for task in TASKS.values()]
 
 
 def test_papers_scale_has_the_papers_values() -> None:
-    study = search(StudyPlan("paper"), list(TASKS.values()), ["UDRL"])
+    study = search_tasks(StudyPlan("paper"), list(TASKS.values()), ["UDRL"])
     runs = [job.config.environment for job in study.jobs]
     assert [runs.count(name) for name in ENVIRONMENTS] == [256 * 3, 256, 72]
     assert {job.config.evaluation.eval_seeds for job in study.jobs} == {"search"}
@@ -37,7 +37,7 @@ def test_papers_scale_has_the_papers_values() -> None:
 
 
 def test_search_starts_from_the_papers_settings_only() -> None:
-    (job,) = search(StudyPlan(), [TASKS["lander"]], ["UDRL"], 1).jobs
+    (job,) = search_tasks(StudyPlan(), [TASKS["lander"]], ["UDRL"], 1).jobs
     buffer = job.config.buffer
     assert (buffer.max_age, buffer.recent_size, job.config.lead) == (None, 0, 0)
     drawn = shipped_space("LunarLander-v3").draw("UDRL", 0)
@@ -47,7 +47,7 @@ def test_search_starts_from_the_papers_settings_only() -> None:
 
 def test_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path: Path) -> None:
     plan = StudyPlan(seeds=(1, 2), assignments=("eval_every=10",))
-    study = search(plan, [TASKS["sparse"]], ["UDRL", "DQN", "DQN"], 4)
+    study = search_tasks(plan, [TASKS["sparse"]], ["UDRL", "DQN", "DQN"], 4)
     scores = dict[tuple[str, int], list[float]]()
     for index, job in enumerate(study.jobs):
         means = [float((index * 7) % 5 + n % 3) for n in range(25)]
@@ -86,7 +86,7 @@ def test_score_is_the_mean_of_the_last_20_and_the_best_becomes_a_preset(tmp_path
 @pytest.mark.parametrize("name", ["batch_size", "eval_seeds", "hidden", "seed", "environment"])
 def test_searched_setting_cannot_be_set(name: str) -> None:
     with pytest.raises(ConfigError, match=f"--set {name}=...: this study sets {name} itself"):
-        search(StudyPlan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
+        search_tasks(StudyPlan(assignments=(f"{name}=1",)), [TASKS["lander"]], ["UDRL"], 1)
 
 
 def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
@@ -115,7 +115,7 @@ def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
 
     monkeypatch.setattr(search_module, "run_jobs_on_ray", run)
     plan = StudyPlan(seeds=(1,), max_env_steps=50_000)
-    study = search(plan, [TASKS["lander"]], ["UDRL"], 4, Final(2, 100_000))
+    study = search_tasks(plan, [TASKS["lander"]], ["UDRL"], 4, Final(2, 100_000))
     study.run_jobs(study.jobs, tmp_path, 1, threading.Event(), print)
     assert [[(job.variant, job.max_env_steps) for job in batch] for batch in batches] == [
         [(f"configuration {n}", 50_000) for n in range(4)],
@@ -130,7 +130,7 @@ def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
 
 
 def test_no_preset_is_written_without_a_score(tmp_path: Path) -> None:
-    study = search(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
+    study = search_tasks(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()
     text = study.report(StudyFolders(tmp_path, tmp_path / "search"))
     assert "every configuration has a failed run" in text
@@ -139,7 +139,7 @@ def test_no_preset_is_written_without_a_score(tmp_path: Path) -> None:
 
 def test_algorithm_that_is_not_in_the_space_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"--algorithm PPO: .*LunarLander-v3 has UDRL, DQN, A2C"):
-        search(StudyPlan(), [TASKS["lander"]], ["PPO"], 1)
+        search_tasks(StudyPlan(), [TASKS["lander"]], ["PPO"], 1)
 
 
 SPACE = """

@@ -10,7 +10,7 @@ from udrl.errors import ConfigError
 from udrl_experiments.jobs import Job
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.study_command import study
-from udrl_experiments.study_progress import JobProgress, job_progress, studies, table
+from udrl_experiments.study_progress import JobProgress, job_progress, progress_table, studies
 from udrl_inspect.csv_tables import write
 
 
@@ -74,7 +74,7 @@ def test_table_has_a_summary_and_a_line_for_each_run() -> None:
         JobProgress(job(1, variant="lead 2"), "done", 1000, 61.0, -12.54),
         JobProgress(job(2, 2000), "not begun"),
     ]
-    assert table("lander", runs) == [
+    assert progress_table("lander", runs) == [
         "lander: 1 of 2 runs done, 1,000 of 3,000 env steps, wall time 1:01",
         "state      env steps       wall time  mean return  run",
         "done       1,000 of 1,000  1:01       -12.5        DQN lead 2 CartPole-v1 seed 1",
@@ -87,7 +87,7 @@ def test_runs_of_the_papers_preset_and_of_configurations_are_labelled() -> None:
         JobProgress(msgspec.structs.replace(job(1, variant=variant), algorithm="UDRL"), "not begun")
         for variant in ("paper", "configuration 3")
     ]
-    assert [line.split("  ")[-1].strip() for line in table("search", runs)[2:]] == [
+    assert [line.split("  ")[-1].strip() for line in progress_table("search", runs)[2:]] == [
         "UDRL-paper CartPole-v1 seed 1",
         "UDRL configuration 3 CartPole-v1 seed 1",
     ]

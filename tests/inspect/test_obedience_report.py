@@ -21,7 +21,7 @@ from udrl_inspect.obedience_report import (
 )
 from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
 from udrl_launch.subcommands.options import RETURNS
-from udrl_show.obedience_picture import draw
+from udrl_show.obedience_picture import draw_obedience
 
 
 def point(
@@ -145,12 +145,12 @@ def test_csv_file_has_every_point(tmp_path: Path) -> None:
 def test_figure_shows_the_obeyed_range(tmp_path: Path, obeyed: tuple[float, float] | None) -> None:
     example = report(obeyed=obeyed)
     for name in ("both.svg", "one.png", "one.pdf"):
-        draw(example, tmp_path / "pictures" / name)
+        draw_obedience(example, tmp_path / "pictures" / name)
         example = msgspec.structs.replace(example, by_horizon=[], all_horizons=None)
     ElementTree.fromstring((tmp_path / "pictures" / "both.svg").read_text())
     assert (tmp_path / "pictures" / "one.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
-        draw(example, tmp_path / "picture.bmp")
+        draw_obedience(example, tmp_path / "picture.bmp")
 
 
 def test_report_round_trips(tmp_path: Path) -> None:

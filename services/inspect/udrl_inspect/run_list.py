@@ -55,7 +55,7 @@ def find(folder: Path) -> list[Summary]:
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such directory; give the folder of your runs")
-    summaries = map(summarise, run_directories(folder))
+    summaries = map(summarise_run, run_directories(folder))
     return sorted(summaries, key=lambda s: s.changed, reverse=True)
 
 
@@ -77,7 +77,7 @@ def run_directories(folder: Path, seen: set[Path] | None = None) -> Iterator[Pat
         yield from run_directories(one, seen)
 
 
-def summarise(run_dir: Path) -> Summary:
+def summarise_run(run_dir: Path) -> Summary:
     """Return the summary of a run, even if it cannot be read."""
     # Without the -shm file, which readers write too.
     changed = max(map(_changed, (run_dir / STORE_FILE, run_dir / f"{STORE_FILE}-wal")))

@@ -80,14 +80,14 @@ class LinePoint(NamedTuple):
     high: float
 
 
-def draw(run_dir: Path, title: str) -> Path:
+def draw_curve(run_dir: Path, title: str) -> Path:
     """Draw a run's returns against env steps into its directory; return the figure's path.
 
     Raises:
         ConfigError: matplotlib is not installed.
         StoreError: the run has no metrics.
     """
-    curve = read(run_dir)
+    curve = read_curve(run_dir)
     figure, (axes,) = pictures.empty()
     steps = [r["env_steps"] for r in curve.rows]
     for name, label, style in (
@@ -123,7 +123,7 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
         ConfigError: matplotlib is not installed, or the file's extension is not supported.
         StoreError: a run has no metrics, or no run has an evaluation.
     """
-    pictures.check_name(picture)
+    pictures.check_picture_name(picture)
     lines, missing = _lines(places)
     curves = [curve for line in lines for curve in line]
     if not any(_points(line, x) or line[0].final for line in lines):
@@ -151,7 +151,7 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
     return missing
 
 
-def read(run_dir: Path) -> Curve:
+def read_curve(run_dir: Path) -> Curve:
     """Return the data of a run.
 
     Raises:
@@ -200,7 +200,7 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
                 continue
             drawn.add(run_dir.resolve())
             try:
-                curve = read(run_dir)
+                curve = read_curve(run_dir)
             except UdrlError as error:
                 if not below:
                     raise

@@ -30,7 +30,7 @@ _KINDS = {
 _FINISH_S = 60.0
 
 
-def check_name(path: Path) -> None:
+def check_video_name(path: Path) -> None:
     """Check the extension of a file name.
 
     Raises:
@@ -53,7 +53,7 @@ class Film:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        check_name(path)
+        check_video_name(path)
         try:
             import imageio_ffmpeg
             from PIL import Image, ImageDraw, ImageFont

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _TITLE = 52
 
 
-def draw(report: ObedienceReport, picture: Path) -> None:
+def draw_obedience(report: ObedienceReport, picture: Path) -> None:
     """Draw obtained against commanded returns, and lengths against commanded horizons.
 
     Args:
@@ -27,7 +27,7 @@ def draw(report: ObedienceReport, picture: Path) -> None:
         ConfigError: matplotlib is not installed, the extension is not supported, or the file cannot
             be written.
     """
-    pictures.check_name(picture)
+    pictures.check_picture_name(picture)
     figure, axes = pictures.empty(2 if report.by_horizon else 1)
     _returns(axes[0], report)
     if report.by_horizon:

@@ -16,7 +16,7 @@ _KINDS = (".png", ".svg", ".pdf")
 _MOST_COLUMNS = 3
 
 
-def check_name(picture: Path) -> None:
+def check_picture_name(picture: Path) -> None:
     """Check the extension of a file name.
 
     Raises:

@@ -73,7 +73,7 @@ def fps_of(env: Environment) -> float:
     return float(env.metadata.get("render_fps") or _USUAL_FPS)
 
 
-def play(
+def play_episodes(
     agent: Agent,
     commands: list[Command],
     *,

@@ -22,7 +22,7 @@ from udrl_launch.subcommands.options import (
     version,
 )
 from udrl_show import pictures
-from udrl_show.obedience_picture import draw
+from udrl_show.obedience_picture import draw_obedience
 
 _NAME = Path(reports.FILE)
 
@@ -65,7 +65,7 @@ def obedience(
     Example: udrl obedience runs/mine
     """
     if output is not None:
-        pictures.check_name(output)
+        pictures.check_picture_name(output)
     agent = load_agent(run_dir, version(weights))
     plan = reports.plan_commands(
         agent, points=points, episodes=episodes,
@@ -87,7 +87,7 @@ def obedience(
         for paragraph in obedience_text.table(report).splitlines():
             print_text(paragraph)
     if output is not None:
-        draw(report, output)
+        draw_obedience(report, output)
     for problem in _keep(run_dir, report, draws=output is None):
         click.echo(problem, err=True)
     return 0
@@ -104,7 +104,7 @@ def _keep(run_dir: Path, report: reports.ObedienceReport, *, draws: bool) -> lis
         return [f"the report cannot be written to {run_dir}: {error}"]
     try:
         if draws:
-            draw(report, run_dir / _NAME.with_suffix(".png"))
+            draw_obedience(report, run_dir / _NAME.with_suffix(".png"))
     except ConfigError as error:
         return [f"no figure: {error}"]
     return []

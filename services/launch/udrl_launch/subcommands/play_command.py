@@ -22,8 +22,7 @@ from udrl_launch.subcommands.options import (
     version,
 )
 from udrl_show import film
-from udrl_show.playing import play as play_episodes
-from udrl_show.playing import with_seeds
+from udrl_show.playing import play_episodes, with_seeds
 from udrl_show.window import KEYS_HELP, Window
 
 
@@ -66,7 +65,7 @@ def play(
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
     if video is not None:
-        film.check_name(video)
+        film.check_video_name(video)
     agent = load_agent(run_dir, version(weights))
     commands = with_seeds(
         evaluation_commands(

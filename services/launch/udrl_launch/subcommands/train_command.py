@@ -30,7 +30,7 @@ from udrl_launch.training_run import Adviser, Watchers, run_training
 from udrl_proto.reports import Status
 from udrl_proto.text import printable
 from udrl_replay.creation import directory_name, exists
-from udrl_show.curve import draw
+from udrl_show.curve import draw_curve
 from udrl_show.display import Display
 from udrl_show.prometheus import Exporter
 from udrl_show.run_log import RunLog
@@ -181,7 +181,7 @@ def _finish(run_dir: Path, status: Status, run_logs: Sequence[RunLog]) -> None:
         lines.append(("weights", "none: the warm-up spent the budget; raise --max-env-steps"))
     lines.append(("metrics", shown(run_dir / "metrics.csv")))
     try:
-        curve = shown(draw(run_dir, status.environment))
+        curve = shown(draw_curve(run_dir, status.environment))
     except ConfigError as error:
         curve = str(error)
     lines.append(("learning curve", curve))
