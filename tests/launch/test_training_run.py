@@ -43,3 +43,16 @@ def test_stop_while_connecting_prints_how_to_resume(
     with pytest.raises(Interrupted, match=f"^stopped; resume with: {command}$"):
         training_run.run_training(settings, tmp_path / "run", stop, in_process=True)
     assert UnresponsiveServices.ended
+
+
+def test_torch_is_loaded_in_the_calling_thread_before_there_is_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load() -> None:
+        raise OSError(f"libtorch.so, in {threading.current_thread().name}")
+
+    monkeypatch.setattr(training_run, "load_learner_service", load)
+    settings = gather("Figure2-v0", preset_name="none", options=TOY)
+    with pytest.raises(OSError, match=rf"^libtorch\.so, in {threading.current_thread().name}$"):
+        training_run.run_training(settings, tmp_path / "run", threading.Event(), in_process=True)
+    assert not (tmp_path / "run").exists()

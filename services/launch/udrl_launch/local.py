@@ -129,8 +129,6 @@ class Threads:
         self._errors: list[BaseException] = []
         self._threads: list[threading.Thread] = []
         self._run_ended: float | None = None
-        # Not in the learner's thread: a native library is not loaded safely while others run.
-        roles.load_learner_service()
         self._switched_before = switch_threads_soon()
         self._start(
             "replay",

@@ -15,7 +15,7 @@ from udrl_inspect.address import Address, connected, from_this_machine
 from udrl_inspect.inspection import read_status
 from udrl_launch.local import Local, Processes, Threads
 from udrl_launch.paths import shown
-from udrl_launch.roles import open_run, require_device, require_torch
+from udrl_launch.roles import load_learner_service, open_run, require_device, require_torch
 from udrl_launch.settings import Settings
 from udrl_proto import session as sessions
 from udrl_proto import verbs
@@ -122,7 +122,11 @@ def run_training(
         UdrlError: the run cannot be started or cannot continue.
         Interrupted: ``stop`` was set.
     """
-    require_torch()
+    if in_process:
+        # Not in the learner's thread: a native library is not loaded safely while others run.
+        load_learner_service()
+    else:
+        require_torch()
     require_device(settings.config)
     endpoint = listen or f"{'tls' if keys else 'tcp'}/127.0.0.1:{free_port()}"
     sessions.check_endpoint(endpoint, secure=keys is not None)
