@@ -34,7 +34,7 @@ from udrl.commands import CommandSampler
 from udrl.config import Config, change
 from udrl.environments.making import make_environment, specify
 from udrl.errors import RunFailed
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl_launch.settings import Settings, gather
 from udrl_proto.reports import Status
 

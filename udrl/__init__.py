@@ -4,7 +4,7 @@
 
 ================================  ======================================
 Algorithm 1                       :mod:`udrl.algorithm1`
-2.3.1 replay buffer               :mod:`udrl.replay`
+2.3.1 replay buffer               :mod:`udrl.replay_buffer`
 2.3.2 behavior function           :mod:`udrl.behavior`
 2.3.3 training                    :mod:`udrl.segments`, :mod:`udrl.experience`, :mod:`udrl.training`
 2.3.4 exploratory commands        :mod:`udrl.commands`

@@ -20,7 +20,7 @@ from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.numerics import resolve_arithmetic
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due
 from udrl.training import TrainingState, exact_arithmetic, train, untrained
 

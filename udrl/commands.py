@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from udrl.config import COMMANDS_PER_ITERATION, Config
 from udrl.environments.making import EnvironmentSpec
-from udrl.replay import ReplayBuffer
+from udrl.replay_buffer import ReplayBuffer
 from udrl.schedule import weights_version
 from udrl.setting_groups import CommandSettings, Temperature
 from udrl.strategies import Best, CommandStrategy, choose_command, make_strategy

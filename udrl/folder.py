@@ -15,6 +15,7 @@ import msgspec
 from udrl.config import Configured, FlatSettings, flat
 from udrl.environments.making import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.file_remedies import file_remedy
 from udrl.graph import acting_graph
 from udrl.policy import Policy
 from udrl.weights import decode_behavior, encode_weights
@@ -85,9 +86,8 @@ def save_folder(folder: Path, policy: Policy, card: str) -> None:
         if policy.config.network.behavior is not None:
             (folder / _GRAPH).write_bytes(policy.behavior.graph)
     except OSError as error:
-        raise ConfigError(
-            f"{error.filename or folder}: {error.strerror}; name a folder you may write"
-        ) from error
+        what_to_do = file_remedy(error, "choose a writable folder")
+        raise ConfigError(f"{error.filename or folder}: {error.strerror}; {what_to_do}") from error
 
 
 def load_folder(folder: str | Path) -> Policy:

@@ -18,7 +18,7 @@ from typing import NamedTuple, Protocol
 
 from udrl.config import Config
 from udrl.errors import ConfigError
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 
 #: Largest absolute return and horizon of a command.
 _MOST = 10**9

@@ -40,7 +40,9 @@ def decode_weights(blob: bytes, shapes: Shapes) -> Weights:
     try:
         tensors = safetensors.numpy.load(blob)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise InvalidWeights(f"weights: not safetensors: {error}; fetch them again") from error
+        raise InvalidWeights(
+            f"weights: not safetensors: {error}; they are damaged, use another copy"
+        ) from error
     if set(tensors) != set(shapes):
         odd = sorted(set(tensors) ^ set(shapes))
         raise InvalidWeights(

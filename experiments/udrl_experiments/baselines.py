@@ -25,7 +25,7 @@ from udrl.evaluation import Evaluation, summarise
 from udrl.frame_stack import FrameStack
 from udrl.inference import Acting
 from udrl.numerics import resolve_arithmetic
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl_experiments.protocol import BaselineAlgorithm
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete

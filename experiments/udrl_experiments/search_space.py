@@ -113,7 +113,7 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     try:
         file = msgspec.convert(values, _File)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {error}; see docs/studies.md") from error
+        raise ConfigError(f"{source}: {error}; the page on studies shows a file") from error
     for name in file.networks:
         if name not in NETWORKS:
             raise ConfigError(

@@ -10,6 +10,7 @@ import msgspec
 
 from udrl.atomic_files import write_atomically
 from udrl.errors import ConfigError, InvalidData
+from udrl.file_remedies import file_remedy
 from udrl.strategies import make_strategy
 from udrl_experiments.jobs import Job, copy_finished, run_jobs
 from udrl_experiments.protocol import TASKS
@@ -93,9 +94,8 @@ def run_study(
         study.run_jobs(study.jobs, folders.root, side_by_side, stop, echo)
         summary = study.report(folders)
     except OSError as error:
-        raise ConfigError(
-            f"--folder {root}: {error}; choose a writable folder on a disk with free space"
-        ) from error
+        what_to_do = file_remedy(error, "choose a writable folder")
+        raise ConfigError(f"--folder {root}: {error}; {what_to_do}") from error
     echo(f"tables and figures are in {folder}")
     return summary
 

@@ -278,9 +278,9 @@ def find_run(
                 )
             return decode(payload, Hello)
         if time.monotonic() >= deadline:
-            wanted = "no run" if run_id is None else f"no run {run_id!r}"
+            named, otherwise = ("", "") if run_id is None else (f" {run_id!r}", ", or check --run")
             raise Unreachable(
-                f"{wanted} replied in {patience_s:.0f} s; start `udrl replay ENV` or check --run"
+                f"no run{named} replied in {patience_s:.0f} s; start `udrl replay ENV`{otherwise}"
             )
         if stop.wait(pause):
             raise Interrupted("stopped while looking for a run")

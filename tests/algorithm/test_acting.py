@@ -30,7 +30,7 @@ from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.frame_stack import Seen
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, Call
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.streams import Purpose, stream_key
 from udrl.training import weights_of
 

@@ -14,7 +14,7 @@ from udrl.evaluation import summarise
 from udrl.experience import Experience
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.training import train, untrained
 
 BUDGET = Budget(max_env_steps=400)

@@ -19,7 +19,7 @@ from udrl.commands import (
 )
 from udrl.config import COMMANDS_PER_ITERATION, Config, build
 from udrl.environments import EnvironmentSpec
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.spaces import Vector
 from udrl.streams import Purpose, Stream, stream_key
 

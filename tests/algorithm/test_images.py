@@ -19,7 +19,7 @@ from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.experience import Experience
 from udrl.numerics import resolve_arithmetic, resolve_as
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.spaces import Image
 from udrl.training import train, untrained
 from udrl.training_class import training_class

@@ -14,7 +14,7 @@ from udrl.commands import CommandSampler
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec
 from udrl.errors import ConfigError
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.spaces import Vector
 from udrl.strategies import STRATEGIES, choose_command, make_strategy
 

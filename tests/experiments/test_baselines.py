@@ -21,7 +21,7 @@ from udrl.config import Config, KeywordValue, build, read_toml
 from udrl.environments.making import make_environment, specify
 from udrl.errors import ConfigError, InvalidData
 from udrl.frame_stack import FrameStack
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, train_baseline
 from udrl_experiments.protocol import TASKS, BaselineAlgorithm, Task

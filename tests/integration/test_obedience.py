@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from udrl.config import Budget, Config, build, change
 from udrl.errors import ConfigError, UdrlError
-from udrl.replay import ReplayBuffer
+from udrl.replay_buffer import ReplayBuffer
 from udrl_inspect.agents import Agent, evaluate, evaluation_commands, load_agent
 from udrl_inspect.obedience_report import (
     ObedienceReport,

@@ -205,14 +205,20 @@ def test_several_runs_are_listed_if_no_name_is_given(
         sessions.find_run(client, None, patience_s=5.0)
 
 
-@pytest.mark.parametrize(("run_id", "named"), [(None, "no run"), ("two", "no run 'two'")])
+@pytest.mark.parametrize(
+    ("run_id", "message"),
+    [
+        (None, "no run replied in .*; start `udrl replay ENV`"),
+        ("two", "no run 'two' replied in .*, or check --run"),
+    ],
+)
 def test_missing_run_times_out(
-    run_id: str | None, named: str, router: zenoh.Session, client: zenoh.Session
+    run_id: str | None, message: str, router: zenoh.Session, client: zenoh.Session
 ) -> None:
     if run_id:
         serve(router, "one", encode(hello("one")))
     began = time.monotonic()
-    with pytest.raises(Unreachable, match=rf"^{named} replied in .*--run"):
+    with pytest.raises(Unreachable, match=f"^{message}$"):
         sessions.find_run(client, run_id, patience_s=0.1)
     assert time.monotonic() - began < 3.0
 

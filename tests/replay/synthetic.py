@@ -21,7 +21,7 @@ from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.evaluation import Evaluation, summarise
 from udrl.graph import acting_graph
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl.spaces import Vector
 from udrl_proto import PROTOCOL

@@ -36,7 +36,7 @@ def test_advice_is_given_after_a_third_of_the_budget_without_learning(run: Store
     assert text.startswith(
         "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
     )
-    assert text.endswith("See 'Signs of trouble' in docs/metrics.md")
+    assert text.endswith("See 'Signs of trouble' on the documentation's page on metrics")
     assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == text
     run.budget = Budget(max_env_steps=3 * run.progress.env_steps + 1)
     assert advice(run) == ""

@@ -11,7 +11,7 @@ from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import InvalidMessage
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 from udrl.spaces import Vector
 from udrl_proto.codec import decode, decode_episode, encode_array, encode_episode
 from udrl_proto.messages import ArrayMessage, EpisodeMessage

@@ -35,7 +35,7 @@ from tests.replay.synthetic import (
 from udrl.commands import FINAL_EVALUATION, Command
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Refused
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 from udrl.schedule import weights_version
 from udrl_inspect.inspection import read_status
 from udrl_proto.codec import decode, encode

@@ -19,7 +19,7 @@ from udrl.evaluation import Evaluation, summarise
 from udrl.folder import load_folder
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
-from udrl.replay import ReplayBuffer
+from udrl.replay_buffer import ReplayBuffer
 from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_inspect.hub import HUB_SCHEME, download

@@ -10,6 +10,7 @@ from udrl.config import change
 from udrl.datasets import write_dataset
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import return_text
+from udrl.file_remedies import file_remedy
 from udrl.version import __version__
 from udrl_inspect.agents import Agent, stored_evaluation
 from udrl_inspect.hub import HUB_SCHEME, upload
@@ -152,7 +153,8 @@ def export_model(agent: Agent, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(agent.behavior.model)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; choose a writable file") from error
+        what_to_do = file_remedy(error, "choose a writable file")
+        raise ConfigError(f"{path}: {error.strerror}; {what_to_do}") from error
 
 
 def export_buffer(run_dir: Path, name: str) -> int:

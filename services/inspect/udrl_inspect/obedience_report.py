@@ -16,6 +16,7 @@ from udrl.atomic_files import write_atomically
 from udrl.commands import Command
 from udrl.errors import ConfigError, InvalidData, StoreError
 from udrl.evaluation import summarise
+from udrl.file_remedies import file_remedy
 from udrl.obedience_statistics import (
     Means,
     correlation,
@@ -285,7 +286,8 @@ def save_report(run_dir: Path, report: ObedienceReport) -> Path:
     try:
         write_atomically(path, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
     except OSError as error:
-        raise StoreError(f"{path}: {error.strerror}; make the directory writable") from error
+        what_to_do = file_remedy(error, "make the directory writable")
+        raise StoreError(f"{path}: {error.strerror}; {what_to_do}") from error
     return path
 
 

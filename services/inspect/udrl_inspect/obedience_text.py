@@ -120,7 +120,7 @@ def horizons(report: ObedienceReport) -> str:
 def rule(report: ObedienceReport) -> str:
     """Return a sentence that defines when a command counts as obeyed."""
     is_usual = math.isclose(report.tolerance, _usual_tolerance(report))
-    share = f" ({100 * TOLERANCE:.0f} % of the range of the replay buffer's returns)"
+    share = f" ({100 * TOLERANCE:.0f} % of the returns commanded by default)"
     return (
         f"Obeyed: the mean lies within {_number(report)(report.tolerance)} of the command"
         f"{share if is_usual else ''}, and increases with it."

@@ -30,7 +30,7 @@ def advice(run: RunState) -> str:
         f"the run does not learn: its best evaluation is {return_text(best)}, the "
         f"{'dataset' if has_dataset else 'warm-up'}'s mean return "
         f"{return_text(warm_up.explored_return)}. Most likely {reason}. See "
-        f"'Signs of trouble' in docs/metrics.md"
+        f"'Signs of trouble' on the documentation's page on metrics"
     )
 
 

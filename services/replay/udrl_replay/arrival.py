@@ -8,7 +8,7 @@ from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec
 from udrl.episode import fault
 from udrl.errors import InvalidMessage
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 from udrl_proto.codec import decode_episode, encode
 from udrl_proto.messages import EpisodeMessage
 

@@ -6,14 +6,12 @@ import sqlite3
 from pathlib import Path
 
 from udrl.errors import StoreError
+from udrl.file_remedies import FREE_DISK, file_remedy
 
-_OUT_OF_FILES = {errno.EMFILE, errno.ENFILE}
-_DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 _CLOSE = "close the other program that uses the file"
 _PERMIT = "make the file and its directory readable and writable"
-_FREE_DISK = "free some disk space"
 _CHECK = "check the disk and the file"
 #: By SQLite's primary result codes, what to do before the file can be used again.
 _REMEDIES = {
@@ -23,7 +21,7 @@ _REMEDIES = {
     sqlite3.SQLITE_PERM: _PERMIT,
     sqlite3.SQLITE_READONLY: _PERMIT,
     sqlite3.SQLITE_CANTOPEN: _PERMIT,
-    sqlite3.SQLITE_FULL: _FREE_DISK,
+    sqlite3.SQLITE_FULL: FREE_DISK,
     sqlite3.SQLITE_IOERR: "repair the disk, or raise its quota",
     sqlite3.SQLITE_NOMEM: "free some memory",
 }
@@ -31,9 +29,15 @@ _REMEDIES = {
 
 def remedy(error: OSError | sqlite3.Error, otherwise: str) -> str:
     """Return the remedy for too many open files or a full disk, else ``otherwise``."""
-    if _is_out_of_files(error):
-        return "raise the limit of open files, e.g. ulimit -n 4096"
-    return _FREE_DISK if _is_disk_full(error) else otherwise
+    if isinstance(error, OSError):
+        return file_remedy(error, otherwise)
+    if primary_code(error) == sqlite3.SQLITE_FULL:
+        return FREE_DISK
+    try:  # SQLite does not say why it could not open a file
+        os.close(os.open(os.devnull, os.O_RDONLY))
+    except OSError as probe:
+        return file_remedy(probe, otherwise)
+    return otherwise
 
 
 def database_remedy(error: sqlite3.Error, *, read_only: bool) -> str:
@@ -56,22 +60,6 @@ def database_remedy(error: sqlite3.Error, *, read_only: bool) -> str:
 def primary_code(error: sqlite3.Error) -> int:
     """Return SQLite's primary result code; 0: the error is not SQLite's."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
-
-
-def _is_out_of_files(error: OSError | sqlite3.Error) -> bool:
-    if isinstance(error, OSError):
-        return error.errno in _OUT_OF_FILES
-    try:  # SQLite does not say why it could not open a file
-        os.close(os.open(os.devnull, os.O_RDONLY))
-    except OSError as probe:
-        return probe.errno in _OUT_OF_FILES
-    return False
-
-
-def _is_disk_full(error: OSError | sqlite3.Error) -> bool:
-    if isinstance(error, OSError):
-        return error.errno in _DISK_FULL
-    return primary_code(error) == sqlite3.SQLITE_FULL
 
 
 def unwritable(path: Path, error: OSError) -> StoreError:

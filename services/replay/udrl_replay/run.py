@@ -14,7 +14,7 @@ from udrl.commands import FINAL_EVALUATION, Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Budget
 from udrl.errors import Deceived, Refused, RunFailed
 from udrl.evaluation import return_text, summarise
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 from udrl.schedule import evaluation_due, opened_by, weights_version
 from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import IterationStatus

@@ -5,7 +5,7 @@ import time
 
 from udrl.commands import Command
 from udrl.config import Budget
-from udrl.replay import ReplayBuffer
+from udrl.replay_buffer import ReplayBuffer
 from udrl_proto.messages import Hello
 from udrl_replay.auditing import Auditor
 from udrl_replay.dispatching import Dispatcher

@@ -12,7 +12,7 @@ import msgspec
 from udrl.commands import Command
 from udrl.config import COMMANDS_PER_ITERATION
 from udrl.evaluation import Evaluation
-from udrl.replay import Entry
+from udrl.replay_buffer import Entry
 from udrl_proto.reports import IterationStatus
 from udrl_replay.database import Database
 from udrl_replay.schema import SEALED, sha256

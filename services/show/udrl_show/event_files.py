@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from udrl.errors import ConfigError
+from udrl.file_remedies import file_remedy
 from udrl_show.run_log import Logged
 from udrl_show.scalars import Scalar
 
@@ -43,7 +44,8 @@ class EventFiles:
                 old.unlink()
             self._writer: Any = EventFileWriter(str(folder))
         except OSError as error:
-            raise ConfigError(f"{folder}: {error.strerror}; make it a writable folder") from error
+            what_to_do = file_remedy(error, "make it a writable folder")
+            raise ConfigError(f"{folder}: {error.strerror}; {what_to_do}") from error
 
     def begin(self, run_id: str, settings: dict[str, Any], began: float) -> Logged:
         """Write the settings."""

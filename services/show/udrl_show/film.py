@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.errors import ConfigError
+from udrl.file_remedies import file_remedy
 
 Picture = npt.NDArray[np.uint8]
 
@@ -138,9 +139,8 @@ class Film:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.open("wb").close()
         except OSError as error:
-            raise ConfigError(
-                f"--video {self._path}: {error.strerror}; choose a writable file"
-            ) from error
+            what_to_do = file_remedy(error, "choose a writable file")
+            raise ConfigError(f"--video {self._path}: {error.strerror}; {what_to_do}") from error
         arguments = (
             "-y", "-loglevel", "error",
             "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from udrl.atomic_files import replacing
 from udrl.errors import ConfigError
+from udrl.file_remedies import file_remedy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,4 +60,5 @@ def save(figure: "Figure", picture: Path) -> None:
         with replacing(picture) as unfinished:
             figure.savefig(unfinished, format=picture.suffix[1:], dpi=130)
     except OSError as error:
-        raise ConfigError(f"{picture}: {error.strerror}; choose a writable file") from error
+        what_to_do = file_remedy(error, "choose a writable file")
+        raise ConfigError(f"{picture}: {error.strerror}; {what_to_do}") from error

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udrl.config import COMMANDS_PER_ITERATION, build
-from udrl.replay import Entry, ReplayBuffer
+from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl.setting_groups import BufferSettings
 
 # Few different returns cause many ties. Episodes arrive in batches, one for each iteration.
