@@ -42,7 +42,7 @@ from udrl_replay.store import COLUMNS, Store
 def test_studies_list_the_dependencies_of_other_algorithms() -> None:
     text = " ".join(section("docs/studies.md", "## Participants").split())
     needs = text[text.index("DQN, A2C and PPO are") :]
-    for words in ('pip install "udrl[studies]"', "discrete actions and one vector or image"):
+    for words in ("the extra `studies`", "discrete actions and one vector or image"):
         assert words in needs
 
 
