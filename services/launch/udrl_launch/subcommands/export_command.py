@@ -20,8 +20,8 @@ from udrl_launch.subcommands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, vers
 )  # fmt: skip
 @click.option(
     "--onnx", type=FILE, metavar="FILE",
-    help="Write the agent as an ONNX model. Inputs: observation and command (desired return, "
-    "desired horizon). Output: logits.",
+    help="Write the agent as an ONNX model. Inputs: observation (one for each part of a Dict or "
+    "Tuple) and command (desired return, desired horizon). Output: logits.",
 )  # fmt: skip
 @click.option(
     "--hub", "repo_id", metavar="REPO_ID",
