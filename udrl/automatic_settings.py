@@ -26,7 +26,7 @@ from udrl.setting_groups import CommandSettings
 
 log = logging.getLogger("udrl")
 
-#: Reset seed with which the environment is asked for an action mask, from the training range.
+#: Reset seed for the check whether the environment has an action mask, from the training range.
 _SEED = 1_000_000
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500

@@ -18,7 +18,7 @@
     │   └── DamagedStore             its content is not what was written
     ├── RunFailed                the run cannot continue
     │   └── Deceived                 the run was trained on false episodes of an actor
-    └── Interrupted              a wait ended because the process was asked to stop
+    └── Interrupted              a wait ended because the process must stop
 
 A message names the value, what was expected, and the remedy. ``exit_code`` is the exit code of a
 command (``docs/operations-reference.md``).
@@ -116,6 +116,6 @@ class Deceived(RunFailed):
 
 
 class Interrupted(UdrlError):
-    """A wait ended because the process was asked to stop."""
+    """A wait ended because the process must stop."""
 
     exit_code = 130

@@ -69,7 +69,7 @@ def obedience(run_dir: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)  # Two trainings, 26 s on one core.
+@pytest.mark.timeout(400)  # Two training runs, 26 s on one core.
 def test_tutorial_runs_and_has_the_printed_output(tmp_path: Path) -> None:
     printed = ""
     for language, title, text in BLOCKS:

@@ -1,9 +1,9 @@
 """A program that kills game engines whose owner has ended; started by :mod:`.doom`.
 
 ViZDoom's engines are processes that outlive a killed parent and ignore SIGTERM. This program waits
-for the end of its standard input, which closes however the owner ends. It then
-kills every engine with the owner's mark in its environment variables, and removes the engine's
-shared memory. It only imports the standard library, to start quickly and use little memory.
+for the end of its standard input, which closes however the owner ends. It then kills every engine
+with the owner's mark in its environment variables, and removes the engine's shared memory. It only
+imports the standard library, to start quickly and use little memory.
 """
 
 import contextlib
