@@ -177,7 +177,7 @@ WAITING = Waiting(who="actor actor-1", on="learner", why="weights version 6", se
 EXAMPLES: tuple[Message, ...] = (
     encode_array(np.arange(6, dtype=np.int32).reshape(2, 3)),
     Wait(on="learner: weights version 6", retry_after_s=0.28125),
-    Problem(code="rewind", message="version 6 is next, not 5; ask for the state"),
+    Problem(code="rewind", message="version 6 is next, not 5; request the state"),
     HelloRequest(),
     Hello(
         protocol=PROTOCOL,

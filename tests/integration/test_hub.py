@@ -221,7 +221,7 @@ def test_unresponsive_hub_is_unreachable(tmp_path: Path) -> None:
     with Hub() as closed:
         pass
     _, out, err = run(closed, tmp_path, "-c", LOAD, "hf://me/lander")
-    assert out.startswith("Unreachable: the Hugging Face Hub did not answer for me/lander: "), err
+    assert out.startswith("Unreachable: the Hugging Face Hub did not respond for me/lander: "), err
 
 
 def test_missing_extra_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

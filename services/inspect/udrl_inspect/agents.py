@@ -118,7 +118,7 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
         ConfigError: the path is none of these, or ``weights`` cannot be chosen.
         InvalidData: the files are invalid.
         StoreError: the run has no such version.
-        Unreachable: the Hub does not answer.
+        Unreachable: the Hub does not respond.
     """
     is_on_hub = isinstance(path, str) and path.startswith(HUB_SCHEME)
     if (Path(path) / STORE_FILE).exists() and not is_on_hub:

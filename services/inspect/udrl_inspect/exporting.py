@@ -134,7 +134,7 @@ def export_to_hub(agent: Agent, run_dir: Path, repo_id: str, *, public: bool) ->
         ConfigError: the extra is not installed, or the Hub refuses.
         InvalidData: the report of ``udrl obedience`` is damaged.
         StoreError: the run cannot be read.
-        Unreachable: the Hub does not answer.
+        Unreachable: the Hub does not respond.
     """
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)

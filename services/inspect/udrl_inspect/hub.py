@@ -9,7 +9,7 @@ from udrl.folder import FILES, MAX_BYTES
 
 #: How addresses of agents on the Hub begin: ``hf://OWNER/NAME`` or ``hf://OWNER/NAME@REVISION``.
 HUB_SCHEME = "hf://"
-#: Seconds without an answer after which a request has failed.
+#: Seconds without a response after which a request has failed.
 _TIMEOUT_S = 60.0
 
 
@@ -26,7 +26,7 @@ def upload(folder: Path, repo_id: str, *, public: bool) -> str:
     Raises:
         ConfigError: the extra is not installed, the Hub refuses, or the repository exists with
             another visibility.
-        Unreachable: the Hub does not answer.
+        Unreachable: the Hub does not respond.
     """
     with _hub_errors(repo_id):
         from huggingface_hub import CommitOperationAdd, HfApi, get_session
@@ -59,7 +59,7 @@ def download(address: str) -> Path:
     Raises:
         ConfigError: the extra is not installed, or there is no such repository or no access to it.
         InvalidData: a file is too large.
-        Unreachable: the Hub does not answer.
+        Unreachable: the Hub does not respond.
     """
     repo_id, _, revision = address.removeprefix(HUB_SCHEME).partition("@")
     with _hub_errors(repo_id):
@@ -111,5 +111,5 @@ def _hub_errors(repo_id: str) -> Iterator[None]:
         ) from error
     except (HTTPError, OSError) as error:
         raise Unreachable(
-            f"the Hugging Face Hub did not answer for {repo_id}: {error}; check the network"
+            f"the Hugging Face Hub did not respond for {repo_id}: {error}; check the network"
         ) from error

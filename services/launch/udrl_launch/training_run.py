@@ -169,14 +169,14 @@ def _watch(
     stopped = _StoppedOrFailed(services, stop)
     with connected("observer", address, stopped) as (transport, hello):
         client = ReplayClient(transport, hello.run_id, "the display", stopped)
-        asked = time.monotonic() - _POLL_S
+        requested = time.monotonic() - _POLL_S
         while not stop.wait(_CHECK_S):
             services.check()
             if services.done:
                 return
-            if time.monotonic() - asked < _POLL_S:
+            if time.monotonic() - requested < _POLL_S:
                 continue
-            asked = time.monotonic()
+            requested = time.monotonic()
             try:
                 status = client.request(verbs.STATUS, StatusRequest())
             except (Unreachable, Interrupted) as error:

@@ -258,11 +258,11 @@ class LearnerService:
     def _episodes(self, missing: list[int]) -> list[Episode]:
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
-            asked = left[:_ASK_FOR]
-            page = self._client.request(verbs.EPISODES, EpisodesRequest(ids=tuple(asked)))
-            if len(page.episodes) > len(asked):
-                raise _wrong(f"{len(page.episodes)} episodes, expected at most {len(asked)}")
-            pairs = zip(page.episodes, asked, strict=False)
+            requested = left[:_ASK_FOR]
+            page = self._client.request(verbs.EPISODES, EpisodesRequest(ids=tuple(requested)))
+            if len(page.episodes) > len(requested):
+                raise _wrong(f"{len(page.episodes)} episodes, expected at most {len(requested)}")
+            pairs = zip(page.episodes, requested, strict=False)
             episodes += [self._decode(body, expected) for body, expected in pairs]
         return episodes
 
