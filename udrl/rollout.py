@@ -175,7 +175,7 @@ class Rollout:
         """Call the environment; turn its exceptions into :class:`EnvironmentFault`."""
         try:
             return call()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             what = str(error)
             if not isinstance(error, EnvironmentFault):
                 what = raised(where, error)

@@ -1,4 +1,5 @@
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -246,6 +247,8 @@ class Scripted(gym.Env[Any, Any]):
         self.broken = self.fault is not None
         if self.fault == "raises in reset":
             raise RuntimeError("no more worlds")
+        if self.fault == "exits in reset":
+            sys.exit("no more worlds")
         self.seeds.append(seed)
         self.left = list(self.world.script(seed))
         self.t = 0
@@ -259,6 +262,8 @@ class Scripted(gym.Env[Any, Any]):
         if self.fault is not None and self.t == 3:
             if self.fault == "raises in step":
                 raise RuntimeError("the world has ended")
+            if self.fault == "exits in step":
+                sys.exit(0)
             if self.fault == "returns four values":
                 return observation, reward, terminated, {}
             if self.fault == "observes a matrix":
@@ -482,6 +487,8 @@ NOT_FINITE = "not all finite numbers"
 FAULTS = {
     "raises in reset": "reset() raised RuntimeError: no more worlds (test_acting.py, line ",
     "raises in step": "step() raised RuntimeError: the world has ended (test_acting.py, line ",
+    "exits in reset": "reset() raised SystemExit: no more worlds (test_acting.py, line ",
+    "exits in step": "step() raised SystemExit: 0 (test_acting.py, line ",
     "returns four values": "step() returned a tuple of 4, expected (observation, reward, ",
     "observes a matrix": "step() returned observation: an array of float32, shape (2, 2), exp",
     "observes NaN": f"observations are {NOT_FINITE}",
@@ -518,10 +525,11 @@ def test_fault_costs_one_episode_and_its_environment_only(fault: str, random: bo
 
 
 def test_generator_survives_consecutive_faults() -> None:
-    world = World(faults=dict(zip(range(1, 10), FAULTS, strict=True)))
-    outcomes = act(world, [make_command(i) for i in range(11)], n_environments=2)
-    assert sum(isinstance(outcome, Failure) for outcome in outcomes) == 9
-    assert set(digests(outcomes)) == {0, 10}
+    n = len(FAULTS)
+    world = World(faults=dict(enumerate(FAULTS, start=1)))
+    outcomes = act(world, [make_command(i) for i in range(n + 2)], n_environments=2)
+    assert sum(isinstance(outcome, Failure) for outcome in outcomes) == n
+    assert set(digests(outcomes)) == {0, n + 1}
 
 
 def test_rebuilt_environment_gets_the_next_commands_limit() -> None:

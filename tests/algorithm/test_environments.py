@@ -358,6 +358,22 @@ def test_any_error_of_the_factory_is_a_config_error() -> None:
         make("LunarLander-v3", environment_kwargs={"gravity": 5.0})
 
 
+def exits(**kwargs: Any) -> Environment:
+    """Fail as an environment that checks a licence, and ends the process if there is none."""
+    sys.exit("no licence")
+
+
+def test_environment_that_exits_is_a_config_error(register: Register) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=r"cannot be created: SystemExit: no licence"):
+        make(register(exits))
+    with pytest.raises(UnsupportedEnvironment, match=r"cannot be applied: SystemExit: no licence"):
+        make("CartPole-v1", wrappers=[f"{__name__}:exits_around"])
+
+
+def exits_around(env: Environment) -> Environment:
+    sys.exit("no licence")
+
+
 MODULE = """
 import gymnasium
 from udrl.environments.obedience import Obedience

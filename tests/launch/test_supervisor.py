@@ -158,6 +158,16 @@ def test_remaining_children_are_ended_after_a_grace_period(
     assert other.returncode == -signal.SIGTERM
 
 
+def test_child_that_ends_long_before_the_first_is_restarted(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_AHEAD_S", 0.2)
+    start(supervisor, "first", WAIT)
+    start(supervisor, "other", "print('bye')")
+    with pytest.raises(RunFailed, match="other ended with code 0 6 times without progress:\nbye"):
+        check_until(supervisor, lambda: False)
+
+
 def test_killed_first_child_is_restarted(supervisor: Supervisor) -> None:
     start(supervisor, "first", WAIT)
     start(supervisor, "other", "pass")

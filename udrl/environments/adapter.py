@@ -49,9 +49,12 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         """Begin an episode.
 
         Raises:
-            EnvironmentFault: the environment returned an invalid value.
+            EnvironmentFault: the environment returned an invalid value, or called ``sys.exit``.
         """
-        returned: Any = self.env.reset(seed=seed, options=options)
+        try:
+            returned: Any = self.env.reset(seed=seed, options=options)
+        except SystemExit as error:  # it would end this process without a message
+            raise EnvironmentFault(raised("reset", error)) from error
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise _wrong("reset", describe(returned), _RESET)
         observation, info = returned
@@ -66,7 +69,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             action: a plain action.
 
         Raises:
-            EnvironmentFault: the environment returned an invalid value.
+            EnvironmentFault: the environment returned an invalid value, or called ``sys.exit``.
         """
         try:
             returned: Any = self.env.step(self.actions.back_one(action))
@@ -74,6 +77,8 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             if str(error).endswith(_OLD_STEP):  # raised by Gymnasium's wrappers
                 raise _wrong("step", "a tuple of 4", f"{_STEP}, required since Gym 0.26") from error
             raise
+        except SystemExit as error:
+            raise EnvironmentFault(raised("step", error)) from error
         if type(returned) is not tuple or len(returned) != 5:
             raise _wrong("step", describe(returned), _STEP)
         observation, reward, terminated, truncated, info = returned
@@ -102,11 +107,11 @@ def close(env: gym.Env[Any, Any]) -> None:
     """Close an environment; its exceptions are logged and ignored."""
     try:
         env.close()
-    except Exception as error:  # noqa: BLE001 - the environment is foreign code
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - the environment is foreign code
         log.warning("environment %s failed in close(): %s: %s", env, type(error).__name__, error)
 
 
-def raised(where: str, error: Exception) -> str:
+def raised(where: str, error: BaseException) -> str:
     """Return what a method of an environment raised, and the line of the environment's code.
 
     That is the innermost line outside of installed packages, or the innermost one of all.

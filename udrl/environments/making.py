@@ -116,7 +116,7 @@ def make_environment(config: Config) -> Adapter:
             env: Environment = gym.make(
                 name, disable_env_checker=True, **(limit | config.environment_kwargs)
             )
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UnsupportedEnvironment(
             f"environment {name!r} cannot be created: {type(error).__name__}: {error}; "
             f"{_remedy(error, config)}"
@@ -150,7 +150,7 @@ def _wrapped(env: Environment, name: str) -> Environment:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
         attribute, arguments = _called(call)
         wrapped: Environment = getattr(import_module(module), attribute)(env, **arguments)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         close(env)
         raise UnsupportedEnvironment(
             f"wrapper {name!r} cannot be applied: {type(error).__name__}: {error}; name a wrapper "
@@ -217,7 +217,7 @@ def _with_checked_mask(
     return CheckMask(env, action_mask, components)
 
 
-def _remedy(error: Exception, config: Config) -> str:
+def _remedy(error: BaseException, config: Config) -> str:
     """Return the remedy for an exception of ``gymnasium.make``."""
     text = str(error)
     if isinstance(error, gym.error.DependencyNotInstalled | ImportError):

@@ -171,7 +171,7 @@ def _of_gymnasium(env: Any) -> list[str]:
         warnings.simplefilter("always")
         try:
             check_env(env, skip_render_check=True)
-        except Exception as error:  # noqa: BLE001 - it raises many types, and runs foreign code
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - it raises many types, and runs foreign code
             return [f"Gymnasium's checker reports: {_line(error)}"]
         finally:
             logger.setLevel(level)

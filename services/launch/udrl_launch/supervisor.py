@@ -23,6 +23,9 @@ _MOST_DEATHS = 6
 _LONGEST_LOG = 1 << 20
 #: Seconds for services to end after the run has ended or after SIGTERM.
 END_S = 4.0
+#: Seconds that the first child may run on after another has ended without an error; a replay
+#: service stays for 10 s after the end of the run.
+_AHEAD_S = 20.0
 
 
 @dataclass
@@ -37,6 +40,7 @@ class Child:
         deaths: number of deaths since the last progress.
         work: progress at the last death.
         done: whether it has ended and is not restarted.
+        done_at: when it was, seconds.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Child:
     deaths: int = 0
     work: int = -1
     done: bool = False
+    done_at: float = 0.0
 
     def start(self) -> None:
         """Start the process."""
@@ -125,7 +130,8 @@ class Supervisor:
     """Keeps children running until they are done.
 
     When the first child has ended without an error, no child is restarted any more, and the others
-    get a few seconds to end.
+    get a few seconds to end. Until then, another that has ended without an error is restarted too,
+    after a while: code of an environment can end its process with any code.
 
     Args:
         log_dir: folder for the logs, one file per child.
@@ -159,15 +165,15 @@ class Supervisor:
             assert child.process is not None
             child.shorten_log()
             code = child.process.poll()
-            if code is None or child.done:
-                continue
             now = time.monotonic()
+            if code is None or (child.done and not self._is_missing(child, now)):
+                continue
             if child is self.children[0] and code == 0:
                 self._first_done = now
-            if code == 0 or self._first_done is not None:
+            if self._first_done is not None or (code == 0 and not child.done):
                 if code != 0:
                     log.warning("%s %s after the run was complete", child.name, how_it_ended(code))
-                child.done = True
+                child.done, child.done_at = True, now
                 continue
             work = self.work.get(child.arguments[0] if child.arguments else "", 0)
             child.deaths = 1 if work != child.work else child.deaths + 1
@@ -180,7 +186,12 @@ class Supervisor:
                 failure.exit_code = code if code in FINAL_CODES else failure.exit_code
                 raise failure
             log.warning("%s %s and is restarted", child.name, how_it_ended(code))
+            child.done = False
             child.start()
+
+    def _is_missing(self, child: Child, now: float) -> bool:
+        """Return whether a child has ended although the run goes on."""
+        return self._first_done is None and now - child.done_at > _AHEAD_S
 
     @property
     def done(self) -> bool:
