@@ -98,7 +98,7 @@ def test_missing_folder_is_rejected(tmp_path: Path, policy: Policy) -> None:
     with pytest.raises(ConfigError, match="or a folder that udrl export --folder wrote"):
         udrl.load(tmp_path / "nothing")
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="name a folder you may write"):
+    with pytest.raises(ConfigError, match="choose a writable folder"):
         folder.save_folder(tmp_path / "file", policy, "")
 
 
