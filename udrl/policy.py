@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.config import Config
-from udrl.environments.conversions import describe, nested
+from udrl.environments.conversions import as_array, describe, nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
 from udrl.frame_stack import FrameStack
@@ -118,8 +118,8 @@ class Policy:
             float64 [n_parameters]; for a batch [n, n_parameters].
 
         Raises:
-            InvalidData: the observation's shape differs from that in training, or a value is not
-                finite.
+            InvalidData: the observation's shape differs from that in training, a value is not
+                finite or impossible in training, or the memory is that of another batch.
         """
         return self.advance(observation, desired_return, desired_horizon, self._state)[0]
 
@@ -140,14 +140,14 @@ class Policy:
         """
         desired, n = _commands(desired_return, desired_horizon)
         seen = self._stack.join(self._plain(observation, n))
+        if state is not None and len(state) != (n or 1):
+            what = "a single observation" if n is None else f"a batch of {n} observations"
+            raise InvalidData(
+                f"{what}, but the memory is that of {len(state)} episodes; call reset() first"
+            )
         if n is None:
             rows, after = self.behavior.advance(seen, desired, state)
             return rows[0].astype(np.float64), after
-        if state is not None and len(state) != n:
-            raise InvalidData(
-                f"a batch of {n} observations, but the memory is that of {len(state)} episodes; "
-                f"call reset() first"
-            )
         call = self.behavior.call(n)
         for given, array in zip(call.seen, seen, strict=True):
             given[:] = array
@@ -163,7 +163,7 @@ class Policy:
         parts = zip(leaves_of(space), parts_of(plain), self._stack.shapes, strict=True)
         rows = () if n is None else (n,)
         for leaf, part, joined in parts:
-            seen = np.asarray(_find(leaf, observation))
+            seen = as_array(f"observation{leaf.name}", _find(leaf, observation))
             stacked = part.shape[1:]
             expected = stacked[1:] if length == 1 else joined
             if seen.shape not in ((*rows, *expected), (*rows, *stacked)):
@@ -171,9 +171,13 @@ class Policy:
                     f"an observation{leaf.name} of shape {seen.shape}: expected "
                     f"{(*rows, *expected)}, as in training ({self.config.environment})"
                 )
-            if not np.isfinite(seen).all():
-                raise InvalidData(f"observation{leaf.name}: {seen}; expected finite numbers")
-            part[:] = seen.reshape(part.shape)
+            values, found = _converted(seen, part.dtype)
+            values = values.reshape(-1, *leaf.space.shape)
+            if found := found or leaf.space.fault(values, len(values)):
+                raise InvalidData(
+                    f"observation{leaf.name}: {found}; pass observations like those in training"
+                )
+            part[:] = values.reshape(part.shape)
         return plain
 
     def probabilities(
@@ -231,9 +235,8 @@ class Policy:
         """
         _check(temperature)
         temperature = 0.0 if deterministic else temperature
-        logits, self._state = self.advance(
-            observation, desired_return, desired_horizon, self._state
-        )
+        logits, after = self.advance(observation, desired_return, desired_horizon, self._state)
+        self._state = after if after.shape[1] else None  # without a memory, batches may change size
         space = self.spec.action_space
         if logits.ndim == 1:
             uniform: Any = self._rng.random(space.shape)
@@ -276,6 +279,20 @@ def _find(leaf: Leaf, observation: Any) -> Any:
             f"observation{leaf.name} is missing in {describe(observation)}; pass observations like "
             f"those in training"
         ) from error
+
+
+def _converted(seen: npt.NDArray[Any], dtype: np.dtype[Any]) -> tuple[npt.NDArray[Any], str | None]:
+    """Return values in another dtype, and why this changes them; None: it only rounds them."""
+    if seen.dtype == dtype:
+        return seen, None
+    if seen.dtype.kind not in "biuf":
+        return seen, f"an array of {seen.dtype}, expected numbers"
+    with np.errstate(over="ignore", invalid="ignore"):
+        converted = seen.astype(dtype)
+    if dtype.kind in "iu" and not np.array_equal(converted, seen):
+        limits = np.iinfo(dtype)
+        return converted, f"not all whole numbers from {limits.min} to {limits.max}"
+    return converted, None
 
 
 def _check(temperature: float) -> None:

@@ -8,18 +8,21 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from udrl.actions import Categorical
 from udrl.config import Config, build
-from udrl.environments import make_environment, specify
+from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.errors import InvalidData
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction, probe_weights
 from udrl.policy import Policy
+from udrl.spaces import Bits, Category, Image, ObservationSpace
 
 
 def policy(environment: str = "CartPole-v1", seed: int = 1, **values: Any) -> Policy:
     config = build(Config, {"environment": environment, "hidden": [16, 16]} | values)
-    env = make_environment(config)
-    spec = specify(env, config)
-    env.close()
+    with contextlib.closing(make_environment(config)) as env:
+        return policy_of(config, specify(env, config), seed)
+
+
+def policy_of(config: Config, spec: EnvironmentSpec, seed: int = 1) -> Policy:
     graph = acting_graph(config.network, spec)
     behavior = ActingFunction(graph, probe_weights(graph))
     return Policy(behavior, config, spec, np.random.default_rng(seed))
@@ -79,12 +82,37 @@ def test_actions_repeat_under_the_same_seed() -> None:
         (SEEN[:3], (1.0, 1.0), r"an observation of shape \(3,\): expected \(4,\).*CartPole-v1"),
         (SEEN, (math.nan, 1.0), "desired return nan.*finite"),
         (SEEN, (1.0, math.inf), "desired horizon inf.*finite"),
-        ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation.*expected finite numbers"),
+        ([math.nan, *SEEN[1:]], (1.0, 1.0), "observation.*not all finite numbers"),
+        ([1e39, *SEEN[1:]], (1.0, 1.0), "observation.*not all finite numbers"),
+        (list("abcd"), (1.0, 1.0), "observation: an array of <U1, expected numbers"),
+        ([[1], [1, 2]], (1.0, 1.0), "observation a list of 2: "),
     ],
 )
 def test_invalid_input_is_rejected(seen: Any, desired: tuple[float, float], message: str) -> None:
     with pytest.raises(InvalidData, match=message):
         policy().predict(seen, *desired)
+
+
+@pytest.mark.parametrize(
+    ("space", "seen", "message"),
+    [
+        (Category(n=4), 4, "observation: from 4 to 4, expected 0 to 3; pass observations like"),
+        (Category(n=4), -1, "observation: from -1 to -1, expected 0 to 3"),
+        (Category(n=4), 1.7, "observation: not all whole numbers from -2147483648 to 2147483647"),
+        (Image(1, 8, 8), np.full((1, 8, 8), 0.5), "not all whole numbers from 0 to 255"),
+        (Image(1, 8, 8), np.full((1, 8, 8), 300), "not all whole numbers from 0 to 255"),
+        (Bits(3), [0, 7, 0], "observation: not all 0 or 1"),
+    ],
+)
+def test_observation_that_is_impossible_in_training_is_rejected(
+    space: ObservationSpace, seen: Any, message: str
+) -> None:
+    config = build(Config, {"environment": "Any-v0"})
+    spec = EnvironmentSpec(
+        observation_space=space, action_space=Categorical(n=2), max_episode_steps=9
+    )
+    with pytest.raises(InvalidData, match=message):
+        policy_of(config, spec).predict(seen, 1.0, 1)
 
 
 @pytest.mark.parametrize("temperature", [-1.0, math.nan, math.inf])
@@ -162,6 +190,13 @@ def test_scalar_applies_to_all_rows_of_a_batch() -> None:
     assert agent.logits(batch, 20.0, np.array([30, 30])).tolist() == expected
 
 
+def test_agent_without_a_memory_takes_batches_of_any_size() -> None:
+    agent = policy()
+    assert np.ndim(agent.predict(SEEN, 20.0, 30)) == 0
+    for n in (3, 1, 2):
+        assert agent.predict([SEEN] * n, [20.0] * n, 30).shape == (n,)
+
+
 def test_rows_of_a_batch_are_reset_independently() -> None:
     agent = policy(memory="gru")
     batch, returns = np.array([SEEN, SEEN]), np.array([20.0, 20.0])
@@ -175,6 +210,8 @@ def test_rows_of_a_batch_are_reset_independently() -> None:
         agent.reset([True, False, True])
     with pytest.raises(InvalidData, match="a batch of 1 observations, but the memory is that of 2"):
         agent.predict(batch[:1], returns[:1], 30)
+    with pytest.raises(InvalidData, match="a single observation, but the memory is that of 2"):
+        agent.predict(SEEN, 20.0, 30)
     agent.reset()
     assert agent.logits(batch, returns, 30).tolist() == first
 
