@@ -1,4 +1,8 @@
-"""Text from other processes, made safe for logs and terminals."""
+"""Text from other processes and file names, made safe for logs, terminals and JSON."""
+
+import json
+
+import msgspec
 
 
 def printable(text: object) -> str:
@@ -13,3 +17,15 @@ def printable(text: object) -> str:
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in raw
     )
+
+
+def as_json(value: object) -> bytes:
+    r"""Return a value as JSON.
+
+    Bytes of file names that are not UTF-8 become escapes such as ``\udcff``, from which Python gets
+    the same file name.
+    """
+    try:
+        return msgspec.json.encode(value)
+    except UnicodeEncodeError:
+        return json.dumps(msgspec.to_builtins(value)).encode()

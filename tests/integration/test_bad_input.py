@@ -48,6 +48,7 @@ def refusal(process: Cli) -> tuple[int, str]:
         (["status", "nowhere"], "nowhere holds no run"),
         (["evaluate", "nowhere"], "nowhere holds no run"),
         (["evaluate", "nowhere", "--weights", "new"], "latest, best or a version number"),
+        (["evaluate", "nowhere", "--weights", "9" * 5000], "latest, best or a version number"),
     ],
 )
 def test_bad_argument_is_rejected_with_the_remedy(

@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,12 +18,16 @@ import imageio_ffmpeg
 import pytest
 from click.testing import CliRunner
 from PIL import Image, ImageSequence
+from starlette.testclient import TestClient
 
 from udrl.commands import Command
 from udrl.config import Budget
 from udrl.environments.making import make_environment
 from udrl.errors import ConfigError, StoreError, UdrlError
 from udrl.rollout import Rollout
+from udrl_board.app import make_app
+from udrl_board.feed import Feed
+from udrl_board.source import Directory
 from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, load_agent
 from udrl_inspect.inspection import read_status
 from udrl_inspect.run_list import find
@@ -421,3 +426,14 @@ def test_missing_screen_is_reported(ended_run: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(pygame.display, "init", init)
     with pytest.raises(UdrlError, match=r"No available video device; .* --video FILE"):
         call("play", ended_run, "--window")
+
+
+def test_run_directory_may_have_a_name_that_is_not_utf8(ended_run: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"run-\xff")
+    shutil.copytree(ended_run, odd)
+    assert [one["run_dir"] for one in lines(call("runs", tmp_path, "--json"))] == [str(odd)]
+    (report,) = lines(call("evaluate", odd, "--episodes", 1, "--json"))
+    assert report["run_dir"] == str(odd)
+    assert compare([odd], tmp_path / "curves.svg") == []
+    client = TestClient(make_app(Feed(Directory(odd))))
+    assert client.get("/news").json()["place"]["run_dir"] == str(odd)

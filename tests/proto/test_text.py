@@ -1,5 +1,7 @@
 """Text of peers is escaped before it is logged."""
 
+import json
+import os
 import unicodedata
 
 import pytest
@@ -12,7 +14,7 @@ from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import Acknowledged, FailureMessage, Problem, StateRequest
 from udrl_proto.replay_client import ReplayClient
-from udrl_proto.text import printable
+from udrl_proto.text import as_json, printable
 
 HOSTILE = (
     "no\n2026-01-01 00:00:00,000 ERROR   forged\r\x1b[2J\x1b]0;title\x07\x9b31m\u202e\u2028\x00"
@@ -60,3 +62,10 @@ def test_refusal_is_escaped() -> None:
             verbs.STATE, StateRequest(learner="l")
         )
     assert str(no.value).isprintable()
+
+
+@given(st.binary())
+def test_file_names_that_are_not_utf8_survive_json(name: bytes) -> None:
+    path = os.fsdecode(name)
+    found = json.loads(as_json({"run_dir": path, "seeds": (1, 2.5)}))
+    assert found == {"run_dir": path, "seeds": [1, 2.5]}

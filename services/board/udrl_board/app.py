@@ -27,6 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from udrl_board.feed import Feed
 from udrl_board.stage import Stage
 from udrl_board.stage_messages import Moment, StageProblem, StageRequest
+from udrl_proto.text import as_json
 
 log = logging.getLogger("udrl")
 
@@ -182,7 +183,7 @@ class _Board:
     async def runs(self, request: Request) -> Response:
         """Return all runs of the board."""
         rows = [await run_in_threadpool(feed.summary) for feed in self._feeds]
-        return Response(msgspec.json.encode(rows), media_type="application/json")
+        return Response(as_json(rows), media_type="application/json")
 
     async def news(self, request: Request) -> Response:
         """Return the changes since an iteration."""
@@ -191,14 +192,14 @@ class _Board:
             return PlainTextResponse(f"after={text[:40]!r}: expected an iteration", 400)
         run_id = request.query_params.get("run", "")
         news = await run_in_threadpool(self._feed(request).news, int(text), run_id)
-        return Response(msgspec.json.encode(news), media_type="application/json")
+        return Response(as_json(news), media_type="application/json")
 
     async def stage(self, socket: WebSocket) -> None:
         """Receive a viewer's requests and show the episodes."""
         await socket.accept()
         if self._stages >= MOST_STAGES:
             problem = f"all {MOST_STAGES} stages are in use; try again later"
-            await socket.send_text(msgspec.json.encode(StageProblem(problem=problem)).decode())
+            await socket.send_text(as_json(StageProblem(problem=problem)).decode())
             await socket.close(1013)
             return
         self._stages += 1
@@ -231,7 +232,7 @@ async def _listen(socket: WebSocket, stage: Stage) -> None:
         except (msgspec.ValidationError, msgspec.DecodeError) as error:
             problem = f"invalid request: {error}"
         if problem:
-            await socket.send_text(msgspec.json.encode(StageProblem(problem=problem)).decode())
+            await socket.send_text(as_json(StageProblem(problem=problem)).decode())
 
 
 #: Exceptions of sending when the socket or the event loop is closed.
@@ -247,7 +248,7 @@ def _sender(socket: WebSocket, loop: asyncio.AbstractEventLoop) -> Sender:
     """Return a function that sends a stage's moments, and waits until they are sent."""
 
     async def send(news: Moment | StageProblem, picture: bytes | None) -> None:
-        await socket.send_text(msgspec.json.encode(news).decode())
+        await socket.send_text(as_json(news).decode())
         if picture is not None:
             await socket.send_bytes(picture)
 

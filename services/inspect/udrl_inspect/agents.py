@@ -28,6 +28,8 @@ from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
+#: Versions are below this, which SQLite can still hold.
+_MOST_VERSIONS = 2**62
 #: Seconds between tracebacks of a command that is reproduced.
 _SHOW_S = 60.0
 
@@ -75,7 +77,9 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         hello = store.fact("hello", Hello)
         progress = store.fact("progress", RunProgress)
         named = {"latest": progress.latest_version, "best": progress.best_version}
-        if version not in named and not isinstance(version, int):
+        if version not in named and not (
+            isinstance(version, int) and abs(version) < _MOST_VERSIONS
+        ):
             raise ConfigError(f"weights {version!r}: expected latest, best or a version number")
         wanted = version if isinstance(version, int) else named[version]
         found = store.version(wanted)

@@ -10,7 +10,8 @@ import textwrap
 from typing import TextIO
 
 import click
-import msgspec
+
+from udrl_proto.text import as_json
 
 _kept: TextIO | None = None
 
@@ -28,7 +29,7 @@ def keep_for_json() -> None:
 
 def print_json(value: object) -> None:
     """Print a value as a line of JSON."""
-    click.echo(msgspec.json.encode(value).decode(), file=_kept)
+    click.echo(as_json(value).decode(), file=_kept)
 
 
 def print_text(text: str, label: str = "") -> None:

@@ -20,6 +20,7 @@ from udrl.errors import StoreError, UdrlError
 from udrl.evaluation import Evaluation
 from udrl_inspect.run_list import run_directories
 from udrl_proto.messages import Hello
+from udrl_proto.text import printable
 from udrl_replay.database import STORE_FILE
 from udrl_replay.store import EvaluationRow, Store
 from udrl_show import pictures
@@ -223,10 +224,10 @@ def _names(curves: Sequence[Curve]) -> list[str]:
     """Return unique names of runs: as few of the last parts of their paths as possible."""
     parts = [curve.run_dir.resolve().parts for curve in curves]
     for n in range(1, max(map(len, parts))):
-        names = ["/".join(p[-n:]) for p in parts]
+        names = [printable("/".join(p[-n:])) for p in parts]
         if len(set(names)) == len(set(parts)):
             return names
-    return [str(curve.run_dir) for curve in curves]
+    return [printable(curve.run_dir) for curve in curves]
 
 
 def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -15,6 +15,8 @@ from udrl_launch.settings import read_steps
 from udrl_proto.credentials import load_credentials
 from udrl_proto.session import check_endpoint
 
+#: Most digits of a weights version.
+_MOST_DIGITS = 18
 #: Largest accepted absolute value of a return.
 _MOST = 1e9
 
@@ -179,7 +181,7 @@ def version(text: str) -> int | Literal["latest", "best"]:
     """
     if text == "latest" or text == "best":
         return text  # type: ignore[return-value]
-    if text.isdecimal():
+    if text.isdecimal() and len(text) <= _MOST_DIGITS:
         return int(text)
     raise ConfigError(f"--weights {text}: expected latest, best or a version number")
 
