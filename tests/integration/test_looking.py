@@ -29,6 +29,7 @@ from udrl_board.app import make_app
 from udrl_board.feed import Feed
 from udrl_board.source import Directory
 from udrl_inspect.agents import evaluate, evaluate_all, evaluation_commands, load_agent
+from udrl_inspect.exporting import export_folder
 from udrl_inspect.inspection import read_status
 from udrl_inspect.run_list import find
 from udrl_launch.cli import cli
@@ -435,5 +436,8 @@ def test_run_directory_may_have_a_name_that_is_not_utf8(ended_run: Path, tmp_pat
     (report,) = lines(call("evaluate", odd, "--episodes", 1, "--json"))
     assert report["run_dir"] == str(odd)
     assert compare([odd], tmp_path / "curves.svg") == []
+    agent = odd / os.fsdecode(b"agent-\xff")
+    export_folder(load_agent(odd), odd, agent)
+    assert r'udrl.load("agent-\udcff")' in (agent / "README.md").read_text()
     client = TestClient(make_app(Feed(Directory(odd))))
     assert client.get("/news").json()["place"]["run_dir"] == str(odd)

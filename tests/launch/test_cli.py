@@ -1,5 +1,6 @@
 """The command line."""
 
+import io
 import os
 import pty
 import select
@@ -7,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
+from udrl_launch.output import escape_unprintable
 from udrl_launch.subcommands.runs_commands import _narrow
 from udrl_launch.subcommands.train_command import _options_to_repeat, train
 
@@ -178,3 +181,11 @@ def test_crash_in_native_code_leaves_a_traceback() -> None:
     assert done.returncode < 0
     assert "Fatal Python error: Segmentation fault" in done.stderr
     assert "in main" in done.stderr
+
+
+def test_what_standard_output_cannot_encode_is_escaped(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="latin-1"))
+    escape_unprintable()
+    click.echo("run-\udcff: 3 ± 1, ≤ 4")
+    assert written.getvalue() == b"run-\\udcff: 3 \xb1 1, \\u2264 4\n"

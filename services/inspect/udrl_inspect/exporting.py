@@ -19,6 +19,7 @@ from udrl_inspect.obedience_report import ObedienceReport, report_of_agent
 from udrl_inspect.obedience_text import markdown
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
+from udrl_proto.text import printable
 from udrl_replay.creation import write_config
 from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
@@ -122,7 +123,9 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None
     if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
     report, again = report_of_agent(agent, run_dir), _again(agent, progress)
-    folders.save_folder(folder, policy, _card(agent, address or folder.name, found, report, again))
+    folders.save_folder(
+        folder, policy, _card(agent, address or printable(folder.name), found, report, again)
+    )
     # The card promises that a run with these settings keeps the exported version.
     write_config(folder, agent.config, change(budget_of(run_dir), keep_versions=None))
 

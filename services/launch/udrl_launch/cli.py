@@ -48,6 +48,7 @@ def main() -> NoReturn:
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     extend_module_path()
+    output.escape_unprintable()
     if sys.stderr is not None:
         faulthandler.enable()  # a crash in native code leaves the traceback of every thread
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):

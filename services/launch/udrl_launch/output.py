@@ -3,6 +3,7 @@
 Standard output is reserved for JSON if that was requested, even if environments print.
 """
 
+import io
 import os
 import shutil
 import sys
@@ -25,6 +26,12 @@ def keep_for_json() -> None:
     sys.stdout.flush()
     _kept = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
+
+
+def escape_unprintable() -> None:
+    """Escape what standard output cannot encode, e.g. in names of files, as standard error does."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def print_json(value: object) -> None:
