@@ -277,6 +277,11 @@ def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, mess
             r"its action\[0\] has no bounds.*--set action_low=-1 --set action_high=1",
             None,
         ),
+        (
+            spaces.Box(-np.finfo(np.float64).max, np.finfo(np.float64).max, (2,), np.float64),
+            r"its action\[0\] has no bounds",
+            None,
+        ),
         (spaces.Box(-np.inf, 5, (2,), np.int64), r"its action\[0\] has no bounds", None),
         (
             spaces.Dict(a=spaces.Box(1, 1, (2,))),

@@ -223,6 +223,7 @@ def test_mask_after_the_last_step_may_allow_no_action(mask: str, shows: bool) ->
             {"shows": True},
             "has no such entry; expected 'info', or one of 'doors', 'time'",
         ),
+        ("walls", {}, "has no such entry; expected 'info'$"),
         ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
     ],
 )

@@ -16,10 +16,10 @@ from udrl.config import Budget, Config, build, refuse_ineffective
 from udrl.datasets import read_dataset
 from udrl.digests import arrays_digest
 from udrl.environments import make_environment
-from udrl.environments.making import specify
+from udrl.environments.making import adapt, specify
 from udrl.environments.previous import PREVIOUS, ObservePrevious, null_action
 from udrl.episode import Episode
-from udrl.errors import ConfigError, UnsupportedEnvironment
+from udrl.errors import ConfigError, EnvironmentFault, UnsupportedEnvironment
 from udrl.experience import Experience
 from udrl.spaces import Record, Vector
 from udrl.training import train, untrained
@@ -86,6 +86,37 @@ def test_episodes_store_previous_action_and_reward() -> None:
         assert seen["['has_previous']"].ravel().tolist() == [0] + [1] * (episode.length - 1)
         assert seen["['previous_action']"].tolist() == [0, *episode.actions[:-1].tolist()]
         assert seen["['previous_reward']"].ravel().tolist() == [0, *episode.rewards[:-1].tolist()]
+
+
+class Paid(gym.RewardWrapper[Any, Any]):
+    """Pays the given reward."""
+
+    def __init__(self, env: gym.Env[Any, Any], reward: Any) -> None:
+        super().__init__(env)
+        self._reward = reward
+
+    def reward(self, reward: Any) -> Any:
+        return self._reward
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        ("x", r"returned 'x' \(str\) as reward, expected a number"),
+        (np.zeros(2), r"an array of float64, shape \(2,\) as reward"),
+        (10**400, "the reward inf, expected a finite number"),
+        (-(10**400), "the reward -inf, expected a finite number"),
+    ],
+    ids=["text", "array", "huge", "huge negative"],
+)
+@pytest.mark.parametrize("observes", [True, False])
+def test_invalid_reward_is_named(reward: Any, message: str, observes: bool) -> None:
+    settings = config(observe_previous=observes)
+    env = Paid(gym.make(settings.environment), reward)
+    adapted = adapt(ObservePrevious(env) if observes else env, "Paid-v0", settings.actions)
+    adapted.reset(seed=1)
+    with pytest.raises(EnvironmentFault, match=message):
+        adapted.step(0)
 
 
 def test_training_masks_them_in_a_share_of_the_examples() -> None:
@@ -207,6 +238,7 @@ def test_wrappers_take_literal_arguments() -> None:
         ("gymnasium.wrappers:NoSuchWrapper", "AttributeError"),
         ("no_such_package:Wrapper", "ModuleNotFoundError"),
         ("gymnasium.wrappers:TransformObservation", "TypeError"),
+        ("builtins:id", r"TypeError: it returned \d+ \(int\), not an environment"),
     ],
 )
 def test_inapplicable_wrapper_is_rejected(wrapper: str, message: str) -> None:

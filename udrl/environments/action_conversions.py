@@ -221,6 +221,10 @@ def _bounds(space: spaces.Box, settings: ActionSettings) -> tuple[Array, Array]:
         above &= space.high.astype(np.float64) < float(limits.max)
         if limits.min < 0:
             below &= space.low > limits.min
+    elif space.dtype.kind == "f":  # some environments declare the limits of a dtype instead
+        largest = float(np.finfo(space.dtype.name).max)
+        above &= space.high < largest
+        below &= space.low > -largest
     low, high = (
         np.where(declared & np.isfinite(bound), bound, np.nan if given is None else float(given))
         for declared, bound, given in (

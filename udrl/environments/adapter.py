@@ -1,6 +1,7 @@
 """The wrapper that adapts an environment to the algorithm's spaces, and checks what it returns."""
 
 import logging
+import math
 import sysconfig
 import traceback
 from collections.abc import Mapping
@@ -82,10 +83,8 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         if type(returned) is not tuple or len(returned) != 5:
             raise _wrong("step", describe(returned), _STEP)
         observation, reward, terminated, truncated, info = returned
-        if type(reward) is not float:
-            reward = _number(reward)
-        if not -_LARGEST <= reward <= _LARGEST:
-            raise _wrong("step", f"the reward {reward}", "a finite number that float32 can hold")
+        if type(reward) is not float or not -_LARGEST <= reward <= _LARGEST:
+            reward = checked_reward(reward)
         if type(terminated) is not bool:
             terminated = _flag("terminated", terminated)
         if type(truncated) is not bool:
@@ -127,12 +126,27 @@ def _wrong(where: str, returned: str, expected: str) -> EnvironmentFault:
     return EnvironmentFault(f"{where}() returned {returned}, expected {expected}")
 
 
+def checked_reward(reward: Any) -> float:
+    """Return the reward of a step as a float.
+
+    Raises:
+        EnvironmentFault: it is not a finite number that float32 can hold.
+    """
+    number = reward if type(reward) is float else _number(reward)
+    if not -_LARGEST <= number <= _LARGEST:
+        raise _wrong("step", f"the reward {number}", "a finite number that float32 can hold")
+    return number
+
+
 def _number(reward: Any) -> float:
     """Return a number, or the one element of an array, as a float."""
     if isinstance(reward, np.ndarray) and reward.size == 1:
         reward = reward.item()
     if isinstance(reward, int | float | np.integer | np.floating | np.bool_):
-        return float(reward)
+        try:
+            return float(reward)
+        except OverflowError:  # an integer
+            return math.inf if reward > 0 else -math.inf
     raise _wrong("step", f"{describe(reward)} as reward", "a number")
 
 

@@ -149,7 +149,9 @@ def _wrapped(env: Environment, name: str) -> Environment:
         if not colon:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
         attribute, arguments = _called(call)
-        wrapped: Environment = getattr(import_module(module), attribute)(env, **arguments)
+        wrapped: Any = getattr(import_module(module), attribute)(env, **arguments)
+        if not isinstance(wrapped, gym.Env):
+            raise TypeError(f"it returned {describe(wrapped)}, not an environment")  # noqa: TRY301
     except (Exception, SystemExit) as error:
         close(env)
         raise UnsupportedEnvironment(
@@ -157,7 +159,8 @@ def _wrapped(env: Environment, name: str) -> Environment:
             f"that is importable here, as package.module:Wrapper or "
             f"package.module:Wrapper(shape=(84, 84))"
         ) from error
-    return wrapped
+    result: Environment = wrapped
+    return result
 
 
 def _called(call: str) -> tuple[str, dict[str, Any]]:
@@ -305,9 +308,10 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
     leaves = [leaf.path for leaf in leaves_of(space)]
     found = [k for k, path in enumerate(leaves) if below_observation(path) == (key,)]
     if not found:
+        entries = ", ".join(repr(path[-1]) for path in leaves if path)
         raise UnsupportedEnvironment(
             f"action_mask = {name!r}: environment {config.environment!r} has no such entry; "
-            f"expected 'info', or one of {', '.join(repr(path[-1]) for path in leaves if path)}"
+            f"expected 'info'{f', or one of {entries}' if entries else ''}"
         )
     leaf = leaves_of(space)[found[0]].space
     if not isinstance(leaf, Bits | Vector) or leaf.size != actions.n_parameters:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from udrl.environments.adapter import checked_reward
 from udrl.environments.masking import OBSERVATION
 
 #: Keys of the added entries; training hides them together, from random examples.
@@ -40,7 +41,8 @@ class ObservePrevious(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        shown = _with_previous(observation, action, reward, has_previous=True)
+        earned = checked_reward(reward)
+        shown = _with_previous(observation, action, earned, has_previous=True)
         return shown, reward, terminated, truncated, info
 
 
@@ -78,12 +80,12 @@ def null_action(space: spaces.Space[Any]) -> Any:
 
 
 def _with_previous(
-    observation: Any, action: Any, reward: Any, *, has_previous: bool
+    observation: Any, action: Any, reward: float, *, has_previous: bool
 ) -> dict[str, Any]:
     return {
         OBSERVATION: observation,
         ACTION: action,
-        REWARD: np.asarray(reward, np.float32).reshape(()),
+        REWARD: np.array(reward, np.float32),
         HAS_PREVIOUS: np.array([has_previous], np.int8),
     }
 
