@@ -9,17 +9,25 @@ import logging
 import re
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from udrl.config import Config, change
 from udrl.digests import episode_digest, replay_digest
 from udrl.environments import previous, time_left
 from udrl.environments.action_conversions import action_conversion
-from udrl.environments.conversions import Conversion, observation_conversion
+from udrl.environments.conversions import (
+    Conversion,
+    leaves_within,
+    observation_conversion,
+    with_keys_ordered,
+)
 from udrl.environments.making import EnvironmentSpec, make_environment
+from udrl.environments.masking import MASK, OBSERVATION
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
 
@@ -99,6 +107,13 @@ class _Reader:
         self._spec = spec
         self._adds_time = self._adds_previous = False
         observation_space, action_space = dataset.observation_space, dataset.action_space
+        seen, taken = observation_space, action_space
+        if any(path for space in (seen, taken) for path, _ in leaves_within(space)):
+            # Minari sorts the keys of dictionaries; the environment's order counts.
+            with closing(make_environment(config)) as env:
+                seen, taken = env.observations.declared, env.actions.declared
+        action_space = with_keys_ordered(action_space, taken)
+        observation_space = with_keys_ordered(observation_space, seen)
         try:
             actions = action_conversion(action_space, config.actions)
             observations = observation_conversion(observation_space)
@@ -110,7 +125,7 @@ class _Reader:
                     shown = time_left.space_with_time_left(shown)
                 if self._adds_previous:
                     shown = previous.space_with_previous(shown, action_space)
-                observations = observation_conversion(shown)
+                observations = observation_conversion(with_keys_ordered(shown, seen))
         except UnsupportedEnvironment as error:
             raise ConfigError(
                 f"dataset {name!r}: {error}; name a dataset of the run's environment"
@@ -119,7 +134,7 @@ class _Reader:
             raise ConfigError(
                 f"dataset {name!r} has observations {observation_space} and actions "
                 f"{action_space}, the run's environment has {spec.observation_space} and "
-                f"{spec.action_space}; name a dataset of the run's environment"
+                f"{spec.action_space}; {_remedy(observation_space, config)}"
             )
         self._observations, self._actions = observations, actions
 
@@ -155,6 +170,22 @@ class _Reader:
                 f"environment"
             )
         return episode
+
+
+def _remedy(space: spaces.Space[Any], config: Config) -> str:
+    """Return the remedy for a dataset whose observations are not those of the environment."""
+    found = []
+    while isinstance(space, spaces.Dict) and OBSERVATION in space.spaces:
+        if previous.HAS_PREVIOUS in space.spaces and not config.observe_previous:
+            found.append("observe_previous = true")
+        if time_left.TIME_LEFT in space.spaces and not config.observe_time:
+            found.append("observe_time = true")
+        if MASK in space.spaces and config.actions.action_mask is None:
+            found.append("action_mask = info")
+        space = space[OBSERVATION]
+    if not found:
+        return "name a dataset of the run's environment"
+    return f"set {', '.join(found)}, as in the run that exported it"
 
 
 def dataset_digest(episodes: Sequence[Episode]) -> str:

@@ -84,7 +84,31 @@ class Reach(gym.Env[Any, Any]):
         return np.array(self._goal, np.float32), reward, self._step == STEPS, False, {}
 
 
-for environment in (Nested, Reach):
+class Unsorted(gym.Env[Any, Any]):
+    """Pays for the first component of the action; the keys of its spaces are not sorted."""
+
+    def __init__(self) -> None:
+        place = spaces.Box(-1, 1, (1,), np.float32)
+        self.observation_space = spaces.Dict([("sight", place), ("health", place)])
+        self.action_space = spaces.Dict(
+            [("walk", spaces.Discrete(2)), ("talk", spaces.Discrete(2))]
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> Any:
+        self._step += 1
+        return self._seen(), float(action["walk"]), self._step == STEPS, False, {}
+
+    def _seen(self) -> Any:
+        sight, health = self.np_random.uniform(-1, 1, (2, 1)).astype(np.float32)
+        return {"sight": sight, "health": health}
+
+
+for environment in (Nested, Reach, Unsorted):
     name = f"{environment.__name__}-v0"
     if name not in gym.registry:
         gym.register(

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
+from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.actions import Categorical
 from udrl.algorithm1 import algorithm1
+from udrl.commands import CommandSampler
 from udrl.config import Budget, Config
 from udrl.datasets import dataset_digest, read_dataset, write_dataset
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.making import EnvironmentSpec, make_environment, specify
 from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
 from udrl.spaces import Image, Vector
@@ -77,6 +80,48 @@ def test_dataset_round_trips_bit_identically(spec: EnvironmentSpec) -> None:
         assert theirs.rewards.tolist() == ours.rewards.tolist()
         assert theirs.terminations.tolist()[-1] == ours.terminated
         assert theirs.truncations.tolist()[-1] == ours.truncated
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"environment": "kinds_of_spaces:Unsorted-v0"},
+        {"environment": "kinds_of_spaces:Unsorted-v0", "observe_previous": True},
+        {"observe_previous": True, "observe_time": True},
+        {"environment": "Taxi-v4", "action_mask": "info"},
+    ],
+    ids=str,
+)
+def test_episodes_with_unsorted_keys_round_trip(settings: dict[str, Any]) -> None:
+    config = small(**settings)
+    with closing(EpisodeGenerator(config, 2)) as generator:
+        commands = CommandSampler(config, generator.spec).warm_up()
+        episodes = generate_episodes(generator, commands, None)
+        write_dataset("some/ours-v0", episodes, config, generator.spec)
+        found = read_dataset("some/ours-v0", config, generator.spec)
+    assert dataset_digest(found) == dataset_digest(episodes)
+
+
+@pytest.mark.parametrize(
+    ("settings", "remedy"),
+    [
+        ({"observe_time": True}, "set observe_time = true, as in the run that exported it"),
+        ({"observe_previous": True, "observe_time": True},
+         "set observe_previous = true, observe_time = true, as"),
+        ({"environment": "Taxi-v4", "action_mask": "info"}, "set action_mask = info, as"),
+    ],
+)  # fmt: skip
+def test_dataset_with_more_observations_is_rejected_with_the_settings_that_it_needs(
+    settings: dict[str, Any], remedy: str
+) -> None:
+    config = small(**settings)
+    with closing(EpisodeGenerator(config, 2)) as generator:
+        commands = CommandSampler(config, generator.spec).warm_up()[:2]
+        episodes = generate_episodes(generator, commands, None)
+        write_dataset("some/ours-v0", episodes, config, generator.spec)
+    plain = small(environment=config.environment)
+    with closing(make_environment(plain)) as env, pytest.raises(ConfigError, match=remedy):
+        read_dataset("some/ours-v0", plain, specify(env, plain))
 
 
 def test_existing_or_unknown_name_is_rejected() -> None:

@@ -252,6 +252,22 @@ def nested(space: spaces.Space[Any], leaves: Iterator[Any]) -> Any:
     return next(leaves)
 
 
+def with_keys_ordered(space: spaces.Space[Any], model: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return a space with the keys of its dictionaries in the order of another space's."""
+    if isinstance(space, spaces.Dict) and isinstance(model, spaces.Dict):
+        order = {key: k for k, key in enumerate(model.spaces)}
+        if order.keys() == space.spaces.keys():
+            keys = sorted(space.spaces, key=order.__getitem__)
+            return spaces.Dict([(k, with_keys_ordered(space[k], model[k])) for k in keys])
+    if (
+        isinstance(space, spaces.Tuple)
+        and isinstance(model, spaces.Tuple)
+        and len(space) == len(model)
+    ):
+        return spaces.Tuple([*map(with_keys_ordered, space, model)])
+    return space
+
+
 def leaves_within(
     space: spaces.Space[Any], path: Path = ()
 ) -> Iterator[tuple[Path, spaces.Space[Any]]]:
