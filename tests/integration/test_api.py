@@ -5,6 +5,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import udrl
@@ -102,17 +103,18 @@ def test_failed_run_calls_on_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(ends) == 1
 
 
+@pytest.mark.parametrize("false", [False, np.False_])
 @pytest.mark.parametrize("event", ["on_iteration", "on_evaluation"])
-def test_event_callback_can_stop_a_run(event: str, tmp_path: Path) -> None:
+def test_event_callback_can_stop_a_run(event: str, false: Any, tmp_path: Path) -> None:
     seen: list[object] = []
 
-    def stop(found: object) -> bool:
+    def stop(found: object) -> Any:
         seen.append(found)
-        return False
+        return false
 
     callback: dict[str, Any] = {event: stop}
     stopped = udrl.train(
-        "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=10_000_000,
+        "CartPole-v1", run_dir=tmp_path / "run", preset="none", max_env_steps=50_000,
         **callback, **SETTINGS,
     )  # fmt: skip
     assert seen

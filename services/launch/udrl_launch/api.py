@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from udrl.errors import ConfigError, Interrupted, RunFailed, UdrlError
 from udrl.policy import Policy
@@ -194,5 +195,6 @@ class _Callbacks:
             self._stop_if_false(self.on_evaluation(evaluation))
 
     def _stop_if_false(self, returned: bool | None) -> None:
-        if returned is False:
+        # Comparisons of numpy's numbers return its own False.
+        if isinstance(returned, bool | np.bool_) and not returned:
             self._stop.set()
