@@ -238,6 +238,14 @@ def test_unreadable_runs_are_listed(ended_run: Path, tmp_path: Path) -> None:
     assert "run.sqlite" in summary.problem
 
 
+def test_invalid_budget_is_rejected_with_its_file(ended_run: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(ended_run, run_dir)
+    (run_dir / "config.toml").write_text("max_env_steps = -5\n")
+    with pytest.raises(ConfigError, match=r"config.toml: max_env_steps = -5: .*correct that line"):
+        read_status(run_dir)
+
+
 def test_no_runs_are_listed_as_none(tmp_path: Path) -> None:
     result = CliRunner().invoke(cli, ["runs", str(tmp_path)])
     assert "start one with: udrl train LunarLander-v3" in result.stderr

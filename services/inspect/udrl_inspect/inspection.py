@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from udrl.config import Budget, build, flat, read_toml
-from udrl.errors import UdrlError
+from udrl.errors import ConfigError, UdrlError
 from udrl_inspect.address import Address, connected, served_at
 from udrl_proto import verbs
 from udrl_proto.messages import Hello
@@ -110,7 +110,10 @@ def budget_of(run_dir: Path) -> Budget:
     """
     path = run_dir / "config.toml"
     values = read_toml(path) if path.exists() else {}
-    return build(Budget, {n: v for n, v in values.items() if n in Budget.__struct_fields__})
+    try:
+        return build(Budget, {n: v for n, v in values.items() if n in Budget.__struct_fields__})
+    except ConfigError as error:
+        raise ConfigError(f"configuration file {path}: {error}; correct that line") from error
 
 
 def settings_of(run_dir: Path) -> dict[str, Any]:
