@@ -28,8 +28,8 @@ from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
-#: Versions are below this, which SQLite can still hold.
-_MOST_VERSIONS = 2**62
+#: Versions are below this; SQLite holds no larger integers.
+_MOST_VERSIONS = 2**63
 #: Seconds between tracebacks of a command that is reproduced.
 _SHOW_S = 60.0
 
