@@ -139,6 +139,7 @@ class Rollout:
             or picture.dtype != np.uint8
             or picture.ndim != 3
             or picture.shape[2] != 3
+            or picture.size == 0
         ):
             raise UnsupportedEnvironment(
                 f"environment {self._policy.config.environment!r} renders no image of bytes, "

@@ -130,6 +130,17 @@ def test_environment_without_rendering_is_reported() -> None:
         Rollout(policy, env, command()).picture()
 
 
+class Empty(gym.Wrapper[Any, Any, Any, Any]):
+    def render(self) -> Any:
+        return np.zeros((0, 0, 3), np.uint8)
+
+
+def test_empty_picture_is_rejected() -> None:
+    policy, env = agent()
+    with pytest.raises(UnsupportedEnvironment, match="renders no image"):
+        Rollout(policy, Empty(env), command()).picture()
+
+
 class Broken(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         raise RuntimeError("the wheels came off")

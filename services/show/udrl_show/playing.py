@@ -1,6 +1,7 @@
 """``udrl play``: episodes shown in a window or recorded as a video."""
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Protocol
@@ -59,7 +60,8 @@ def filmed(config: Config) -> Environment:
         UnsupportedEnvironment: it does not support rgb_array rendering.
     """
     with closing(make_environment(config)) as env:
-        if "rgb_array" not in env.metadata.get("render_modes", ()):
+        modes = env.metadata.get("render_modes")
+        if not (isinstance(modes, Iterable) and "rgb_array" in modes):
             raise UnsupportedEnvironment(
                 f"environment {config.environment!r} has no pictures to show: it does not support "
                 f"render_mode='rgb_array'; play without --video and --window"
@@ -69,8 +71,12 @@ def filmed(config: Config) -> Environment:
 
 
 def fps_of(env: Environment) -> float:
-    """Return an environment's steps per second."""
-    return float(env.metadata.get("render_fps") or _USUAL_FPS)
+    """Return an environment's steps per second; the usual ones if it does not declare a number."""
+    try:
+        declared = float(env.metadata["render_fps"])
+    except (LookupError, TypeError, ValueError):
+        return _USUAL_FPS
+    return declared if 0 < declared < math.inf else _USUAL_FPS
 
 
 def play_episodes(
