@@ -4,10 +4,13 @@ import { mark, svg } from "./page.js";
 
 const LEFT = 52, BOTTOM = 34, TOP = 10, RIGHT = 12;
 
+const MOST_TICKS = 20;
+
 function ticks([low, high]) {
   const step = nice((high - low) / 5);
   const found = [];
-  for (let t = Math.ceil(low / step) * step; t <= high; t += step) found.push(Math.round(t / step) * step);
+  // The number is limited because adding 1 to a huge number may not change it.
+  for (let k = Math.ceil(low / step); k * step <= high && found.length < MOST_TICKS; k += 1) found.push(k * step);
   return found;
 }
 
