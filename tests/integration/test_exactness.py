@@ -13,10 +13,10 @@ from whole_run import digests, reference, small, toy
 Runner = Callable[..., Status]
 
 CASES = [
-    (small, 4000),
-    (toy, 400),
-    (partial(small, n_episodes_per_iter=2, n_steps_per_iter=300, last_few=2), 4000),
-    (partial(small, baseline="value", guidance_kl=0.05, reset_every=4), 4000),
+    (small, 3000),
+    (toy, 300),
+    (partial(small, n_episodes_per_iter=2, n_steps_per_iter=300, last_few=2), 3000),
+    (partial(small, baseline="value", guidance_kl=0.05, reset_every=4), 2000),
 ]
 
 
@@ -59,7 +59,6 @@ def test_another_seed_gives_another_result(run: Runner) -> None:
 
 @pytest.mark.parametrize("lead", [0, 2])
 def test_resumed_run_equals_an_uninterrupted_one(lead: int, run: Runner, tmp_path: Path) -> None:
-
     config, run_dir = small(lead=lead), tmp_path / "short"
     first = run(config, 2000, run_dir=run_dir)
     longer = run(config, 4000, run_dir=run_dir, resume=True)
@@ -72,7 +71,6 @@ def test_resumed_run_equals_an_uninterrupted_one(lead: int, run: Runner, tmp_pat
 def test_resuming_an_ended_run_with_the_same_budget_changes_nothing(
     run: Runner, tmp_path: Path
 ) -> None:
-
     run_dir = tmp_path / "run"
     first = run(toy(), 300, run_dir=run_dir)
     again = run(toy(), 300, run_dir=run_dir, resume=True)
