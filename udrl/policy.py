@@ -277,7 +277,7 @@ def _find(leaf: Leaf, observation: Any) -> Any:
     except (LookupError, ValueError) as error:
         raise InvalidData(
             f"observation{leaf.name} is missing in {describe(observation)}; pass observations like "
-            f"those in training"
+            f"those in training, which policy.make_environment() returns"
         ) from error
 
 

@@ -32,7 +32,8 @@ def agent(tmp_path: Path) -> Path:
     env.close()
     behavior = ActingFunction(acting_graph(config.network, spec), untrained(config, spec).weights)
     policy = Policy(behavior, config, spec, desired_return=200.0, desired_horizon=300)
-    folder.save_folder(tmp_path / "my-agent", policy, "")
+    (tmp_path / "runs").mkdir()
+    folder.save_folder(tmp_path / "runs" / "lander", policy, "")
     return tmp_path
 
 
@@ -55,4 +56,4 @@ def test_examples_run(agent: Path, block: str) -> None:
     assert done.returncode == 0, done.stderr
     if "udrl.train" in block:
         assert "EvaluationStatus(" in done.stdout
-        assert (agent / "runs").is_dir()
+        assert len(list((agent / "runs").iterdir())) == 2

@@ -308,7 +308,8 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
     leaves = [leaf.path for leaf in leaves_of(space)]
     found = [k for k, path in enumerate(leaves) if below_observation(path) == (key,)]
     if not found:
-        entries = ", ".join(repr(path[-1]) for path in leaves if path)
+        keys = [below_observation(path) for path in leaves]
+        entries = ", ".join(repr(k[0]) for k in keys if len(k) == 1 and isinstance(k[0], str))
         raise UnsupportedEnvironment(
             f"action_mask = {name!r}: environment {config.environment!r} has no such entry; "
             f"expected 'info'{f', or one of {entries}' if entries else ''}"
