@@ -20,10 +20,10 @@ train: setup  ## Train LunarLander to a mean return of 200.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 200 $(ARGS)
 
 test: setup-dev  ## Run the tests, except the slow ones.
-	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 2 $(ARGS)
+	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 4 $(ARGS)
 
 test-slow: setup-dev  ## Run the slow tests.
-	$(VENV)/bin/python -m pytest -m slow -n 2 $(ARGS)
+	$(VENV)/bin/python -m pytest -m slow -n 4 $(ARGS)
 
 test-browser: setup-dev  ## Test the board in Chromium; skipped if there is none.
 	$(VENV)/bin/python -m pytest -m browser $(ARGS)

@@ -189,7 +189,8 @@ def _actors(status: Status) -> list[str]:
     return [
         f"{len(status.actors)} with",
         f"{_counted(environments, 'environment')};",
-        f"{running} of at most {_counted(status.useful_concurrency, 'episode')} running",
+        f"{_counted(running, 'episode')} running;",
+        f"training needs {status.useful_concurrency:,} at once",
     ]
 
 
