@@ -190,7 +190,7 @@ def _actors(status: Status) -> list[str]:
         f"{len(status.actors)} with",
         f"{_counted(environments, 'environment')};",
         f"{_counted(running, 'episode')} running;",
-        f"training needs {status.useful_concurrency:,} at once",
+        f"training needs {status.useful_concurrency:,}",
     ]
 
 
