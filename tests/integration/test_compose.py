@@ -34,7 +34,7 @@ def run_alone(cli: Callable[..., Cli], env_steps: int, run_dir: Path) -> Status:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def image() -> None:
+def _images() -> None:
     """The images of this checkout; skips the tests without an engine."""
     Project("udrl-test-image", ["compose.yaml"], {}).compose("build", timeout=1800)
 
