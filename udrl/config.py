@@ -22,6 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from udrl.errors import ConfigError
+from udrl.invalid_settings import in_words
 from udrl.setting_groups import (
     ActionSettings,
     ArithmeticSettings,
@@ -301,8 +302,10 @@ def build(kind: type[AnyStruct], values: Mapping[str, Any]) -> AnyStruct:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
         named = [n for n in values if re.search(rf"\$\.{n}\b", str(error))]
-        value = f"{named[0]} = {values[named[0]]!r}: " if named else ""
-        raise ConfigError(f"{value}{error}") from error
+        if not named:
+            raise ConfigError(str(error)) from error
+        name, value = named[0], values[named[0]]
+        raise ConfigError(f"{name} = {value!r}: {in_words(error, kind, name, value)}") from error
 
 
 def change(settings: AnyStruct, **values: Any) -> AnyStruct:

@@ -166,7 +166,7 @@ def test_error_describes_the_fault(data: bytes, kind: type[Message], complaint: 
         ({}, None),
         ({"last_few": 501}, "at most replay_size"),
         ({"max_return": float("nan")}, "finite"),
-        ({"batch_size": 0}, "batch_size = 0: Expected `int` >= 1"),
+        ({"batch_size": 0}, "batch_size = 0: expected an integer >= 1"),
         ({"bach_size": 512}, "did you mean 'batch_size'"),
         ({"training": {"batch_size": 512}}, "unknown setting 'training'"),
         ({"hidden": [[8]]}, r"Expected `int \| str`, got `array`"),
