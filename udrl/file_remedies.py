@@ -3,13 +3,13 @@
 import errno
 
 FREE_DISK = "free some disk space"
-RAISE_LIMIT = "raise the limit of open files, e.g. ulimit -n 4096"
+_RAISE_LIMIT = "raise the limit of open files, e.g. ulimit -n 4096"
 #: Reasons that another file or directory would not remove.
 _REMEDIES = {
     errno.ENOSPC: FREE_DISK,
     errno.EDQUOT: FREE_DISK,
-    errno.EMFILE: RAISE_LIMIT,
-    errno.ENFILE: RAISE_LIMIT,
+    errno.EMFILE: _RAISE_LIMIT,
+    errno.ENFILE: _RAISE_LIMIT,
 }
 
 
