@@ -62,8 +62,8 @@ def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job
             variant=PAPER if paper else "",
         )
     chosen = tuned(participant, task.environment)
-    steps = plan.steps(task, participant)
-    return baseline(participant, plan.baseline(task, seed), chosen, steps)
+    config = plan.baseline(task, seed, **chosen.networks)
+    return baseline(participant, config, chosen.hyperparameters, plan.steps(task, participant))
 
 
 def baseline(

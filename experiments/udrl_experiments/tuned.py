@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -11,7 +11,7 @@ from msgspec import Meta
 from udrl.config import KeywordValue, build
 from udrl.errors import ConfigError
 from udrl.setting_groups import Count, PositiveInt
-from udrl_experiments.protocol import BaselineAlgorithm
+from udrl_experiments.protocol import NETWORKS, BaselineAlgorithm
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(gt=0, le=10)]
@@ -137,17 +137,32 @@ def complete(algorithm: BaselineAlgorithm, chosen: Mapping[str, KeywordValue]) -
     return build(kind, chosen)
 
 
-def tuned(algorithm: BaselineAlgorithm, environment: str) -> dict[str, KeywordValue]:
-    """Return an algorithm's hyperparameters for an environment from ``tuned.toml``.
+class Tuned(NamedTuple):
+    """Settings of an algorithm for an environment.
+
+    Attributes:
+        hyperparameters: those that differ from the defaults.
+        networks: settings of the networks (:data:`~udrl_experiments.protocol.NETWORKS`) that
+            differ from those of UDRL's preset.
+    """
+
+    hyperparameters: dict[str, KeywordValue]
+    networks: dict[str, Any]
+
+
+def tuned(algorithm: BaselineAlgorithm, environment: str) -> Tuned:
+    """Return an algorithm's settings for an environment from ``tuned.toml``.
 
     Raises:
         ConfigError: ``tuned.toml`` has none.
     """
     text = (resources.files("udrl_experiments") / "tuned.toml").read_text(encoding="utf-8")
-    shipped: dict[str, dict[str, dict[str, KeywordValue]]] = tomllib.loads(text)
+    shipped: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(text)
     if environment not in shipped:
         raise ConfigError(
             f"tuned.toml has no hyperparameters of {algorithm} for {environment!r}, only for "
             f"{', '.join(shipped)}"
         )
-    return shipped[environment][algorithm]
+    chosen = shipped[environment][algorithm]
+    networks = {name: chosen.pop(name) for name in NETWORKS if name in chosen}
+    return Tuned(chosen, networks)

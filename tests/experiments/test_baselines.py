@@ -389,10 +389,12 @@ def test_missing_stable_baselines3_is_reported(
 @pytest.mark.parametrize("environment", ["LunarLander-v3", "LunarLanderSparse-v3", "TakeCover-v0"])
 @pytest.mark.parametrize("algorithm", ["DQN", "A2C"])
 def test_shipped_hyperparameters_are_in_the_papers_lists(algorithm: Any, environment: str) -> None:
-    spaces = Path(baselines.__file__).parent / "spaces" / f"{environment}.toml"
-    lists = read_toml(spaces)[algorithm]
-    chosen = tuned(algorithm, environment)
+    spaces = read_toml(Path(baselines.__file__).parent / "spaces" / f"{environment}.toml")
+    chosen, networks = tuned(algorithm, environment)
     complete(algorithm, chosen)
+    for name, value in networks.items():
+        assert value in spaces["networks"][name], name
+    lists = spaces[algorithm]
     for name, values in lists.items():
         if name == "learning_rate":
             values = np.logspace(*values["logspace"])
@@ -403,7 +405,7 @@ def test_shipped_hyperparameters_are_in_the_papers_lists(algorithm: Any, environ
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_minibatches_of_ppo_divide_its_rollouts(task: Task) -> None:
-    shipped = complete("PPO", tuned("PPO", task.environment))
+    shipped = complete("PPO", tuned("PPO", task.environment).hyperparameters)
     assert isinstance(shipped, PpoHyperparameters)
     assert (shipped.n_envs * shipped.n_steps) % shipped.batch_size == 0
     # Every point of a curve has exactly one evaluation.
