@@ -10,19 +10,23 @@ import math
 from collections.abc import Collection, Sequence
 from contextlib import closing
 from hashlib import blake2b
+from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from udrl.acting import EpisodeGenerator, generate_episodes
-from udrl.actions import ActionSpace, random_actions
+from udrl.actions import Actions, random_actions
 from udrl.commands import CommandSampler
 from udrl.config import AUTOMATIC, Config, change
 from udrl.datasets import resolve_dataset
-from udrl.environments.making import make_environment
-from udrl.environments.masking import mask_in
+from udrl.environments.adapter import Adapter
+from udrl.environments.making import make_environment, specify
+from udrl.environments.masking import MASK, mask_in
 from udrl.episode import Episode
 from udrl.setting_groups import CommandSettings
+from udrl.spaces import parts_of
 
 log = logging.getLogger("udrl")
 
@@ -145,6 +149,8 @@ def choose(
 def with_offered_mask(config: Config, automatic: Collection[str]) -> Config:
     """Return settings with the environment's own action mask, if it has one and this is automatic.
 
+    The mask is the entry ``action_mask`` of the observation, or else of ``info``.
+
     Args:
         config: the settings.
         automatic: names of the automatic settings.
@@ -155,17 +161,35 @@ def with_offered_mask(config: Config, automatic: Collection[str]) -> Config:
     if "action_mask" not in automatic or config.commands.dataset is not None:
         return config
     with closing(make_environment(config)) as env:
-        actions: ActionSpace = env.get_wrapper_attr("actions").plain
-        components = actions.components
-        try:
-            mask = mask_in(env.reset(seed=_SEED)[1], components, "reset", is_over=False)
-            allowed = random_actions(actions, mask[None], np.zeros((1, *actions.shape)))
-            _, _, terminated, truncated, info = env.step(allowed[0])
-            mask_in(info, components, "step", is_over=terminated or truncated)
-        except Exception as error:  # noqa: BLE001 - random episodes will show other faults
-            log.debug("%s offers no action mask: %s", config.environment, error)
-            return config
-    return change(config, action_mask="info")
+        for place in (MASK, "info"):
+            masked = change(config, action_mask=place)
+            try:
+                _take_allowed_action(env, masked)
+            except Exception as error:  # noqa: BLE001 - random episodes will show other faults
+                log.debug("%s has no action mask in %s: %s", config.environment, place, error)
+            else:
+                return masked
+    return config
+
+
+def _take_allowed_action(env: Adapter, config: Config) -> None:
+    """Begin an episode without a mask's wrapper, and take an action that the mask allows.
+
+    Raises:
+        UnsupportedEnvironment: no entry of the observation can be a mask.
+        EnvironmentFault: the mask is absent or invalid.
+    """
+    actions = env.actions.plain
+    leaf = None if config.actions.action_mask == "info" else specify(env, config).action_mask
+
+    def mask(observation: npt.NDArray[Any], info: Any, where: str, *, is_over: bool) -> Actions:
+        given = info if leaf is None else {MASK: parts_of(observation)[leaf]}
+        return mask_in(given, actions.components, where, is_over=is_over)
+
+    allowed = mask(*env.reset(seed=_SEED), "reset", is_over=False)
+    (action,) = random_actions(actions, allowed[None], np.zeros((1, *actions.shape)))
+    observation, _, terminated, truncated, info = env.step(action)
+    mask(observation, info, "step", is_over=terminated or truncated)
 
 
 class Sample:

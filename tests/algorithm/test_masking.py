@@ -25,14 +25,14 @@ from udrl.rollout import Rollout
 class Doors(gym.Env[Any, Any]):
     """Some doors are open. A closed one raises an error, and the last one pays most."""
 
-    def __init__(self, *, shows: bool = False, two: bool = False, fault: str = "") -> None:
+    def __init__(self, *, shows: str = "", two: bool = False, fault: str = "") -> None:
         self.shows, self.two, self.fault = shows, two, fault
         self.action_space = spaces.MultiDiscrete([4, 2]) if two else spaces.Discrete(4)
         seen = spaces.Box(0, 1, (1,), np.float32)
         self.observation_space: spaces.Space[Any] = seen
         if shows:
             self.observation_space = spaces.Dict(
-                doors=spaces.Box(0, 1, (6 if two else 4,)), time=seen
+                {shows: spaces.Box(0, 1, (6 if two else 4,)), "time": seen}
             )
 
     def _returned(self) -> tuple[Any, dict[str, Any]]:
@@ -57,7 +57,7 @@ class Doors(gym.Env[Any, Any]):
         absent = self.fault == "no mask" or (self.fault == "only at reset" and self.t > 0)
         info = {} if absent else {"action_mask": mask}
         flat = np.concatenate(mask) if self.two else mask
-        return ({"doors": flat, "time": time} if self.shows else time), info
+        return ({self.shows: flat, "time": time} if self.shows else time), info
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
@@ -91,9 +91,9 @@ def config(mask: str | None = "info", given: dict[str, Any] | None = None, **val
     [
         ("info", {}, {}),
         ("info", {"two": True}, {"observe_previous": True, "frame_stack": 2}),
-        ("doors", {"shows": True}, {"eval_temperature": 0.0}),
-        ("doors", {"shows": True, "two": True}, {"observe_previous": True, "memory": "gru"}),
-        ("doors", {"shows": True}, {"baseline": "action_value", "normalise_observations": True}),
+        ("doors", {"shows": "doors"}, {"eval_temperature": 0.0}),
+        ("doors", {"shows": "doors", "two": True}, {"observe_previous": True, "memory": "gru"}),
+        ("doors", {"shows": "doors"}, {"baseline": "action_value", "normalise_observations": True}),
     ],
 )
 def test_run_takes_allowed_actions_only(
@@ -115,6 +115,10 @@ def test_run_takes_allowed_actions_only(
         ({"fault": "only at reset"}, None),
         ({"fault": "none open"}, None),
         ({"fault": "half open"}, None),
+        ({"shows": "action_mask"}, "action_mask"),
+        ({"shows": "action_mask", "two": True, "fault": "no mask"}, "action_mask"),
+        ({"shows": "action_mask", "fault": "half open"}, None),
+        ({"shows": "doors", "fault": "no mask"}, None),
     ],
 )
 def test_automatic_mask_is_the_one_that_the_environment_offers(
@@ -179,13 +183,13 @@ def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], mess
 
 
 def test_ragged_mask_entry_is_a_fault_of_the_observation() -> None:
-    env = make_environment(config("doors", {"fault": "ragged", "shows": True}))
+    env = make_environment(config("doors", {"fault": "ragged", "shows": "doors"}))
     with pytest.raises(EnvironmentFault, match=r"reset\(\) returned.*'doors'"):
         env.reset(seed=1)
 
 
 @pytest.mark.parametrize("previous", [False, True])
-@pytest.mark.parametrize(("mask", "shows"), [("info", False), ("doors", True)])
+@pytest.mark.parametrize(("mask", "shows"), [("info", ""), ("doors", "doors")])
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -196,7 +200,7 @@ def test_ragged_mask_entry_is_a_fault_of_the_observation() -> None:
     ],
 )
 def test_mask_has_zeros_and_ones_and_allows_an_action(
-    fault: str, message: str, mask: str, shows: bool, previous: bool
+    fault: str, message: str, mask: str, shows: str, previous: bool
 ) -> None:
     given = {"fault": fault, "shows": shows, "two": fault == "second closed"}
     name = r"info\['action_mask'\]" if mask == "info" else r"observation\['doors'\]"
@@ -207,8 +211,8 @@ def test_mask_has_zeros_and_ones_and_allows_an_action(
         env.reset(seed=1)
 
 
-@pytest.mark.parametrize(("mask", "shows"), [("info", False), ("doors", True)])
-def test_mask_after_the_last_step_may_allow_no_action(mask: str, shows: bool) -> None:
+@pytest.mark.parametrize(("mask", "shows"), [("info", ""), ("doors", "doors")])
+def test_mask_after_the_last_step_may_allow_no_action(mask: str, shows: str) -> None:
     settings = config(mask, {"fault": "none open at last", "shows": shows})
     generator = EpisodeGenerator(settings, 1)
     commands = CommandSampler(settings, generator.spec).warm_up()[:2]
@@ -220,11 +224,11 @@ def test_mask_after_the_last_step_may_allow_no_action(mask: str, shows: bool) ->
     [
         (
             "walls",
-            {"shows": True},
+            {"shows": "doors"},
             "has no such entry; expected 'info', or one of 'doors', 'time'",
         ),
         ("walls", {}, "has no such entry; expected 'info'$"),
-        ("time", {"shows": True}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
+        ("time", {"shows": "doors"}, r"it is Vector\(size=1\), expected 4 numbers, 0 or 1"),
     ],
 )
 def test_invalid_mask_entry_is_rejected(mask: str, given: dict[str, Any], message: str) -> None:
