@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.config import Config
-from udrl.environments.conversions import as_array, describe, nested
+from udrl.environments.conversions import nested
 from udrl.environments.making import Environment, EnvironmentSpec, make_environment
 from udrl.errors import InvalidData
-from udrl.frame_stack import FrameStack
 from udrl.inference import ActingFunction, MemoryState
-from udrl.spaces import Leaf, Observations, Record, leaves_of, parts_of
+from udrl.policy_inputs import PolicyInputs
+from udrl.spaces import Record, parts_of
 
 
 class Policy:
@@ -54,7 +54,7 @@ class Policy:
         self.spec = spec
         self.desired_return = desired_return
         self.desired_horizon = desired_horizon
-        self._stack = FrameStack(spec.observation_space, config.network.frame_stack)
+        self._inputs = PolicyInputs(spec, config)
         self._rng = rng or np.random.default_rng()
         self.reset()
 
@@ -111,8 +111,9 @@ class Policy:
                 structured array. With a ``frame_stack`` of more than 1, the last observations,
                 newest last, as ``gymnasium.wrappers.FrameStackObservation`` stacks them.
             desired_return: the return still to be obtained.
-            desired_horizon: the steps left for it; less than 1 counts as 1. Not used if the horizon
-                follows from the return (``horizon_equals_return = true``).
+            desired_horizon: the steps left for it; less than 1 counts as 1. Not used by agents
+                without this input (``horizon_scale = 0``), or if the horizon follows from the
+                return (``horizon_equals_return = true``).
 
         Returns:
             float64 [n_parameters]; for a batch [n, n_parameters].
@@ -138,8 +139,7 @@ class Policy:
             desired_horizon: likewise.
             state: the memory. None: empty, as at the beginning of an episode.
         """
-        desired, n = _commands(desired_return, desired_horizon)
-        seen = self._stack.join(self._plain(observation, n))
+        seen, desired, n = self._inputs.convert(observation, desired_return, desired_horizon)
         if state is not None and len(state) != (n or 1):
             what = "a single observation" if n is None else f"a batch of {n} observations"
             raise InvalidData(
@@ -155,30 +155,6 @@ class Policy:
         call.state[:] = 0 if state is None else state
         call.run()
         return call.logits.astype(np.float64), call.next_state.copy()
-
-    def _plain(self, observation: Any, n: int | None) -> Observations:
-        """Return observations as an array, [n or 1, frame_stack, *observation_shape]."""
-        space, length = self.spec.observation_space, self._stack.length
-        plain: Observations = np.empty((n or 1, length, *space.shape), space.dtype)
-        parts = zip(leaves_of(space), parts_of(plain), self._stack.shapes, strict=True)
-        rows = () if n is None else (n,)
-        for leaf, part, joined in parts:
-            seen = as_array(f"observation{leaf.name}", _find(leaf, observation))
-            stacked = part.shape[1:]
-            expected = stacked[1:] if length == 1 else joined
-            if seen.shape not in ((*rows, *expected), (*rows, *stacked)):
-                raise InvalidData(
-                    f"an observation{leaf.name} of shape {seen.shape}: expected "
-                    f"{(*rows, *expected)}, as in training ({self.config.environment})"
-                )
-            values, found = _converted(seen, part.dtype)
-            values = values.reshape(-1, *leaf.space.shape)
-            if found := found or leaf.space.fault(values, len(values)):
-                raise InvalidData(
-                    f"observation{leaf.name}: {found}; pass observations like those in training"
-                )
-            part[:] = values.reshape(part.shape)
-        return plain
 
     def probabilities(
         self,
@@ -245,54 +221,6 @@ class Policy:
         if temperature == 0:
             return space.mode(logits)
         return space.sample(logits, np.full((len(logits), 1), temperature), uniforms)
-
-
-def _commands(
-    desired_return: npt.ArrayLike, desired_horizon: npt.ArrayLike
-) -> tuple[npt.NDArray[np.float64], int | None]:
-    """Return commands, float64 [n, 2], and n; for a single command [1, 2], and None."""
-    values = np.asarray(desired_return, np.float64), np.asarray(desired_horizon, np.float64)
-    try:
-        desired = np.stack(np.broadcast_arrays(*values), axis=-1)
-    except ValueError:
-        desired = np.empty(())
-    if desired.ndim not in (1, 2) or desired.size == 0:
-        raise InvalidData(
-            f"desired returns of shape {values[0].shape} and desired horizons of shape "
-            f"{values[1].shape}: expected numbers, or one for each observation of a batch"
-        )
-    if not np.isfinite(desired).all():
-        raise InvalidData(
-            f"desired return {values[0]}, desired horizon {values[1]}: expected finite numbers"
-        )
-    return (desired[None], None) if desired.ndim == 1 else (desired, len(desired))
-
-
-def _find(leaf: Leaf, observation: Any) -> Any:
-    """Return a leaf of an observation, in the environment's form or as a structured array."""
-    try:
-        if isinstance(observation, np.ndarray | np.void) and observation.dtype.names:
-            return observation[leaf.name]
-        return leaf.find(observation)
-    except (LookupError, ValueError) as error:
-        raise InvalidData(
-            f"observation{leaf.name} is missing in {describe(observation)}; pass observations like "
-            f"those in training, which policy.make_environment() returns"
-        ) from error
-
-
-def _converted(seen: npt.NDArray[Any], dtype: np.dtype[Any]) -> tuple[npt.NDArray[Any], str | None]:
-    """Return values in another dtype, and why this changes them; None: it only rounds them."""
-    if seen.dtype == dtype:
-        return seen, None
-    if seen.dtype.kind not in "biuf":
-        return seen, f"an array of {seen.dtype}, expected numbers"
-    with np.errstate(over="ignore", invalid="ignore"):
-        converted = seen.astype(dtype)
-    if dtype.kind in "iu" and not np.array_equal(converted, seen):
-        limits = np.iinfo(dtype)
-        return converted, f"not all whole numbers from {limits.min} to {limits.max}"
-    return converted, None
 
 
 def _check(temperature: float) -> None:

@@ -219,8 +219,10 @@ def test_rows_of_a_batch_are_reset_independently() -> None:
 @pytest.mark.parametrize(
     ("seen", "desired", "message"),
     [
-        (SEEN, ([1.0, 2.0], 1), r"an observation of shape \(4,\): expected \(2, 4\)"),
-        ([SEEN, SEEN], (1.0, 1), r"an observation of shape \(2, 4\): expected \(4,\)"),
+        (SEEN, ([1.0, 2.0], 1), "a single observation, but 2 desired returns.*batch of 2"),
+        ([SEEN, SEEN], (1.0, 1), "a batch of 2 observations, but one desired.*pass arrays of 2"),
+        ([SEEN, SEEN], ([1.0] * 3, 1), "a batch of 2 observations, but 3 desired.*arrays of 2"),
+        ([SEEN[:3]] * 2, ([1.0] * 2, 1), r"an observation of shape \(2, 3\): expected \(2, 4\)"),
         ([SEEN, SEEN], ([1.0, 2.0], [1, 2, 3]), r"returns of shape \(2,\) and .* of shape \(3,\)"),
         ([SEEN, SEEN], ([[1.0, 2.0]], 1), r"returns of shape \(1, 2\)"),
         ([SEEN, SEEN], ([1.0, math.nan], 1), "expected finite numbers"),
