@@ -33,7 +33,7 @@ def test_command_that_always_raises_stops_the_run_and_can_be_reproduced(
 ) -> None:
     run_dir = tmp_path / "cursed"
     cursed = small(environment="flaky_environments:Cursed-v0")
-    with pytest.raises(RunFailed, match=r"udrl reproduce RUN_DIR \d+"):
+    with pytest.raises(RunFailed, match=r"udrl reproduce /\S+ \d+"):
         run(cursed, 2000, run_dir=run_dir, actors=2)
     status = live_status(run_dir)
     assert status is not None
@@ -67,7 +67,7 @@ def test_command_that_always_hangs_stops_the_run(
             supervisor.start(
                 name, "actor", "--connect", endpoint, "--patience", "60", "--hang-timeout", "2"
             )
-        with pytest.raises(RunFailed, match=r"udrl reproduce RUN_DIR \d+") as caught:
+        with pytest.raises(RunFailed, match=r"udrl reproduce /\S+ \d+") as caught:
             wait_for(ended, "the run to end", timeout=100)
     finally:
         supervisor.end()

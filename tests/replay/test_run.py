@@ -592,7 +592,8 @@ def test_three_failures_on_two_actors_stop_the_run(make_run: MakeRun) -> None:
     fail(run, 2, "a")
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
-        "command 2 failed 3 times: no more fuel; reproduce it with: udrl reproduce RUN_DIR 2"
+        "command 2 failed 3 times: no more fuel; reproduce it with: udrl reproduce "
+        f"{run.store.run_dir} 2"
     )
 
 
@@ -604,7 +605,7 @@ def test_long_error_leaves_room_for_the_remedy(make_run: MakeRun) -> None:
         run.dispatcher.assign(request, 0, 0.0)
         run.fail(FailureMessage(actor=name, command_id=2, error=4000 * "\n"))
     seen = status(run, Throughput(), Waits(), 0.0, 0.0)
-    assert seen.problem.endswith("; reproduce it with: udrl reproduce RUN_DIR 2")
+    assert seen.problem.endswith(f"; reproduce it with: udrl reproduce {run.store.run_dir} 2")
     assert decode(encode(seen), Status) == seen
 
 
@@ -663,7 +664,8 @@ def test_command_that_kills_its_actors_stops_the_run(
     assert (before, run.progress.state) == ("running", "failed")
     assert run.progress.problem == (
         "command 0 failed 3 times, 3 of them by ending an actor that ran nothing else: its "
-        "environment hangs or crashes; reproduce it with: udrl reproduce RUN_DIR 0"
+        "environment hangs or crashes; reproduce it with: udrl reproduce "
+        f"{run.store.run_dir} 0"
     )
     run = reopened(run)
     finish(run)
@@ -701,7 +703,7 @@ def test_failed_run_has_the_causes_of_all_attempts(reported_last: bool, make_run
     cause = "no more fuel" if reported_last else "its environment hangs or crashes"
     assert run.progress.problem == (
         "command 0 failed 3 times, 2 of them by ending an actor that ran nothing else: "
-        f"{cause}; reproduce it with: udrl reproduce RUN_DIR 0"
+        f"{cause}; reproduce it with: udrl reproduce {run.store.run_dir} 0"
     )
 
 

@@ -42,6 +42,10 @@ class Database:
         run_dir: directory of the run.
         read_only: read a snapshot; another service may write meanwhile.
 
+    Attributes:
+        run_dir: directory of the run.
+        read_only: as above.
+
     Raises:
         StoreError: there is no run, or its file cannot be read.
         RunInUse: another replay service has the lock.
@@ -49,6 +53,7 @@ class Database:
     """
 
     def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
+        self.run_dir = run_dir
         self._path = run_dir / STORE_FILE
         if not self._path.exists():
             raise StoreError(f"{run_dir} holds no run ({STORE_FILE} is missing); check the path")
@@ -98,8 +103,8 @@ class Database:
         wal = self._path.with_name(f"{STORE_FILE}-wal")
         # While a file is read, SQLite keeps an index beside it. In a read-only directory it can do
         # without (immutable) if no process can change the file.
-        may_write = os.access(self._path.parent, os.W_OK)
-        is_still = not (wal.exists() and wal.stat().st_size) and not is_locked(self._path.parent)
+        may_write = os.access(self.run_dir, os.W_OK)
+        is_still = not (wal.exists() and wal.stat().st_size) and not is_locked(self.run_dir)
         db = self._connect("mode=ro" if may_write or not is_still else "mode=ro&immutable=1")
         db.execute("BEGIN")
         db.execute("SELECT 1 FROM facts").fetchone()  # takes the snapshot

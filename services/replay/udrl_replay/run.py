@@ -8,6 +8,7 @@ the rest is derived from it, or sent again by the services.
 import logging
 import math
 from heapq import nlargest
+from shlex import quote
 from typing import Literal
 
 from udrl.commands import FINAL_EVALUATION, Command, CommandSampler
@@ -189,7 +190,7 @@ class StoredRun(RunState):
         self.progress.state = "failed"
         self.progress.problem = (
             f"command {command_id} failed {len(item.failures) + ended} times{how}: {cause}; "
-            f"reproduce it with: udrl reproduce RUN_DIR {command_id}"
+            f"reproduce it with: udrl reproduce {quote(str(self.store.run_dir))} {command_id}"
         )
         log.error("%s", RunFailed(self.progress.problem))
 

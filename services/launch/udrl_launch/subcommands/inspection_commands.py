@@ -105,8 +105,9 @@ def reproduce(run_dir: Path, command_id: int) -> int:
         traceback.print_exception(fault.__cause__)
         raise
     click.echo(
-        f"command {command_id}: episode of {episode.length} steps with return "
-        f"{episode.episode_return}; the run was not changed"
+        f"command {command_id} succeeded: an episode of {episode.length} steps with return "
+        f"{episode.episode_return}; if it failed in the run, the failure did not recur; the run "
+        f"was not changed"
     )
     return 0
 
