@@ -14,7 +14,7 @@ import msgspec
 
 from udrl.config import Configured, FlatSettings, flat
 from udrl.environments.making import EnvironmentSpec
-from udrl.errors import ConfigError, InvalidData, UdrlError
+from udrl.errors import ConfigError, InvalidData, InvalidWeights, UdrlError
 from udrl.file_remedies import file_remedy
 from udrl.graph import acting_graph
 from udrl.policy import Policy
@@ -121,7 +121,10 @@ def load_folder(folder: str | Path) -> Policy:
         graph = acting_graph(config.network, description.environment)
     else:
         graph = _read(folder / _GRAPH)
-    behavior = decode_behavior(graph, weights)
+    try:
+        behavior = decode_behavior(graph, weights)
+    except InvalidWeights as error:
+        raise InvalidWeights(f"{folder / _WEIGHTS}: {error}") from error
     return Policy(
         behavior,
         config,

@@ -33,9 +33,13 @@ def test_services_started_by_hand_equal_one_process(
     )  # fmt: skip
     others = [cli("learner", "--connect", endpoint), cli("actor", "--connect", endpoint)]
     others.append(cli("actor", "--connect", endpoint, "--envs", "3"))
+    log = ""
     for process in (replay, *others):
         code, _, error = process.finish()
         assert code == 0, error
+        log += error
+    assert re.search(r"learner-\S+ joined run \S+ \(CartPole-v1\)", log)
+    assert re.search(r"actor-\S+ joined run \S+ \(CartPole-v1\) with \d+ environments", log)
     status = live_status(run_dir)
     assert status is not None
     assert status.state == "ended"

@@ -118,7 +118,7 @@ def make_environment(config: Config) -> Adapter:
             )
     except (Exception, SystemExit) as error:
         raise UnsupportedEnvironment(
-            f"environment {name!r} cannot be created: {type(error).__name__}: {error}; "
+            f"environment {name!r} cannot be created: {type(error).__name__}: {_sentence(error)}; "
             f"{_remedy(error, config)}"
         ) from error
     for wrapper in config.wrappers:
@@ -218,6 +218,11 @@ def _with_checked_mask(
     if action_mask == "info":
         return ObserveMask(env, components)
     return CheckMask(env, action_mask, components)
+
+
+def _sentence(error: BaseException) -> str:
+    """Return an exception's message without a full stop, so that a remedy can follow."""
+    return str(error).rstrip().removesuffix(".")
 
 
 def _remedy(error: BaseException, config: Config) -> str:

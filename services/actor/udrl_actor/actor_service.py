@@ -90,6 +90,10 @@ class ActorService:
                 environment_digest=environment_digest(generator),
             )
             client.request(verbs.JOIN, join)
+            log.info(
+                "%s joined run %s (%s) with %d environments",
+                self._name, run_id, config.environment, self._environments,
+            )  # fmt: skip
             token = self._transport.declare_presence(
                 key_expressions.alive(run_id, "actor", self._name)
             )

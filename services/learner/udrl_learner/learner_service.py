@@ -104,6 +104,7 @@ class LearnerService:
         declared: list[Any] = []
         try:
             self._client.request(verbs.JOIN, self._join)
+            log.info("%s joined run %s (%s)", self._name, run_id, self._config.environment)
             declared += [
                 self._transport.declare_presence(
                     key_expressions.alive(run_id, "learner", self._name)

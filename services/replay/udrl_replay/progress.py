@@ -8,7 +8,7 @@ State = Literal["running", "finishing", "ended", "failed"]
 
 #: Reasons why no process is running a run that has not ended.
 STOPPED = "stopped on request"
-KILLED = "stopped without notice: its replay service was killed, or its machine went down"
+KILLED = "stopped without notice: its replay service failed or was killed, or its machine went down"
 
 
 class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
