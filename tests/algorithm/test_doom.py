@@ -20,12 +20,13 @@ from gymnasium.utils.env_checker import check_env
 from udrl.acting import EpisodeGenerator, Failure, generate_episodes
 from udrl.actions import Categorical
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config, build
+from udrl.config import Config, build, preset
 from udrl.digests import episode_digest
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.environments.doom import Doom
 from udrl.errors import UnsupportedEnvironment
 from udrl.spaces import Image
+from udrl_inspect.checking import check_environment
 
 
 def take_cover(**changes: Any) -> Config:
@@ -98,6 +99,14 @@ def test_take_cover_is_the_papers() -> None:
     assert total == len(seen) - 1, "one reward for each step, including the last"
     assert len(set(seen)) > 20, "frames must differ"
     env.close()
+
+
+@pytest.mark.parametrize(("changed", "n_advised"), [({}, 0), ({"return_scale": 0.2}, 1)])
+def test_only_changed_scales_of_a_preset_get_advice(changed: Any, n_advised: int) -> None:
+    settings = preset("TakeCover-v0") | changed
+    del settings["max_env_steps"]
+    advice = check_environment(build(Config, settings)).advice
+    assert sum("return_scale" in sentence for sentence in advice) == n_advised
 
 
 def test_actions_are_left_and_right(doom: Callable[..., Doom]) -> None:

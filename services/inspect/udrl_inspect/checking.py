@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from udrl.acting import EpisodeGenerator
 from udrl.automatic_settings import choose, scale_fits, with_offered_mask
 from udrl.commands import CommandSampler
-from udrl.config import Config, change, flat
+from udrl.config import Config, change, flat, preset, preset_names
 from udrl.cost import slow_training_warning
 from udrl.determinism import environment_digest, repeated_digest
 from udrl.environments.making import make_environment
@@ -206,11 +206,13 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
             f"All random episodes reach the limit of {lengths[0]} steps. A lower max_train_steps "
             f"shortens episodes in training, but not in evaluations."
         )
+    environment = config.environment
+    tuned = preset(environment) if environment in preset_names() else {}
     for name, scale, size in (
         ("return_scale", config.network.return_scale, float(np.abs(returns).max())),
         ("horizon_scale", config.network.horizon_scale, float(lengths.mean())),
     ):
-        if not scale_fits(scale, size):
+        if scale != tuned.get(name) and not scale_fits(scale, size):
             advice.append(
                 f"{name} = {scale:g} scales values of about {size:.3g} to inputs of about "
                 f"{scale * size:.2g}; the network needs inputs of about 1; try {name} = auto."
