@@ -331,6 +331,20 @@ def test_unknown_id_is_rejected_with_the_two_accepted_forms(name: str) -> None:
     assert ".;" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("orchard.py:Orchard-v0", "orchard:Orchard-v0"),
+        ("./orchard:Orchard-v0", "orchard:Orchard-v0"),
+        ("/srv/orchard.py:Orchard-v0", "orchard:Orchard-v0"),
+        ("orchard.py", "orchard:Env-v0"),
+    ],
+)
+def test_file_of_a_module_is_rejected_with_the_remedy(name: str, module: str) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=f"as in an import, not its file: {module},"):
+        make(name)
+
+
 def test_missing_module_is_rejected_with_the_remedy() -> None:
     with pytest.raises(UnsupportedEnvironment, match=r"no_such_module.*install the package"):
         make("no_such_module:Env-v0")
@@ -369,6 +383,22 @@ def test_environment_that_exits_is_a_config_error(register: Register) -> None:
         make(register(exits))
     with pytest.raises(UnsupportedEnvironment, match=r"cannot be applied: SystemExit: no licence"):
         make("CartPole-v1", wrappers=[f"{__name__}:exits_around"])
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "message"),
+    [
+        ("no_such_module:Wrapper", "name a wrapper that is importable here"),
+        ("gymnasium.wrappers:NoSuchWrapper", "name a wrapper that is importable here"),
+        ("gymnasium.wrappers:TimeLimit(steps=3)", r"argument 'steps'; correct its arguments"),
+        ("gymnasium.wrappers:TimeLimit", r"'max_episode_steps'; correct its arguments"),
+    ],
+)
+def test_wrapper_that_cannot_be_applied_is_rejected_with_the_remedy(
+    wrapper: str, message: str
+) -> None:
+    with pytest.raises(UnsupportedEnvironment, match=message):
+        make("CartPole-v1", wrappers=[wrapper])
 
 
 def exits_around(env: Environment) -> Environment:
@@ -411,6 +441,8 @@ def test_module_that_fails_to_import_is_rejected(importable_module: str, tmp_pat
 
 def test_unknown_environment_of_an_importable_module_is_rejected(importable_module: str) -> None:
     with pytest.raises(
-        UnsupportedEnvironment, match=f"'{importable_module}:Impatience-v0' cannot be created"
+        UnsupportedEnvironment,
+        match=rf"'{importable_module}:Impatience-v0' cannot be created.*"
+        rf"gymnasium\.register\('Impatience-v0', ...\) in {importable_module}",
     ):
         make(f"{importable_module}:Impatience-v0")

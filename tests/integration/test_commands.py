@@ -52,6 +52,12 @@ def test_status_and_evaluate_of_an_ended_run(cli: Callable[..., Cli], tmp_path: 
     ended = cli(*arguments(SMALL, BUDGET, run_dir), "--in-process").status()
     assert cli("status", str(run_dir), "--json").status() == ended
 
+    code, out, error = cli("status", str(run_dir)).finish()
+    assert code == 0, error
+    lines = out.splitlines()
+    assert lines[2].split() == ["state", "ended"]
+    assert lines == [line.rstrip() for line in lines]
+
     code, out, error = cli("evaluate", str(run_dir), "--episodes", "5", "--json").finish()
     assert code == 0, error
     report = json.loads(out)

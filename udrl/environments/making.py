@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from numbers import Integral
+from pathlib import PurePath
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -154,10 +155,15 @@ def _wrapped(env: Environment, name: str) -> Environment:
             raise TypeError(f"it returned {describe(wrapped)}, not an environment")  # noqa: TRY301
     except (Exception, SystemExit) as error:
         close(env)
+        remedy = (
+            "name a wrapper that is importable here, as package.module:Wrapper or "
+            "package.module:Wrapper(shape=(84, 84))"
+        )
+        if isinstance(error, TypeError) and " argument" in str(error):
+            remedy = "correct its arguments, as in package.module:Wrapper(shape=(84, 84))"
         raise UnsupportedEnvironment(
-            f"wrapper {name!r} cannot be applied: {type(error).__name__}: {error}; name a wrapper "
-            f"that is importable here, as package.module:Wrapper or "
-            f"package.module:Wrapper(shape=(84, 84))"
+            f"wrapper {name!r} cannot be applied: {type(error).__name__}: {_sentence(error)}; "
+            f"{remedy}"
         ) from error
     result: Environment = wrapped
     return result
@@ -228,6 +234,13 @@ def _sentence(error: BaseException) -> str:
 def _remedy(error: BaseException, config: Config) -> str:
     """Return the remedy for an exception of ``gymnasium.make``."""
     text = str(error)
+    module, colon, name = config.environment.rpartition(":")
+    path = PurePath(module if colon else name)
+    if path.suffix == ".py" or (colon and "/" in module):
+        return (
+            f"name the module as in an import, not its file: {path.stem}:"
+            f"{name if colon else 'Env-v0'}, and start in the directory that contains it"
+        )
     if isinstance(error, gym.error.DependencyNotInstalled | ImportError):
         for package, extra in _EXTRAS.items():
             if package.lower() in text.lower():
@@ -238,6 +251,8 @@ def _remedy(error: BaseException, config: Config) -> str:
                 "the module"
             )
         return "install the package that provides it"
+    if isinstance(error, gym.error.UnregisteredEnv) and colon:
+        return f"check the name, or call gymnasium.register({name!r}, ...) in {module}"
     if isinstance(error, gym.error.Error):
         return "name an id registered with Gymnasium, or an importable one as package.module:Env-v0"
     if threading.current_thread() is not threading.main_thread() and _needs_main_thread(text):

@@ -8,13 +8,19 @@ import os
 import shutil
 import sys
 import textwrap
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import click
 
 from udrl_proto.text import as_json
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 _kept: TextIO | None = None
+
+#: Width of a table that is not printed to a terminal, characters.
+_WIDE = 1000
 
 
 def keep_for_json() -> None:
@@ -50,6 +56,20 @@ def print_text(text: str, label: str = "") -> None:
         click.echo(text)
     else:
         click.echo(label + text)
+
+
+def print_table(table: "Table") -> None:
+    """Print a table. Unless standard output is a terminal, no line is wrapped or padded."""
+    from rich.console import Console  # it takes a tenth of a second to import
+
+    if sys.stdout.isatty():
+        Console().print(table)
+        return
+    console = Console(file=io.StringIO(), width=_WIDE)
+    with console.capture() as capture:
+        console.print(table)
+    for line in capture.get().splitlines():
+        click.echo(line.rstrip())
 
 
 def print_error(error: object) -> None:

@@ -30,6 +30,8 @@ _STATES = {
     "failed": "failed",
     "stopped": "stopped",
 }
+#: States in which processes of the run are connected.
+_LIVE = "running", "finishing"
 
 
 class Display:
@@ -118,7 +120,8 @@ def panel(status: Status) -> Table:
     add("weights", *_separated(_weights(status)))
     if status.weights_kept:
         add("weights kept", *_kept(status.weights_kept))
-    add("actors", *_actors(status))
+    if status.state in _LIVE:
+        add("actors", *_actors(status))
     left = [time_left(status)] if status.time_left_s is not None else []
     add("time", *_separated([f"{duration(status.wall_s)} elapsed", *left]))
     if status.audit.rate:
@@ -174,13 +177,15 @@ def _separated(phrases: Sequence[str]) -> list[str]:
 def _env_steps(status: Status) -> list[str]:
     evaluating = status.eval_env_steps
     more = [f"{evaluating:,} more in evaluations"] if evaluating else []
-    return [f"{status.env_steps:,}", f"{status.env_steps_per_s:,.0f} per second", *more]
+    rate = [f"{status.env_steps_per_s:,.0f} per second"] if status.state in _LIVE else []
+    return [f"{status.env_steps:,}", *rate, *more]
 
 
 def _weights(status: Status) -> list[str]:
     loss = [f"loss {status.loss:.3f}"] if status.loss is not None else []
     lag = f"lag {_counted(status.weights_lag, 'version')} and {status.weights_lag_s:.2f} s"
-    return [f"version {status.weights_version:,}", *loss, lag]
+    lags = [lag] if status.state in _LIVE else []
+    return [f"version {status.weights_version:,}", *loss, *lags]
 
 
 def _actors(status: Status) -> list[str]:

@@ -1,6 +1,5 @@
 """``udrl evaluate``, ``udrl reproduce`` and ``udrl status``."""
 
-import sys
 import traceback
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from udrl.errors import EnvironmentFault
 from udrl.evaluation import return_text
 from udrl_inspect import agents, inspection
 from udrl_inspect.greedy import caution
-from udrl_launch.output import print_json, print_text
+from udrl_launch.output import print_json, print_table, print_text
 from udrl_launch.subcommands.options import (
     CONNECT,
     DESIRED_HORIZON,
@@ -26,9 +25,6 @@ from udrl_launch.subcommands.options import (
     version,
 )
 from udrl_show.display import panel
-
-#: Width of output to a pipe or a file, characters; large, so that no line is wrapped.
-_WIDE = 1000
 
 
 @click.command()
@@ -133,8 +129,5 @@ def status(
     if as_json:
         print_json(found)
     else:
-        from rich.console import Console
-
-        console = Console(width=None if sys.stdout.isatty() else _WIDE)
-        console.print(panel(found))
+        print_table(panel(found))
     return 0
