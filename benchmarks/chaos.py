@@ -32,7 +32,8 @@ from faults import FAULTS, Fault
 from severed_link import SeveredLink
 from udrl.commands import CommandSampler
 from udrl.config import Config, change
-from udrl.environments.making import make_environment, specify
+from udrl.environments.making import make_environment
+from udrl.environments.specification import specify
 from udrl.errors import RunFailed
 from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl_launch.settings import Settings, gather

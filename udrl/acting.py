@@ -25,8 +25,8 @@ from udrl.actions import Actions, random_actions
 from udrl.architecture import state_sizes
 from udrl.commands import Command
 from udrl.config import Config
-from udrl.environments.adapter import raised
-from udrl.environments.making import Environment, make_environment
+from udrl.environments.adapter import Environment, raised
+from udrl.environments.making import make_environment
 from udrl.episode import Episode, fault
 from udrl.errors import EnvironmentFault
 from udrl.frame_stack import FrameStack

@@ -22,8 +22,9 @@ from udrl.commands import CommandSampler
 from udrl.config import AUTOMATIC, Config, change
 from udrl.datasets import resolve_dataset
 from udrl.environments.adapter import Adapter
-from udrl.environments.making import make_environment, specify
+from udrl.environments.making import make_environment
 from udrl.environments.masking import MASK, mask_in
+from udrl.environments.specification import specify
 from udrl.episode import Episode
 from udrl.setting_groups import CommandSettings
 from udrl.spaces import parts_of

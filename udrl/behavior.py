@@ -17,7 +17,7 @@ from udrl.architecture import FORBIDDEN, GUIDANCE, layer_widths, n_features
 from udrl.config import Config
 from udrl.custom_networks import make_custom
 from udrl.encoders import ACTIVATIONS, PRECISIONS, apply, fully_connected, make_encoder
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.initialisation import draw_weights
 from udrl.recurrence import Memory
 from udrl.setting_groups import NetworkSettings

@@ -8,7 +8,7 @@ import torch
 
 from udrl.behavior import BehaviorFunction
 from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.graph import Weights, critic_shapes
 from udrl.training import TrainingState, assemble, make_critic
 from udrl.weights import MOMENTS, decode_weights, encode_weights, optimizer_shapes

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from udrl.config import COMMANDS_PER_ITERATION, Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.replay_buffer import ReplayBuffer
 from udrl.schedule import weights_version
 from udrl.setting_groups import CommandSettings, Temperature

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 from udrl.architecture import FILTER, VALUE_WIDTH, image_sizes, layer_widths, n_features
 from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.frame_stack import FrameStack
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Image, LeafSpace, Record, leaves_of

@@ -31,7 +31,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import ConfigError
 from udrl.frame_stack import FrameStack
 from udrl.onnx_nodes import OPSET

@@ -26,8 +26,9 @@ from udrl.environments.conversions import (
     observation_conversion,
     with_keys_ordered,
 )
-from udrl.environments.making import EnvironmentSpec, make_environment
+from udrl.environments.making import make_environment
 from udrl.environments.masking import MASK, OBSERVATION
+from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment
 

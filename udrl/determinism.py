@@ -14,7 +14,8 @@ from udrl.commands import TRAINING_SEEDS, Command
 from udrl.config import Config
 from udrl.digests import episode_digest
 from udrl.environments.adapter import raised
-from udrl.environments.making import limit_steps, make_environment
+from udrl.environments.making import make_environment
+from udrl.environments.step_limits import limit_steps
 from udrl.episode import Episode
 from udrl.errors import EnvironmentFault
 from udrl.streams import Purpose, stream_key

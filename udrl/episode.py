@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.actions import Actions
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.spaces import Observations, parts_of
 
 Rewards = npt.NDArray[np.float32]

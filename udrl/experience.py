@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from udrl.actions import Actions
 from udrl.config import Config
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError
 from udrl.frame_stack import FrameStack, Seen

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from udrl.config import Configured, FlatSettings, flat
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidData, InvalidWeights, UdrlError
 from udrl.file_remedies import file_remedy
 from udrl.graph import acting_graph

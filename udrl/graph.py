@@ -38,7 +38,7 @@ from udrl.architecture import (
     n_features,
     state_sizes,
 )
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidWeights
 from udrl.frame_stack import FrameStack
 from udrl.onnx_nodes import OPSET, Nodes

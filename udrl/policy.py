@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.config import Config
+from udrl.environments.adapter import Environment
 from udrl.environments.conversions import nested
-from udrl.environments.making import Environment, EnvironmentSpec, make_environment
+from udrl.environments.making import make_environment
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import InvalidData
 from udrl.inference import ActingFunction, MemoryState
 from udrl.policy_inputs import PolicyInputs

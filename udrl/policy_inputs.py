@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from udrl.config import Config
 from udrl.environments.conversions import as_array, describe
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import InvalidData
 from udrl.frame_stack import FrameStack, Seen
 from udrl.spaces import Leaf, Observations, leaves_of, parts_of

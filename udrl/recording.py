@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.commands import Command, Decisions
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.frame_stack import FrameStack, Seen
 from udrl.spaces import Observations

@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from udrl.actions import random_actions
 from udrl.commands import Command
-from udrl.environments.adapter import raised
-from udrl.environments.making import Environment, limit_steps
+from udrl.environments.adapter import Environment, raised
+from udrl.environments.step_limits import limit_steps
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.inference import MemoryState
 from udrl.policy import Policy

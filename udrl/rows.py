@@ -7,14 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.config import Config
-from udrl.environments.making import (
-    Environment,
-    EnvironmentSpec,
-    indexed,
-    limit_steps,
-    make_environment,
-    specify,
-)
+from udrl.environments.adapter import Environment
+from udrl.environments.making import indexed, make_environment
+from udrl.environments.specification import EnvironmentSpec, specify
+from udrl.environments.step_limits import limit_steps
 from udrl.spaces import Observations
 
 

@@ -17,7 +17,7 @@ from udrl.batches import Batch, Batches, Draw, SeenTensors, draw_examples
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config
 from udrl.encoders import PRECISIONS
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.experience import RankedExperience
 from udrl.graph import Weights
 from udrl.guidance import EXAMPLES, choose_guidance

@@ -8,7 +8,7 @@ import numpy as np
 from udrl.config import Config, change
 from udrl.determinism import PROBE_STEPS
 from udrl.digests import arrays_digest
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.experience import Experience
 from udrl.spaces import noise, parts_of

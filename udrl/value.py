@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from udrl.action_losses import of_action
 from udrl.architecture import MIN_DEVIATION, SQUAREPLUS, VALUE_WIDTH, n_features
 from udrl.encoders import apply, fully_connected, make_encoder
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.recurrence import Memory
 from udrl.setting_groups import NetworkSettings
 

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from udrl.commands import TRAINING_SEEDS
 from udrl.config import Config
-from udrl.environments.making import Environment, make_environment
+from udrl.environments.adapter import Environment
+from udrl.environments.making import make_environment
 from udrl.frame_stack import Seen
 from udrl.inference import Call
 from udrl.streams import Purpose, Stream, stream_key

@@ -15,7 +15,7 @@ from udrl.actions import Categorical, Product
 from udrl.architecture import state_sizes
 from udrl.behavior import BehaviorFunction, initialise
 from udrl.config import Config, build
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import InvalidWeights
 from udrl.frame_stack import Seen
 from udrl.graph import acting_graph, weight_shapes

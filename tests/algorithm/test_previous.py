@@ -16,8 +16,9 @@ from udrl.config import Budget, Config, build, refuse_ineffective
 from udrl.datasets import read_dataset
 from udrl.digests import arrays_digest
 from udrl.environments import make_environment
-from udrl.environments.making import adapt, specify
+from udrl.environments.making import adapt
 from udrl.environments.previous import PREVIOUS, ObservePrevious, null_action
+from udrl.environments.specification import specify
 from udrl.episode import Episode
 from udrl.errors import ConfigError, EnvironmentFault, UnsupportedEnvironment
 from udrl.experience import Experience

@@ -18,7 +18,8 @@ from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, KeywordValue, build, read_toml
-from udrl.environments.making import make_environment, specify
+from udrl.environments.making import make_environment
+from udrl.environments.specification import specify
 from udrl.errors import ConfigError, InvalidData
 from udrl.frame_stack import FrameStack
 from udrl.replay_buffer import Entry, ReplayBuffer

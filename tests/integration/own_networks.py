@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.setting_groups import NetworkSettings
 
 

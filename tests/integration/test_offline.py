@@ -18,7 +18,8 @@ from udrl.algorithm1 import algorithm1
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config
 from udrl.datasets import dataset_digest, read_dataset, write_dataset
-from udrl.environments.making import EnvironmentSpec, make_environment, specify
+from udrl.environments.making import make_environment
+from udrl.environments.specification import EnvironmentSpec, specify
 from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
 from udrl.spaces import Image, Vector

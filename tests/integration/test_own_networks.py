@@ -13,7 +13,8 @@ import torch
 from udrl.algorithm1 import algorithm1
 from udrl.behavior import initialise
 from udrl.config import Budget, Config, build
-from udrl.environments.making import make_environment, specify
+from udrl.environments.making import make_environment
+from udrl.environments.specification import specify
 from udrl.errors import ConfigError
 from udrl.graph import acting_graph, weight_shapes
 from udrl.inference import ActingFunction

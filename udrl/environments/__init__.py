@@ -8,15 +8,12 @@ paper's toy example) and ``Obedience-v0`` (following the command is trivial).
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from udrl.environments.adapter import Environment
 from udrl.environments.downsampling import Downsample
-from udrl.environments.making import (
-    Environment,
-    EnvironmentSpec,
-    limit_steps,
-    make_environment,
-    specify,
-)
+from udrl.environments.making import make_environment
 from udrl.environments.sparse import RewardAtEnd
+from udrl.environments.specification import EnvironmentSpec, specify
+from udrl.environments.step_limits import limit_steps
 
 __all__ = [
     "Downsample",

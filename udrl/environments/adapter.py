@@ -16,6 +16,9 @@ from udrl.errors import EnvironmentFault, InvalidData
 
 log = logging.getLogger("udrl")
 
+#: An environment with any spaces.
+Environment = gym.Env[Any, Any]
+
 _RESET = "(observation, info)"
 _STEP = "(observation, reward, terminated, truncated, info)"
 #: The largest reward.
@@ -35,9 +38,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         actions: conversion of its actions.
     """
 
-    def __init__(
-        self, env: gym.Env[Any, Any], observations: Conversion, actions: Conversion
-    ) -> None:
+    def __init__(self, env: Environment, observations: Conversion, actions: Conversion) -> None:
         super().__init__(env)
         self.observations = observations
         self.actions = actions
@@ -102,7 +103,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             raise EnvironmentFault(f"{where}() returned {error}") from error
 
 
-def close(env: gym.Env[Any, Any]) -> None:
+def close(env: Environment) -> None:
     """Close an environment; its exceptions are logged and ignored."""
     try:
         env.close()

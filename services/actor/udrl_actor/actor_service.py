@@ -10,7 +10,8 @@ import time
 from udrl.acting import EpisodeGenerator, Failure
 from udrl.config import Config
 from udrl.determinism import environment_digest
-from udrl.environments.making import Environment, make_environment
+from udrl.environments.adapter import Environment
+from udrl.environments.making import make_environment
 from udrl.episode import Episode
 from udrl.errors import Interrupted
 from udrl.numerics import acting_class

@@ -17,8 +17,8 @@ from typing import Literal
 from PIL import Image
 
 from udrl.commands import Command
-from udrl.environments.adapter import Adapter
-from udrl.environments.making import Environment, make_environment
+from udrl.environments.adapter import Adapter, Environment
+from udrl.environments.making import make_environment
 from udrl.errors import UdrlError, UnsupportedEnvironment
 from udrl.policy import Policy
 from udrl.rollout import Rollout

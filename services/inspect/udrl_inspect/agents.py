@@ -12,7 +12,7 @@ import msgspec
 from udrl.acting import EpisodeGenerator, generate_episodes, iterate_episodes
 from udrl.commands import Command, CommandSampler
 from udrl.config import Config, change
-from udrl.environments.making import EnvironmentSpec
+from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode
 from udrl.errors import ConfigError, StoreError
 from udrl.evaluation import Evaluation, summarise

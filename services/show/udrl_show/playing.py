@@ -10,7 +10,8 @@ import msgspec
 
 from udrl.commands import Command
 from udrl.config import Config, change
-from udrl.environments.making import Environment, make_environment
+from udrl.environments.adapter import Environment
+from udrl.environments.making import make_environment
 from udrl.errors import UnsupportedEnvironment
 from udrl.evaluation import return_text
 from udrl.rollout import Rollout
