@@ -20,14 +20,10 @@ from udrl.config import Config, change
 from udrl.digests import episode_digest, replay_digest
 from udrl.environments import previous, time_left
 from udrl.environments.action_conversions import action_conversion
-from udrl.environments.conversions import (
-    Conversion,
-    leaves_within,
-    observation_conversion,
-    with_keys_ordered,
-)
+from udrl.environments.conversions import Conversion, leaves_within, with_keys_ordered
 from udrl.environments.making import make_environment
 from udrl.environments.masking import MASK, OBSERVATION
+from udrl.environments.observation_conversions import observation_conversion
 from udrl.environments.specification import EnvironmentSpec
 from udrl.episode import Episode, fault
 from udrl.errors import ConfigError, InvalidData, UnsupportedEnvironment

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from udrl.actions import Categorical, Product
 from udrl.environments.action_conversions import action_conversion, default_bins
-from udrl.environments.conversions import observation_conversion
+from udrl.environments.observation_conversions import observation_conversion
 from udrl.errors import InvalidData, UnsupportedEnvironment
 from udrl.setting_groups import ActionSettings
 from udrl.spaces import Bits, Categories, Category, Image, Record, Vector, leaves_of

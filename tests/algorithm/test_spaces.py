@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from udrl.actions import ActionSpace, Categorical, Product
 from udrl.environments.action_conversions import action_conversion
-from udrl.environments.conversions import observation_conversion
+from udrl.environments.observation_conversions import observation_conversion
 from udrl.setting_groups import ActionSettings
 from udrl.spaces import (
     Bits,

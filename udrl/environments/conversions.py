@@ -3,7 +3,8 @@
 An image's channels are moved to the front, a ``Discrete`` space with an offset is shifted to 0,
 ``Dict`` and ``Tuple`` spaces become records, and arrays get the dtypes of :mod:`udrl.spaces`. All
 values of environments and datasets are converted here and checked, because numpy would silently
-broadcast, round and wrap. :mod:`udrl.environments.action_conversions` converts actions.
+broadcast, round and wrap. :mod:`udrl.environments.observation_conversions` and
+:mod:`udrl.environments.action_conversions` choose the conversions of a space.
 """
 
 from abc import ABC, abstractmethod
@@ -14,19 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from udrl.errors import InvalidData, UnsupportedEnvironment
+from udrl.errors import InvalidData
 from udrl.spaces import (
-    MAX_CATEGORIES,
-    MAX_LEAVES,
-    Bits,
-    Categories,
-    Category,
-    Image,
     Key,
-    Leaf,
-    Record,
     Space,
-    Vector,
 )
 
 Array = npt.NDArray[Any]
@@ -35,8 +27,6 @@ Path = tuple[Key, ...]
 
 #: Maximum number of elements in a lookup table, and in a message.
 _FEW = 1000
-#: Maximum levels of nested spaces.
-_MAX_DEPTH = 16
 
 
 class Conversion(ABC):
@@ -112,33 +102,6 @@ class Boxed(Conversion):
         return array.reshape(*leading, *self.plain.shape) if self._is_reshaped else array
 
 
-class _Images(Boxed):
-    """Converts images."""
-
-    def __init__(self, name: str, declared: spaces.Box) -> None:
-        shape, axis = declared.shape, channel_axis(declared)
-        self._is_flat = axis is None
-        self._is_last = axis == 2
-        moved = (1, *shape) if self._is_flat else shape
-        if self._is_last:
-            moved = (shape[2], *shape[:2])
-        super().__init__(name, declared, Image(*moved))
-        self._is_reshaped = False
-
-    def back(self, values: Array) -> Any:
-        """Return elements of the declared space."""
-        if self._is_flat:
-            return values[:, 0]
-        return np.moveaxis(values, -3, -1) if self._is_last else values
-
-    def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Return plain elements, [*leading, *shape]."""
-        array = super().convert(value, leading)
-        if self._is_flat:
-            return np.expand_dims(array, len(leading))
-        return np.moveaxis(array, -1, -3) if self._is_last else array
-
-
 class Indexed(Conversion):
     """Converts a ``Discrete`` to indices from 0."""
 
@@ -203,46 +166,6 @@ class MultiIndexed(Conversion):
         return shifted.astype(self.plain.dtype)
 
 
-class _Records(Conversion):
-    """Converts a ``Dict`` or ``Tuple``, possibly nested, to records."""
-
-    def __init__(
-        self,
-        name: str,
-        declared: spaces.Space[Any],
-        parts: list[tuple[tuple[Key, ...], Conversion]],
-    ) -> None:
-        leaves = tuple(Leaf(path, conversion.plain) for path, conversion in parts)
-        super().__init__(name, declared, Record(leaves))
-        self._parts = [(leaf, c) for leaf, (_, c) in zip(leaves, parts, strict=True)]
-
-    def back(self, values: Array) -> Any:
-        """Return elements of the declared space."""
-        return nested(self.declared, iter([c.back(values[leaf.name]) for leaf, c in self._parts]))
-
-    def back_one(self, value: Any) -> Any:
-        """Return elements of the declared space."""
-        return nested(
-            self.declared, iter([c.back_one(value[leaf.name]) for leaf, c in self._parts])
-        )
-
-    def convert(self, value: Any, leading: tuple[int, ...]) -> Array:
-        """Return plain elements, [*leading, *shape]."""
-        record: Array = np.empty(leading, self.plain.dtype)
-        for leaf, conversion in self._parts:
-            try:
-                found = leaf.find(value)
-            except LookupError:
-                raise InvalidData(
-                    f"{self.name}: {describe(value)}, without {conversion.name}, expected an "
-                    f"element of {self.declared}"
-                ) from None
-            record[leaf.name] = (
-                conversion.convert(found, leading) if leading else conversion.one(found)
-            )
-        return record
-
-
 def nested(space: spaces.Space[Any], leaves: Iterator[Any]) -> Any:
     """Arrange leaves, in the order of the space's leaves, in its dictionaries and tuples."""
     if isinstance(space, spaces.Dict):
@@ -284,21 +207,6 @@ def leaves_within(
         yield from leaves_within(child, (*path, key))
 
 
-def is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether a space is one of images: a ``Box`` of bytes with two or three dimensions."""
-    return isinstance(space, spaces.Box) and len(space.shape) in (2, 3) and space.dtype == np.uint8
-
-
-def channel_axis(space: spaces.Box) -> int | None:
-    """Return which dimension of an image has its channels, 0 or 2; None: there are only two.
-
-    Spaces do not declare it: it is the smallest.
-    """
-    if len(space.shape) == 2:
-        return None
-    return 2 if space.shape[0] > min(space.shape) else 0
-
-
 def as_array(name: str, value: Any) -> Array:
     """Return a value as an array.
 
@@ -321,65 +229,3 @@ def describe(value: Any) -> str:
         return f"a dict of {', '.join(map(repr, list(value)[:8])) or 'nothing'}"
     text = repr(value.item() if isinstance(value, np.generic) else value)
     return f"{text[:60]}{'...' if len(text) > 60 else ''} ({type(value).__name__})"
-
-
-def observation_conversion(space: spaces.Space[Any]) -> Conversion:
-    """Return the conversion for observations of a space.
-
-    Raises:
-        UnsupportedEnvironment: the space is not supported; the message lists all problems.
-    """
-    leaves = list(leaves_within(space))
-    if [path for path, _ in leaves] == [()]:
-        return _of_leaf("observation", space)
-    if not 1 <= len(leaves) <= MAX_LEAVES or max(len(path) for path, _ in leaves) > _MAX_DEPTH:
-        raise UnsupportedEnvironment(
-            f"its observations have {len(leaves)} parts; supported are 1 to {MAX_LEAVES}, at most "
-            f"{_MAX_DEPTH} levels deep"
-        )
-    parts, problems = [], []
-    for path, inner in leaves:
-        name = "observation" + "".join(f"[{key!r}]" for key in path)
-        try:
-            parts.append((path, _of_leaf(name, inner)))
-        except UnsupportedEnvironment as error:
-            problems.append(str(error))
-    if problems:
-        raise UnsupportedEnvironment("; also, ".join(problems))
-    return _Records("observation", space, parts)
-
-
-def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
-    match space:
-        case spaces.Discrete(n=n) if n <= MAX_CATEGORIES:
-            return Indexed(name, space, Category(n=int(n)))
-        case spaces.Discrete(n=n):
-            raise UnsupportedEnvironment(
-                f"its {name} is one of {n:,} states, and the network would learn a vector for "
-                f"each; at most {MAX_CATEGORIES:,} are supported; use a wrapper that returns "
-                f"numbers that describe a state"
-            )
-        case spaces.MultiDiscrete() if space.nvec.size and space.nvec.sum() <= MAX_CATEGORIES:
-            return MultiIndexed(name, space, Categories(ns=tuple(space.nvec.reshape(-1).tolist())))
-        case spaces.MultiBinary() if np.prod(space.shape) > 0:
-            return Boxed(name, space, Bits(size=int(np.prod(space.shape))))
-        case spaces.Box() if is_image(space):
-            if min(space.shape) > 0:
-                return _Images(name, space)
-        case spaces.Box() if np.prod(space.shape) > 0:
-            return Boxed(name, space, Vector(size=int(np.prod(space.shape))))
-    raise UnsupportedEnvironment(
-        f"its {name} is {space}; supported are Box, Discrete, MultiDiscrete, MultiBinary, and Dict "
-        f"and Tuple of these; {_remedy(name, space)}"
-    )
-
-
-def _remedy(name: str, space: spaces.Space[Any]) -> str:
-    """Return the remedy for an unsupported space."""
-    drop = ""
-    if name.endswith("']"):
-        drop = ", or leave it out with gymnasium.wrappers.FilterObservation"
-    cause = ""
-    if isinstance(space, spaces.Text | spaces.Sequence | spaces.Graph | spaces.OneOf):
-        cause = "its elements vary in size; "
-    return f"{cause}convert it to arrays with gymnasium.wrappers.TransformObservation{drop}"

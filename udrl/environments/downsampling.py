@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from udrl.environments.conversions import channel_axis, is_image, leaves_within
+from udrl.environments.conversions import leaves_within
+from udrl.environments.observation_conversions import channel_axis, is_image
 from udrl.errors import UnsupportedEnvironment
 
 Pixels = npt.NDArray[np.uint8]

@@ -16,9 +16,9 @@ from gymnasium.envs.registration import find_highest_version, get_env_id, parse_
 from udrl.config import Config
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.adapter import Adapter, Environment, close
-from udrl.environments.conversions import observation_conversion
 from udrl.environments.creation_remedies import remedy, sentence
 from udrl.environments.masking import CheckMask, ObserveMask
+from udrl.environments.observation_conversions import observation_conversion
 from udrl.environments.previous import ObservePrevious
 from udrl.environments.step_limits import limit_steps, step_limit
 from udrl.environments.time_left import ObserveTime
