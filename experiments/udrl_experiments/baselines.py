@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import safetensors
@@ -30,6 +31,9 @@ from udrl_experiments.protocol import BaselineAlgorithm
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
 from udrl_inspect.csv_tables import write
+
+if TYPE_CHECKING:
+    from udrl_experiments.policies import Model
 
 #: Number of environments of an evaluation. The result does not depend on it.
 _ENVIRONMENTS = 16
@@ -114,15 +118,14 @@ def train_baseline(
     folder.mkdir(parents=True, exist_ok=True)
     config, hyperparameters = resolve_arithmetic(baseline.config), baseline.complete()
     path, table = folder / "state.safetensors", folder / "evaluations.csv"
+    if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
+        exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
+    state = _State(exploration_steps=exploration_steps or 0, counters={}, rows=[])
+    tensors: dict[str, Tensor] = {}
     if path.exists():
         state, tensors = _load(path)
         # The process may have ended after it saved the state, and before it wrote the table.
         write(table, EvaluationRecord, state.rows)
-    else:
-        if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
-            exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
-        state = _State(exploration_steps=exploration_steps or 0, counters={}, rows=[])
-        tensors = {}
     rows = state.rows
     began = time.monotonic() - (rows[-1].wall_s if rows else 0.0)
 
@@ -143,13 +146,7 @@ def train_baseline(
         every = config.evaluation.eval_every
         while (env_steps := model.num_timesteps) < max_env_steps:
             due = (env_steps // every + 1) * every
-            model.learn(
-                min(due, max_env_steps) - env_steps,
-                callback=lambda local, shared: not stop.is_set(),
-                reset_num_timesteps=False,
-            )
-            if stop.is_set():
-                raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
+            _learn(model, min(due, max_env_steps) - env_steps, stop)
             policy = policies.ModelPolicy(model, shape)
             evaluation = _evaluate(baseline, generator, policy, len(rows) + 1)
             row = EvaluationRecord(
@@ -173,6 +170,21 @@ def _require_stable_baselines3() -> None:
             f"algorithms other than UDRL need Stable-Baselines3: {error}; "
             f'install it with: pip install "udrl[studies]"'
         ) from error
+
+
+def _learn(model: "Model", env_steps: int, stop: threading.Event) -> None:
+    """Train for a number of env steps, up to the end of an update.
+
+    Raises:
+        Interrupted: ``stop`` was set.
+    """
+    model.learn(
+        env_steps,
+        callback=lambda local, shared: not stop.is_set(),
+        reset_num_timesteps=False,
+    )
+    if stop.is_set():
+        raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
 
 
 def _evaluate(
