@@ -95,6 +95,15 @@ def test_lines_wrap_at_words_in_a_terminal(columns: int) -> None:
     assert len(" ".join(" ".join(lines).split())) == pytest.approx(len(words), abs=40)
 
 
+@pytest.mark.parametrize("columns", [50, 80])
+def test_help_does_not_break_words(columns: int) -> None:
+    lines = in_a_terminal(columns, "train", "--help").splitlines()
+    command = "    udrl train LunarLander-v3 --max-env-steps 2M --seed 7"  # to copy
+    assert max(len(line) for line in lines if line != command) <= columns
+    words = " ".join(lines).split()
+    assert {"LunarLander-v3,", "TakeCover-v0-paper,", "tcp/127.0.0.1:7447."} <= set(words)
+
+
 def test_runs_in_a_narrow_terminal() -> None:
     row = [
         "ended", "CartPole-v1", "7", "3,000 of 3,000", "412.5", "0:12 ago",

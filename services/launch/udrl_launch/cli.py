@@ -5,6 +5,7 @@ import inspect
 import os
 import re
 import sys
+from collections.abc import Iterable
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -37,6 +38,11 @@ _COMMANDS = {
     "keys": "udrl_launch.subcommands.keys_command",
     "completion": "udrl_launch.subcommands.completion_command",
 }
+
+#: Width from which descriptions are beside long options, characters.
+_WIDE = 70
+#: Width of the column of options and commands in a narrower terminal, characters.
+_NARROW = 12
 
 #: Entry points of other packages' commands.
 _GROUP = "udrl.commands"
@@ -87,8 +93,26 @@ def _one_line(error: click.ClickException) -> str:
     return message[:1].lower() + message[1:]
 
 
+class _HelpFormatter(click.HelpFormatter):
+    """Formats help. In a narrow terminal, a long option is on a line above its description.
+
+    Beside it, the column of descriptions would be too narrow for words such as names of presets.
+    """
+
+    def write_dl(
+        self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2
+    ) -> None:
+        super().write_dl(list(rows), col_max if self.width >= _WIDE else _NARROW, col_spacing)
+
+
+class _Context(click.Context):
+    formatter_class = _HelpFormatter
+
+
 class _Commands(click.Group):
     """Imports a command when it is used. Other packages add theirs as entry points."""
+
+    context_class = _Context
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [*_COMMANDS, *sorted(entry_points(group=_GROUP).names - _COMMANDS.keys())]
@@ -97,10 +121,10 @@ class _Commands(click.Group):
         command: click.Command
         if cmd_name in _COMMANDS:
             command = getattr(import_module(_COMMANDS[cmd_name]), cmd_name)
-            return _with_example(command)
+            return _formatted(command)
         for added in entry_points(group=_GROUP, name=cmd_name):
             command = added.load()
-            return _with_example(command)
+            return _formatted(command)
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(
@@ -113,15 +137,16 @@ class _Commands(click.Group):
         return super().resolve_command(ctx, args)
 
 
-def _with_example(command: click.Command) -> click.Command:
+def _formatted(command: click.Command) -> click.Command:
     """Put the example in a command's help on a line of its own, which click does not wrap."""
+    command.context_class = _Context
     if command.help is not None:
         about, found, example = inspect.cleandoc(command.help).partition("Example: ")
         if found:
             command.help = f"{about}\b\nExample:\n  {' '.join(example.split())}"
     if isinstance(command, click.Group):
         for subcommand in command.commands.values():
-            _with_example(subcommand)
+            _formatted(subcommand)
     return command
 
 

@@ -9,9 +9,9 @@ from click.shell_completion import get_completion_class
 def completion(shell: str) -> int:
     """Print a shell completion script.
 
-    Add this to your shell's startup file, e.g. ~/.bashrc: eval "$(udrl completion bash)"
+    Evaluate the script in your shell's startup file, e.g. ~/.bashrc, as in the example.
 
-    Example: udrl completion bash
+    Example: eval "$(udrl completion bash)"
     """
     from udrl_launch.cli import cli
 
