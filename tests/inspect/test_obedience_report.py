@@ -149,7 +149,7 @@ def test_figure_shows_the_obeyed_range(tmp_path: Path, obeyed: tuple[float, floa
         example = msgspec.structs.replace(example, by_horizon=[], all_horizons=None)
     ElementTree.fromstring((tmp_path / "pictures" / "both.svg").read_text())
     assert (tmp_path / "pictures" / "one.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
+    with pytest.raises(ConfigError, match=r"ends with .png, .svg or .pdf"):
         draw_obedience(example, tmp_path / "picture.bmp")
 
 

@@ -197,8 +197,8 @@ def test_wrong_extension_is_rejected_before_anything_is_loaded(tmp_path: Path) -
     nowhere = tmp_path / "nowhere"
     for arguments, message in [
         (("play", nowhere, "--video", tmp_path / "film.avi"), "ends with .mp4 or .gif"),
-        (("obedience", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
-        (("plot", nowhere, "--output", tmp_path / "figure.jpg"), "ends with .png, .svg, .pdf"),
+        (("obedience", nowhere, "--output", tmp_path / "figure.jpg"), ".png, .svg or .pdf"),
+        (("plot", nowhere, "--output", tmp_path / "figure.jpg"), ".png, .svg or .pdf"),
     ]:
         with pytest.raises(ConfigError, match=message):
             call(*arguments)
@@ -220,7 +220,7 @@ def test_runs_are_listed_with_state_and_best_return(ended_run: Path) -> None:
     assert summary["best_return"] >= status.final_evaluation.mean
     table = call("runs", ended_run.parent).splitlines()
     assert table[0].split() == [
-        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "because",
+        "state", "environment", "seed", "env", "steps", "best", "return", "changed", "reason",
         "run",
     ]  # fmt: skip
     assert f"{summary['best_return']:.1f}" in table[1]
@@ -264,7 +264,7 @@ def test_several_runs_are_plotted_in_one_figure(ended_run: Path, tmp_path: Path)
     assert picture.read_text().count('id="LineCollection_') == 1
     assert "cart" in picture.read_text()
     assert drawn.tag.endswith("svg")
-    with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
+    with pytest.raises(ConfigError, match=r"ends with .png, .svg or .pdf"):
         compare([ended_run], tmp_path / "picture.bmp")
     with pytest.raises(StoreError, match="give the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")

@@ -195,7 +195,7 @@ def test_custom_path_of_the_figure(run_dir: Path, tmp_path: Path) -> None:
     call("obedience", run_dir, *few, "--output", tmp_path / "pictures" / "it.svg")
     assert (tmp_path / "pictures" / "it.svg").exists()
     assert not (run_dir / "obedience.png").exists()
-    with pytest.raises(ConfigError, match=r"ends with .png, .svg, .pdf"):
+    with pytest.raises(ConfigError, match=r"ends with .png, .svg or .pdf"):
         call("obedience", run_dir, *few, "--output", tmp_path / "it.bmp")
 
 

@@ -104,12 +104,12 @@ def test_end_of_a_run_has_its_reason() -> None:
     console = Console(file=io.StringIO(), width=120)
     with console.capture() as capture:
         console.print(panel(ended))
-    assert "because        reached return 100" in capture.get()
+    assert "reason         reached return 100" in capture.get()
     assert "env steps      12,345; 100 more in evaluations" in capture.get()
     for live in ("per second", "lag", "episodes running"):
         assert live not in capture.get()
     assert "; reached return 100" in line(ended)
-    assert "because" not in line(STATUS)
+    assert "reason" not in line(STATUS)
 
 
 def test_panel_has_the_advice() -> None:

@@ -113,7 +113,7 @@ def panel(status: Status) -> Table:
         add("target", f"mean return {return_text(status.stop_return)} in an evaluation")
     add("env steps", *_separated(_env_steps(status)))
     add("iteration", f"{status.iteration:,}")
-    add("evaluation", *_evaluation(status.evaluation))
+    add("evaluation", *_evaluation(status.evaluation, has_ended=status.state not in _LIVE))
     if status.final_evaluation:
         add("final evaluation", *_evaluation(status.final_evaluation))
     add("replay buffer", *_separated(returns(status)))
@@ -127,7 +127,7 @@ def panel(status: Status) -> Table:
     if status.audit.rate:
         add("audit", *_separated(_audit(status.audit)))
     if status.ended_because:
-        add("because", status.ended_because)
+        add("reason", status.ended_because)
     if status.advice:
         add("advice", status.advice)
     for actor in status.quarantined:
@@ -243,9 +243,9 @@ def evaluation(result: EvaluationStatus | None) -> str:
     return " ".join(_evaluation(result))
 
 
-def _evaluation(result: EvaluationStatus | None) -> list[str]:
+def _evaluation(result: EvaluationStatus | None, *, has_ended: bool = False) -> list[str]:
     if result is None:
-        return ["none yet"]
+        return ["none" if has_ended else "none yet"]
     half = (result.ci95_high - result.ci95_low) / 2
     return [
         f"mean return {interval_text(result.mean, half)}",

@@ -24,7 +24,8 @@ def check_picture_name(picture: Path) -> None:
         ConfigError: the extension is not supported.
     """
     if picture.suffix not in _KINDS:
-        raise ConfigError(f"{picture}: expected a name that ends with {', '.join(_KINDS)}")
+        either = " or ".join([", ".join(_KINDS[:-1]), _KINDS[-1]])
+        raise ConfigError(f"{picture}: expected a name that ends with {either}")
 
 
 def empty(panels: int = 1) -> "tuple[Figure, list[Axes]]":

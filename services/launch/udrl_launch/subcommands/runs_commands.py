@@ -17,7 +17,7 @@ from udrl_proto.text import printable
 from udrl_show import curve
 from udrl_show.display import duration, wrapped
 
-_HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "because", "run"
+_HEAD = "state", "environment", "seed", "env steps", "best return", "changed", "reason", "run"
 
 
 @click.command()
@@ -57,8 +57,8 @@ def runs(folder: Path, as_json: bool) -> int:
 
 def _narrow(row: Sequence[str], width: int) -> list[str]:
     """Return a row of the table as lines for a narrow terminal."""
-    state, environment, seed, steps, best, changed, because, run_dir = row
-    phrases = [f"{state}: {because}" if because else state]
+    state, environment, seed, steps, best, changed, reason, run_dir = row
+    phrases = [f"{state}: {reason}" if reason else state]
     if environment:
         phrases += [environment, f"seed {seed}", f"{steps} env steps", f"best return {best}"]
     phrases.append(f"changed {changed}")
@@ -75,8 +75,8 @@ def _cells(summary: Summary) -> tuple[str, ...]:
     best = "none yet" if summary.best_return is None else return_text(summary.best_return)
     steps = f"{summary.env_steps:,} of {summary.max_env_steps:,}"
     seed = str(summary.seed)
-    because = summary.ended_because.partition(":")[0]  # the rest is printed below
-    return summary.state, summary.environment, seed, steps, best, ago, because, summary.run_dir
+    reason = summary.ended_because.partition(":")[0]  # the rest is printed below
+    return summary.state, summary.environment, seed, steps, best, ago, reason, summary.run_dir
 
 
 @click.command()
