@@ -391,6 +391,9 @@ def test_cursor_reads_the_curve(
     assert final is not None
     expect(caption).to_contain_text("best evaluation", timeout=SOON)
     summary = caption.inner_text()
+    best = re.search(r"best evaluation (\S+ ± \S+) after", summary)
+    assert best is not None
+    expect(page.locator("#facts")).to_contain_text(f"best evaluation{best[1]}")  # the same one
     box = curve.bounding_box()
     assert box is not None
     curve.hover(position={"x": box["width"] - 2, "y": 20})

@@ -21,7 +21,7 @@ const buffer = new Plane($("buffer"), { x: "return", y: "length, steps", label: 
 function showContents(contents) {
   if (!contents.returns.length) return;
   legend($("buffer-legend"), [
-    ["episode, newer ones darker", "dot", "episode"],
+    ["episode, older ones fainter", "dot", "episode"],
     ["outstanding exploratory command", "cross", "explored"],
     ["command of evaluations", "diamond", "chosen"],
   ]);
@@ -39,7 +39,7 @@ function showContents(contents) {
   });
   const held = known.status?.buffer, recent = known.hello?.config.recent_size;
   const best = held ? `The ${number(held.episodes)} best episodes have returns from ${number(held.return_min)} to ${number(held.return_max)}${recent ? `; the newest ${number(recent)} are shown too` : ""}. ` : "";
-  setText($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${count(pairs.length, "exploratory command is", "exploratory commands are")} outstanding.${outside(contents, buffer)}`);
+  setText($("buffer-said"), `${best}Evaluations command ${command(...evaluation)}. ${pairs.length ? count(pairs.length, "exploratory command is", "exploratory commands are") : "No exploratory command is"} outstanding.${outside(contents, buffer)}`);
 }
 
 function showObeyed() {

@@ -21,6 +21,10 @@ export function evaluated(e) {
   return `${number(e.mean, decimals)} ± ${number(half, decimals)}`;
 }
 
+// The evaluation with the highest mean, the final one included; null: there is none.
+export const best = (evaluations, final) =>
+  (final ? [...evaluations, final] : evaluations).reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
+
 export const percent = (share) => `${Math.round(100 * share)} %`;
 
 export function time(s) {

@@ -1,13 +1,18 @@
 // Charts of the run's iterations: returns, speed, loss, admitted episodes.
 import { Chart, merge, smooth, thin } from "./charts.js";
-import { count, evaluated, number } from "./format.js";
+import { best, count, evaluated, number } from "./format.js";
 import { $, legend } from "./page.js";
 
 // Iterations that exploratory returns are averaged over.
 const WINDOW = 10;
 
 const steps = (n) => count(n, "env step");
-const commanded = (row) => (row.commanded_min == null ? "" : `, commanded ${number(row.commanded_min)} to ${number(row.commanded_max)}`);
+
+function commanded({ commanded_min: low, commanded_max: high }) {
+  if (low == null) return "";
+  const [from, to] = [number(low), number(high)];
+  return `, commanded ${from === to ? from : `${from} to ${to}`}`;
+}
 
 export class Learning {
   constructor() {
@@ -66,12 +71,11 @@ export class Learning {
     );
     const columns = ["mean", "high", "low", "explored", "average", "most", "least", "final"].map(column);
     columns.push(xs.map(() => target ?? undefined));
-    const last = rows.at(-1), all = final ? [...evaluations, final] : evaluations;
-    const best = all.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
+    const last = rows.at(-1), highest = best(evaluations, final);
     const explored = (row) => `exploratory episodes ${number(row.average)}${commanded(row)}`;
     const place = (name, e, x) => `${name} ${evaluated(e)}${e.env_steps < x ? ` (after ${number(e.env_steps)})` : ""}`;
     this.curve.show(xs, columns,
-      `After ${steps(last.env_steps)}: ${explored(last)}${best ? `; best evaluation ${evaluated(best)} after ${number(best.env_steps)}` : "; no evaluation yet"}.`,
+      `After ${steps(last.env_steps)}: ${explored(last)}${highest ? `; best evaluation ${evaluated(highest)} after ${number(highest.env_steps)}` : "; no evaluation yet"}.`,
       (i) => {
         const until = (e) => e.env_steps <= xs[i], row = rows.findLast(until), made = evaluations.findLast(until);
         const parts = [

@@ -1,5 +1,5 @@
 // The state of the run: the header, its numbers, the actors and what to do next.
-import { count, evaluated, number, time } from "./format.js";
+import { best, count, evaluated, number, time } from "./format.js";
 import { $, facts, lines, made, setText } from "./page.js";
 
 export const STATES = { running: "Running", finishing: "Final evaluation", ended: "Ended", failed: "Failed", stopped: "Stopped" };
@@ -30,9 +30,8 @@ export function showRun(known) {
   showProgress(status);
   showScore(status);
   const buffer = status.buffer;
-  const best = known.evaluations.reduce((b, e) => (b && b.mean >= e.mean ? b : e), null);
   facts($("facts"), [
-    ["best evaluation", evaluated(best)],
+    ["best evaluation", evaluated(best(known.evaluations, status.final_evaluation))],
     ["best return in the buffer", number(buffer.return_max)],
     ["mean return of the buffer", number(buffer.return_mean)],
     ...(status.state === "running" || status.state === "finishing" ? [["env steps/s", number(status.env_steps_per_s, 0)]] : []),
