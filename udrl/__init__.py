@@ -17,6 +17,7 @@ Table 2 hyperparameters           :mod:`udrl.config`, :mod:`udrl.setting_groups`
 """
 
 from importlib.metadata import entry_points
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from udrl.version import __version__ as __version__
@@ -39,4 +40,6 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *entry_points(group=_GROUP).names})
+    modules = [name for name, value in globals().items() if isinstance(value, ModuleType)]
+    special = [name for name in globals() if name.startswith("__")]
+    return sorted({*__all__, *modules, *special})

@@ -105,6 +105,7 @@ def test_missing_folder_is_rejected(tmp_path: Path, policy: Policy) -> None:
 def test_package_exports_nothing_else() -> None:
     assert {"train", "load", "__version__"} <= set(dir(udrl))
     assert set(udrl.__all__) <= set(dir(udrl))
+    assert not {"Any", "TYPE_CHECKING", "entry_points"} & set(dir(udrl))
     with pytest.raises(AttributeError, match="'udrl' has no attribute 'loads'"):
         udrl.loads  # noqa: B018
 
