@@ -296,6 +296,13 @@ def test_folder_of_runs_is_plotted_as_means_over_seeds(ended_run: Path, tmp_path
     assert final is not None
     assert (final.low, final.mean, final.high) == (min(ends), sum(ends) / 2, max(ends))
 
+    # A seed counts once: with another budget it has a line of its own.
+    shorter = Settings(small(seed=7), Budget(max_env_steps=1000), Fleet(actors=1))
+    run_training(shorter, runs / "cart-7-shorter", threading.Event(), in_process=True)
+    lines, _ = curve._lines([runs])
+    assert sorted(len(line) for line in lines) == [1, 1, 2]
+    assert [one.seed for line in lines if len(line) == 2 for one in line] == [7, 8]
+
     # Listed individually, each run has its own line.
     call("plot", runs / "cart-7", runs / "cart-8", "--output", figure)
     assert [name in figure.read_text() for name in ("cart-7", "cart-8", "seeds")] == [

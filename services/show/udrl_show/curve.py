@@ -54,12 +54,14 @@ class Curve(NamedTuple):
         run_dir: its directory.
         rows: its metrics.
         settings: its settings, without the seed; empty if it has no store.
+        seed: its seed; None if it has no store.
         final: its final evaluation. None: there is none.
     """
 
     run_dir: Path
     rows: Sequence[Row]
     settings: dict[str, Any]
+    seed: int | None
     final: EvaluationRow | None
 
     @property
@@ -144,8 +146,8 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
             name = names_of[line[0].run_dir] if len(line) == 1 else _label(line, differing)
             _draw_line(axes, line, x, name, rank)
         several = any(len(line) > 1 for line in held)
-        interval = "mean over seeds and range" if several else "95 % interval"
-        axes.set(xlabel=_X[x][0], ylabel=f"mean return of an evaluation, {interval}")
+        interval = "mean and range over seeds" if several else "95 % interval"
+        axes.set(xlabel=_X[x][0], ylabel=f"mean return ({interval})")
         axes.set(title=environment)
         axes.legend(fontsize="small", handlelength=3.5)
     pictures.save(figure, picture)
@@ -174,10 +176,11 @@ def read_curve(run_dir: Path) -> Curve:
         with closing(Store(run_dir, read_only=True)) as store:
             config = store.fact("hello", Hello).config
             settings = {n: v for n, v in flat(config).items() if n != "seed"}
-            return Curve(run_dir, rows, settings, store.last_evaluation(is_final=True))
+            final = store.last_evaluation(is_final=True)
+            return Curve(run_dir, rows, settings, config.seed, final)
     except StoreError as error:
         log.debug("%s is drawn without its store: %s", run_dir, error)
-        return Curve(run_dir, rows, {}, None)
+        return Curve(run_dir, rows, {}, None, None)
 
 
 def _rows(file: TextIO) -> Iterator[dict[str, str]]:
@@ -195,7 +198,7 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
     for place in places:
         is_run = any((place / name).exists() for name in (_METRICS, STORE_FILE))
         below = [] if is_run else list(run_directories(place))
-        by_settings: dict[bytes, Line] = {}
+        by_settings: dict[bytes, list[Line]] = {}
         for run_dir in below or [place]:
             if run_dir.resolve() in drawn:
                 continue
@@ -213,11 +216,20 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
                 missing.append(f"{run_dir}: no evaluation yet")
             else:
                 key = msgspec.json.encode(curve.settings, order="sorted")
-                by_settings.setdefault(key, []).append(curve)
-        lines += by_settings.values()
+                _add(by_settings.setdefault(key, []), curve)
+        lines += [line for same in by_settings.values() for line in same]
     if not lines:
         raise StoreError(f"nothing to draw: {'; '.join(missing)}")
     return lines, missing
+
+
+def _add(lines: list[Line], curve: Curve) -> None:
+    """Add a run to the first line without its seed, e.g. to a new one if its budget differs."""
+    for line in lines:
+        if curve.seed not in {other.seed for other in line}:
+            line.append(curve)
+            return
+    lines.append([curve])
 
 
 def _names(curves: Sequence[Curve]) -> list[str]:
