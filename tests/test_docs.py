@@ -40,7 +40,7 @@ from udrl_replay.store import COLUMNS, Store
 
 
 def test_studies_list_the_dependencies_of_other_algorithms() -> None:
-    text = " ".join(section("docs/studies.md", "## Participants").split())
+    text = " ".join(section("docs/studies.md", "## Algorithms").split())
     needs = text[text.index("DQN, A2C and PPO are") :]
     for words in ("the extra `studies`", "discrete actions and one vector or image"):
         assert words in needs
