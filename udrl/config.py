@@ -225,10 +225,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigError(
-            f"configuration file {path}: {error}; name a readable TOML file"
+            f"configuration file {path}: {error.strerror}; name a readable TOML file"
         ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"configuration file {path}: {error}; name a TOML file") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
             f"configuration file {path} is not TOML: {error}; correct that line"

@@ -37,10 +37,10 @@ def test_new_file_has_its_facts(tmp_path: Path) -> None:
 
 def test_failed_creation_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def replace(self: Path, target: Path) -> Path:
-        raise OSError("no space left")
+        raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(Path, "replace", replace)
-    with pytest.raises(StoreError, match=r"no space left; use a writable directory"):
+    with pytest.raises(StoreError, match=r": no space left; free some disk space"):
         Store.create(tmp_path)
     with pytest.raises(StoreError, match="holds no run"):
         Store(tmp_path)

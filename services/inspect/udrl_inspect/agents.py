@@ -91,8 +91,8 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
             )
         if found is None or not found.weights:
             raise StoreError(
-                f"weights {version!r} are not kept in {run_dir}; choose one of "
-                f"{store.versions_kept()}"
+                f"weights version {version} is not kept in {run_dir}; choose latest, best or one "
+                f"of {', '.join(map(str, store.versions_kept()))}"
             )
         held = store.buffer(progress.iteration)
         return Agent(

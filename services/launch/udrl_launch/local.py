@@ -69,8 +69,8 @@ class Processes:
             except OSError as error:
                 self._supervisor.end()
                 raise UdrlError(
-                    f"cannot start {name}: {error}; free memory, processes or open files, or "
-                    f"raise their limits"
+                    f"cannot start {name}: {error.strerror}; free memory, processes or open files, "
+                    f"or raise their limits"
                 ) from error
 
         start(

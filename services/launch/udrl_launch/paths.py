@@ -35,7 +35,9 @@ def new_run_dir(name: str) -> Path:
             else:
                 return path
     except OSError as error:
-        raise ConfigError(f"{runs}: {error}; choose another directory with --run-dir") from error
+        raise ConfigError(
+            f"{runs}: {error.strerror}; choose another directory with --run-dir"
+        ) from error
 
 
 def extend_module_path() -> None:

@@ -171,7 +171,7 @@ def write_config(run_dir: Path, config: Config, budget: Budget) -> None:
         write_atomically(path, ("\n".join(lines) + "\n").encode())
     except OSError as error:
         what_to_do = remedy(error, "use a writable directory")
-        raise StoreError(f"{path} cannot be written: {error}; {what_to_do}") from error
+        raise StoreError(f"{path} cannot be written: {error.strerror}; {what_to_do}") from error
 
 
 def as_toml(value: object) -> str:

@@ -277,7 +277,8 @@ def _sync(folder: Path) -> None:
 
 def _unusable(run_dir: Path, error: OSError | sqlite3.Error) -> StoreError:
     what_to_do = remedy(error, "use a writable directory")
-    return StoreError(f"run directory {run_dir}: {error}; {what_to_do}")
+    reason = error.strerror if isinstance(error, OSError) else error
+    return StoreError(f"run directory {run_dir}: {reason}; {what_to_do}")
 
 
 def is_locked(run_dir: Path) -> bool:

@@ -66,6 +66,6 @@ def unwritable(path: Path, error: OSError) -> StoreError:
     """Return the error for a file beside the store."""
     what_to_do = remedy(error, _PERMIT if error.errno in _FORBIDDEN else _CHECK)
     return StoreError(
-        f"{path} cannot be written: {error}; {what_to_do}, and restart with --resume; nothing is "
-        f"lost"
+        f"{path} cannot be written: {error.strerror}; {what_to_do}, and restart with --resume; "
+        f"nothing is lost"
     )
