@@ -31,14 +31,14 @@ class MeasuredRun(NamedTuple):
     Attributes:
         speed: env steps per second of the whole run.
         later: env steps per second of the second half, when the board has started.
-        asked: number of requests to the board.
+        requests: number of requests to the board.
         cpu_s: CPU seconds of the board, including its start.
         start_s: CPU seconds of the board's start.
     """
 
     speed: float
     later: float
-    asked: int = 0
+    requests: int = 0
     cpu_s: float = 0.0
     start_s: float = 0.0
 
@@ -70,18 +70,18 @@ def _watch(run_dir: Path, training: subprocess.Popen[bytes]) -> tuple[int, float
     assert board.stdout is not None
     address = board.stdout.readline().split()[1]
     start_s = _cpu_s(board.pid)
-    asked, after, run_id = 0, -1, ""
+    requests, after, run_id = 0, -1, ""
     while _is_running(training, 1.0):
         url = f"{address}news?after={after}&run={run_id}"
         with urllib.request.urlopen(url, timeout=20) as answer:  # noqa: S310 - our own
             news = json.load(answer)
-        asked += 1
+        requests += 1
         run_id = news["hello"]["run_id"] if news["hello"] else run_id
         after = news["iterations"][-1]["iteration"] if news["iterations"] else after
     cpu_s = _cpu_s(board.pid)
     board.terminate()
     board.wait(20)
-    return asked, cpu_s, start_s
+    return requests, cpu_s, start_s
 
 
 def _is_running(training: subprocess.Popen[bytes], seconds: float) -> bool:
@@ -114,7 +114,7 @@ def main() -> None:
             figures = f"{run.speed:,.0f} env steps/s, second half {run.later:,.0f}"
             if watched:
                 figures += (
-                    f"; {run.asked} requests to the board, which used {run.cpu_s:.1f} s of CPU, "
+                    f"; {run.requests} requests to the board, which used {run.cpu_s:.1f} s of CPU, "
                     f"{run.start_s:.1f} s of them to start"
                 )
             print(f"{number + 1}: {'with' if watched else 'without'}: {figures}", flush=True)

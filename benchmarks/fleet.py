@@ -70,7 +70,7 @@ class LogicalActor:
     commands: deque[Command] = field(default_factory=deque)
     verb: str = ""
     payload: bytes = b""
-    asked_at: float = 0.0
+    requested_at: float = 0.0
     answered: bool = True
     query: int = 0
 
@@ -177,7 +177,7 @@ class LogicalFleet:
 
     def _send(self, actor: LogicalActor, verb: str, message: Message) -> None:
         actor.verb, actor.payload = verb, encode(message)
-        actor.asked_at, actor.answered = time.monotonic(), False
+        actor.requested_at, actor.answered = time.monotonic(), False
         self._ask(actor)
 
     def _ask(self, actor: LogicalActor) -> None:
@@ -212,7 +212,7 @@ class LogicalFleet:
             return actor, 0.5
         actor.query += 1
         actor.answered = True
-        took = time.monotonic() - actor.asked_at
+        took = time.monotonic() - actor.requested_at
         if actor.verb == verbs.EPISODE.name:
             decode(answer, EpisodeReply)
             self._episode_s.append(took)

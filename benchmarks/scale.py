@@ -127,7 +127,7 @@ UNITS = (
     "resident at first, MB",
     "resident at last, MB",
     "iterations",
-    "queries asked again",
+    "queries sent again",
 )
 
 

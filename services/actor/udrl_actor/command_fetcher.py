@@ -129,24 +129,24 @@ class CommandFetcher(threading.Thread):
                 self._changed.notify_all()
 
     def _work(self) -> None:
-        ask_at = 0.0
+        request_at = 0.0
         rate_at, rate = time.monotonic(), 0.0
         while self._alive():
             with self._changed:
                 wants = self._free > len(self._assignments)
-                pause = ask_at - time.monotonic() if wants else 0.5
+                pause = request_at - time.monotonic() if wants else 0.5
                 if pause > 0 and not (wants and self._has_news):
                     self._changed.wait(min(pause, 0.5))
                 if self._has_news:
-                    ask_at, self._acknowledged = 0.0, False
+                    request_at, self._acknowledged = 0.0, False
                 wanted = self._free - len(self._assignments)
-            if wanted > 0 and time.monotonic() >= ask_at:
+            if wanted > 0 and time.monotonic() >= request_at:
                 now = time.monotonic()
                 if now - rate_at >= 1.0:
                     with self._changed:
                         rate, self._steps = self._steps / (now - rate_at), 0
                     rate_at = now
-                ask_at = self._fetch(wanted, rate)
+                request_at = self._fetch(wanted, rate)
 
     @property
     def _has_news(self) -> bool:

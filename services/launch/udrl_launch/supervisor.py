@@ -190,7 +190,7 @@ class Supervisor:
             child.start()
 
     def _is_missing(self, child: Child, now: float) -> bool:
-        """Return whether a child has ended although the run goes on."""
+        """Return whether a child has ended although the run continues."""
         return self._first_done is None and now - child.done_at > _AHEAD_S
 
     @property

@@ -123,8 +123,8 @@ class Dispatcher:
     def join(self, request: JoinRequest, now: float) -> None:
         """Add an actor; one that rejoins loses the commands that it held."""
         self.remove_actor(request.id)
-        asked = CommandsRequest(actor=request.id, wanted=0)
-        self.actors[request.id] = Actor(request, now, asked)
+        nothing = CommandsRequest(actor=request.id, wanted=0)
+        self.actors[request.id] = Actor(request, now, nothing)
 
     def remove_actor(self, name: str) -> list[Outstanding]:
         """Remove an actor and return the commands that it held, which are assigned again."""

@@ -46,8 +46,8 @@ def resume(
     store = Store(run_dir)
     with closed_on_error(store):
         hello = store.fact("hello", Hello)
-        held, asked = flat(hello.config), flat(resolve_as(hello.config, config))
-        different = [f"{k} = {held[k]!r}, not {asked[k]!r}" for k in held if held[k] != asked[k]]
+        held, given = flat(hello.config), flat(resolve_as(hello.config, config))
+        different = [f"{k} = {held[k]!r}, not {given[k]!r}" for k in held if held[k] != given[k]]
         if different:
             raise OtherConfiguration(
                 f"{run_dir} belongs to a run with {'; '.join(different)}; use its "
