@@ -49,12 +49,13 @@ def check(
 
 
 def _lines(found: Check) -> list[tuple[str, str]]:
+    observations = " ".join(found.declared_observations.split())  # NumPy aligns bounds in columns
     limit = f"at most {found.max_episode_steps:,} steps"
     if found.max_return is not None:
         limit += f", return at most {found.max_return:g}"
     lines = [
         ("environment", found.environment),
-        ("observations", f"{found.declared_observations}; read as {found.observations}"),
+        ("observations", f"{observations}; read as {found.observations}"),
         ("actions", f"{found.declared_actions}; read as {found.actions}"),
         ("episodes", limit),
         (
