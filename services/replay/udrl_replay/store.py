@@ -124,13 +124,16 @@ class Store(Database):
 
     def admit(self, iteration: int, ids: Iterable[int], evicted: Iterable[int]) -> None:
         """Record the episodes that an iteration added to the buffer and evicted from it."""
-        columns = SEALED["episodes"]
-        for column, changed in (("admitted", ids), ("evicted", evicted)):
-            self._db.executemany(
-                f"UPDATE episodes SET {column} = ?1, "  # noqa: S608
-                f"seal = seal({columns.replace(column, '?1')}) WHERE id = ?2",
-                ((iteration, i) for i in changed),
-            )
+        self._db.executemany(
+            "UPDATE episodes SET admitted = ?1, seal = seal("
+            "id, episode_return, length, digest, ?1, evicted, checksum) WHERE id = ?2",
+            ((iteration, i) for i in ids),
+        )
+        self._db.executemany(
+            "UPDATE episodes SET evicted = ?1, seal = seal("
+            "id, episode_return, length, digest, admitted, ?1, checksum) WHERE id = ?2",
+            ((iteration, i) for i in evicted),
+        )
 
     def remove_episodes(self, ids: Iterable[int]) -> None:
         """Delete episodes."""
