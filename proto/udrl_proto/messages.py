@@ -109,6 +109,9 @@ class JoinRequest(Message, frozen=True, kw_only=True):
 
     Attributes:
         id: unique to this process.
+        host: name of its machine.
+        pid: id of its process.
+        software: version of its package.
         environments: number of environments that an actor steps; 0 for a learner.
         numerics_class: digest of the service's numerics probe.
         environment: specification of the service's own environment; None if it has none.

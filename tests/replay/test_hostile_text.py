@@ -66,8 +66,9 @@ def test_hostile_text_forges_no_log_line(
     with caplog.at_level(logging.INFO, "udrl"):
         status = send_hostile_text(transport)
     logged = [record.getMessage() for record in caplog.records]
-    for part in ("joined from no", " connected", " disconnected", "invalid commands: ",
-                 "refused join: ", "failed on command", "failed 3 times"):  # fmt: skip
+    for part in ("joined from no", ", process ", " connected", " disconnected",
+                 "invalid commands: ", "refused join: ", "failed on command",
+                 "failed 3 times"):  # fmt: skip
         assert any(part in line for line in logged), part
     assert [line for line in logged if not line.isprintable()] == []
     assert status.state == "failed"

@@ -280,7 +280,8 @@ class ReplayService:
 
     def _join(self, request: JoinRequest, now: float) -> JoinReply:
         self._admission.join(request, now)
-        log.info("%s %s joined from %s", request.role, request.id, printable(request.host))
+        where = printable(f"{request.host}, process {request.pid}, udrl {request.software}")
+        log.info("%s %s joined from %s", request.role, request.id, where)
         return JoinReply()
 
     def _commands(self, request: CommandsRequest, now: float) -> CommandsReply:
