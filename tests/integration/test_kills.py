@@ -21,7 +21,7 @@ from whole_run import (
     wait_for,
 )
 
-BUDGET = 9000
+BUDGET = 5000
 
 
 @pytest.fixture(scope="module")
