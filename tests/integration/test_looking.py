@@ -398,7 +398,7 @@ def test_kept_versions_can_act_and_others_are_missing(tmp_path: Path) -> None:
         )  # fmt: skip
         assert played["weights_version"] == version
     gone = min(evaluated - set(ended.weights_kept))
-    with pytest.raises(StoreError, match="are not kept"):
+    with pytest.raises(StoreError, match=f"version {gone} is not kept in "):
         call("evaluate", run_dir, "--weights", gone)
     assert f"{len(ended.weights_kept)} versions: " in call("status", run_dir)
 
