@@ -62,7 +62,9 @@ def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job
             variant=PAPER if paper else "",
         )
     chosen = tuned(participant, task.environment)
-    config = plan.baseline(task, seed, **chosen.networks)
+    given = plan.assigned(())
+    networks = {name: value for name, value in chosen.networks.items() if name not in given}
+    config = plan.baseline(task, seed, **networks)
     return baseline(participant, config, chosen.hyperparameters, plan.steps(task, participant))
 
 

@@ -10,6 +10,7 @@ from udrl_experiments.protocol import DEFAULT_PARTICIPANTS, TASKS, StudyPlan, Ta
 from udrl_experiments.provenance import Machine
 from udrl_experiments.statistics import CurvePoint, Reached
 from udrl_experiments.study import StudyFolders
+from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read
 
 #: Two evaluations suffice for a curve.
@@ -29,6 +30,16 @@ def test_papers_preset_is_a_participant_with_the_papers_settings(
     del shipped["max_env_steps"]
     assert settings.items() >= shipped.items()
     assert participant.name != job(task, PLAN, "UDRL", 1).name
+
+
+def test_tuned_networks_are_used_unless_others_are_given() -> None:
+    task = TASKS["lander"]
+    found = tuned("A2C", task.environment)
+    plain = job(task, PLAN, "A2C", 1)
+    assert list(plain.config.network.hidden) == found.networks["hidden"]
+    assert plain.hyperparameters == found.hyperparameters
+    given = job(task, PLAN._replace(assignments=("hidden=[8, 8]",)), "A2C", 1)
+    assert given.config.network.hidden == (8, 8)
 
 
 @each_task

@@ -57,7 +57,7 @@ def test_comparison_is_interrupted_and_resumed(
     whole = ("--seeds", "1-2", "--side-by-side", "1")
     begun = cli("study", "lander", "--folder", str(tmp_path), "--max-env-steps", str(STEPS),
                 *SETTINGS, *whole)  # fmt: skip
-    wait_for(lambda: list(tmp_path.glob("runs/udrl-*/done.json")), "the first run", 180)
+    wait_for(lambda: list(tmp_path.glob("runs/udrl-*/done.json")), "the first run", 60)
     begun.process.send_signal(signal.SIGTERM)
     code, _, error = begun.finish()
     assert code == 128 + signal.SIGTERM, error
