@@ -65,10 +65,9 @@ def print_table(table: "Table") -> None:
     if sys.stdout.isatty():
         Console().print(table)
         return
-    console = Console(file=io.StringIO(), width=_WIDE)
-    with console.capture() as capture:
-        console.print(table)
-    for line in capture.get().splitlines():
+    text = io.StringIO()
+    Console(file=text, width=_WIDE).print(table)
+    for line in text.getvalue().splitlines():
         click.echo(line.rstrip())
 
 
