@@ -112,6 +112,8 @@ def test_invalid_exports_are_rejected(ended_run: Path, tmp_path: Path) -> None:
         export(ended_run, "--folder", ended_run)
     with pytest.raises(ConfigError, match="--public needs --hub REPO_ID"):
         export(ended_run, "--onnx", tmp_path / "agent.onnx", "--public")
+    with pytest.raises(ConfigError, match=r"agent\.bin: expected a name that ends with \.onnx"):
+        export(tmp_path / "no run", "--onnx", tmp_path / "agent.bin")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="choose a writable file"):
         export(ended_run, "--onnx", tmp_path / "file" / "agent.onnx")

@@ -23,7 +23,7 @@ class UnresponsiveServices:
         """Start no process."""
         store.close()
 
-    def check(self) -> None:
+    def failure(self) -> None:
         """Report no error."""
 
     def end(self) -> None:

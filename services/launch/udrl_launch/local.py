@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from udrl.errors import UdrlError
+from udrl.errors import RunFailed, UdrlError
 from udrl_inspect.address import Address, from_this_machine
 from udrl_launch import roles
 from udrl_launch.process import switch_threads_soon
@@ -31,8 +31,8 @@ class Local(Protocol):
         """Whether all have ended without an error."""
         ...
 
-    def check(self) -> None:
-        """Restart dead services; raise the first unrecoverable error."""
+    def failure(self) -> BaseException | None:
+        """Restart dead services; return the first unrecoverable error."""
         ...
 
     def note(self, status: Status) -> None:
@@ -61,6 +61,7 @@ class Processes:
         fleet, environment = settings.fleet, settings.config.environment
         store.close()
         self._supervisor = Supervisor(run_dir / "logs")
+        self._failure: RunFailed | None = None
         secured = ("--keys", str(keys)) if keys else ()
 
         def start(name: str, *arguments: str) -> None:
@@ -93,9 +94,14 @@ class Processes:
         """Whether all have ended without an error."""
         return self._supervisor.done
 
-    def check(self) -> None:
-        """Restart dead services; raise the first unrecoverable error."""
-        self._supervisor.check()
+    def failure(self) -> BaseException | None:
+        """Restart dead services; return the first unrecoverable error."""
+        if self._failure is None:
+            try:
+                self._supervisor.check()
+            except RunFailed as failure:
+                self._failure = failure
+        return self._failure
 
     def note(self, status: Status) -> None:
         """Record the run's progress, to give up on services that die without progress."""
@@ -162,7 +168,7 @@ class Threads:
         def target() -> None:
             try:
                 service()
-            except BaseException as error:  # noqa: BLE001 - raised by check() in the main thread
+            except BaseException as error:  # noqa: BLE001 - the main thread raises it
                 self._errors.append(error)
 
         thread = threading.Thread(target=target, name=name, daemon=True)
@@ -178,10 +184,9 @@ class Threads:
             return True
         return not any(thread.is_alive() for thread in self._threads)
 
-    def check(self) -> None:
-        """Raise the first error of a service."""
-        if self._errors:
-            raise self._errors[0]
+    def failure(self) -> BaseException | None:
+        """Return the first error of a service."""
+        return self._errors[0] if self._errors else None
 
     def note(self, status: Status) -> None:
         """Do nothing: threads are not restarted."""

@@ -153,6 +153,9 @@ def run_training(
     try:
         with suppress(Interrupted):  # while it connects to the replay service
             _watch(services, address, stop, watcher)
+        failure = services.failure()
+        if failure is not None:
+            raise failure
     finally:
         services.end()
     if stop.is_set():
@@ -165,15 +168,12 @@ def run_training(
 def _watch(
     services: Local, address: Address, stop: threading.Event, watcher: Watcher | None
 ) -> None:
-    """Show the status until the services are done or ``stop`` is set."""
-    stopped = _StoppedOrFailed(services, stop)
-    with connected("observer", address, stopped) as (transport, hello):
-        client = ReplayClient(transport, hello.run_id, "the display", stopped)
+    """Show the status until the services are done, one has failed, or ``stop`` is set."""
+    over = _Over(services, stop)
+    with connected("observer", address, over) as (transport, hello):
+        client = ReplayClient(transport, hello.run_id, "the display", over)
         requested = time.monotonic() - _POLL_S
-        while not stop.wait(_CHECK_S):
-            services.check()
-            if services.done:
-                return
+        while not over.wait(_CHECK_S):
             if time.monotonic() - requested < _POLL_S:
                 continue
             requested = time.monotonic()
@@ -187,8 +187,8 @@ def _watch(
                 watcher.show(status)
 
 
-class _StoppedOrFailed(threading.Event):
-    """Set when the run is stopped or done; raises if a service has failed. Ends waits."""
+class _Over(threading.Event):
+    """Set when the services are done, one has failed, or ``stop`` is set. Ends waits."""
 
     def __init__(self, services: Local, stop: threading.Event) -> None:
         super().__init__()
@@ -196,8 +196,8 @@ class _StoppedOrFailed(threading.Event):
         self._stop_event = stop
 
     def is_set(self) -> bool:
-        self._services.check()
-        return self._stop_event.is_set() or self._services.done
+        services = self._services
+        return self._stop_event.is_set() or services.failure() is not None or services.done
 
     def wait(self, timeout: float | None = None) -> bool:
         return self._stop_event.wait(timeout) or self.is_set()

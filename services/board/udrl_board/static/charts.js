@@ -4,6 +4,8 @@ import { made, setText } from "./page.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 
 const MOST_POINTS = 1500;
+// Distances between the ticks of an axis of counts, e.g. env steps.
+const WHOLE = [...Array(15).keys()].flatMap((power) => [1, 2, 5].map((m) => m * 10 ** power));
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const faded = (name, share) => `color-mix(in srgb, ${colour(name)} ${share}%, transparent)`;
@@ -43,7 +45,7 @@ export function merge(...tables) {
 }
 
 export class Chart {
-  // lines: [{colour, width?, dash?, points?, hollow?, pale?, quiet?}], quiet: without a dot at the cursor;
+  // lines: [{colour, width?, dash?, points?, hollow?, pale?, quiet?, counts?}], quiet: without a dot at the cursor;
   // bands: [[upper, lower, colour]] by the lines' numbers.
   constructor(place, said, lines, bands = []) {
     Object.assign(this, { place, said, lines, bands });
@@ -106,7 +108,10 @@ export class Chart {
         width: this.place.clientWidth,
         height: this.height,
         scales: { x: { time: false } },
-        axes: [axis, { ...axis, size: 56, space: 24 }],
+        axes: [
+          { ...axis, incrs: WHOLE },
+          { ...axis, size: 56, space: 24, ...(this.lines.every((line) => line.counts) && { incrs: WHOLE }) },
+        ],
         series: [
           {},
           ...this.lines.map((line) => ({

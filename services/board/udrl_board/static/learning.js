@@ -29,7 +29,7 @@ export class Learning {
     ], [[1, 2, "evaluation"], [5, 6, "commanded"]]);
     this.speed = new Chart($("speed"), $("speed-said"), [{ colour: "evaluation" }]);
     this.loss = new Chart($("loss"), $("loss-said"), [{ colour: "evaluation" }]);
-    this.admitted = new Chart($("admitted"), $("admitted-said"), [{ colour: "evaluation" }]);
+    this.admitted = new Chart($("admitted"), $("admitted-said"), [{ colour: "evaluation", counts: true }]);
   }
 
   show({ iterations, evaluations, status }) {
