@@ -28,18 +28,23 @@ _FILES = {
 }
 
 
-def comparison(name: str, plan: StudyPlan, participants: Sequence[Participant]) -> Study:
+def comparison(name: str, plan: StudyPlan, participants: Mapping[Participant, int | None]) -> Study:
     """Return the study ``lander`` (Figure 4a), ``takecover`` (4b) or ``sparse`` (5).
 
     Args:
         name: name of the task.
         plan: seeds and steps.
-        participants: one line of the figure each; duplicates are ignored.
+        participants: one line of the figure each, with the env steps of its runs. None: the plan's.
     """
     task = TASKS[name]
     jobs = [
-        job(task, plan, participant, seed)
-        for participant in dict.fromkeys(participants)
+        job(
+            task,
+            plan if steps is None else plan._replace(max_env_steps=steps),
+            participant,
+            seed,
+        )
+        for participant, steps in participants.items()
         for seed in plan.seeds_of_runs()
     ]
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 #: Styles that are the same in every figure, by agent or algorithm. UDRL is green, as in the paper.
 _OWN_STYLES = {"UDRL": 0, "DQN": 1, "A2C": 2, "PPO": 3, "UDRL-paper": 4}
 
+#: Ratio of the lengths of two lines from which on the shorter is too small on a linear axis.
+_MUCH_LONGER = 5
+
 _AXES = {"env_steps": ("env steps (millions)", 1e6), "wall_s": ("wall time (minutes)", 60.0)}
 
 
@@ -33,6 +36,8 @@ def learning_curves(
     references: Mapping[str, float] | None = None,
 ) -> "Figure":
     """Draw mean returns with 95 % bootstrap intervals (Figures 4 and 5), one line per agent.
+
+    The x axis is logarithmic if one line is much longer than another.
 
     Args:
         points: at least one point; those of an agent in the order of env steps.
@@ -69,6 +74,10 @@ def learning_curves(
         # Ten markers per line, shifted so that they do not hide each other.
         step = max(1, len(line) // 10)
         axes.plot(at, mean, label=label, markevery=(step * rank // len(lines), step), **style)
+    ends = [getattr(line[-1], x) for line in lines.values()]
+    if max(ends) > _MUCH_LONGER * min(ends):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
     _legend(figure, axes, "mean over seeds, 95 % bootstrap interval")
     return figure
 

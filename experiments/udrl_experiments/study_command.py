@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import click
+from click.shell_completion import CompletionItem
 
 from udrl.errors import ConfigError
 from udrl_experiments.comparison import comparison
@@ -31,6 +32,28 @@ from udrl_launch.process import log_to_stderr, run_service
 from udrl_launch.subcommands.options import FILE, STEPS
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+Participants = tuple[tuple[Participant, int | None], ...]
+
+
+class _Entry(click.ParamType):  # type: ignore[type-arg]
+    """A participant of a comparison, alone or with its number of env steps: ``A2C=3M``."""
+
+    name = "algorithm"
+    _names = click.Choice(get_args(Participant))
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return self._names.shell_complete(ctx, param, incomplete)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Participant, int | None]:
+        if isinstance(value, tuple):  # converted already
+            return value
+        name, separator, steps = str(value).partition("=")
+        participant: Any = self._names.convert(name, param, ctx)
+        return participant, STEPS.convert(steps, param, ctx) if separator else None
 
 
 _FOLDER = click.option(
@@ -87,9 +110,11 @@ def _tasks(*default: str) -> Callable[[Decorated], Decorated]:
 def _participants(command: Decorated) -> Decorated:
     """Add the option ``--algorithm`` of comparisons."""
     return click.option(
-        "--algorithm", "participants", multiple=True, type=click.Choice(get_args(Participant)),
+        "--algorithm", "participants", multiple=True, type=_Entry(),
+        metavar=f"{'|'.join(get_args(Participant))}[=STEPS]",
         default=DEFAULT_PARTICIPANTS, show_default=True,
-        help="Algorithm to run. May be repeated. UDRL-paper is UDRL with the preset ENV-paper.",
+        help="Algorithm to run, e.g. A2C, or A2C=3M for another number of env steps. May be "
+        "repeated. UDRL-paper is UDRL with the preset ENV-paper.",
     )(command)  # fmt: skip
 
 
@@ -145,36 +170,36 @@ def show(names: tuple[str, ...], folder: Path) -> int:
 @_options
 @_runs_from
 @_participants
-def lander(participants: tuple[Participant, ...], **options: Any) -> int:
+def lander(participants: Participants, **options: Any) -> int:
     """Figure 4a: UDRL, DQN and A2C on LunarLander.
 
     Example: udrl study lander --algorithm UDRL --algorithm UDRL-paper
     """
-    return _run(lambda plan: comparison("lander", plan, participants), **options)
+    return _run(lambda plan: comparison("lander", plan, dict(participants)), **options)
 
 
 @study.command()
 @_options
 @_runs_from
 @_participants
-def takecover(participants: tuple[Participant, ...], **options: Any) -> int:
+def takecover(participants: Participants, **options: Any) -> int:
     """Figure 4b: UDRL, DQN and A2C on TakeCover.
 
     Example: udrl study takecover --algorithm UDRL
     """
-    return _run(lambda plan: comparison("takecover", plan, participants), **options)
+    return _run(lambda plan: comparison("takecover", plan, dict(participants)), **options)
 
 
 @study.command()
 @_options
 @_runs_from
 @_participants
-def sparse(participants: tuple[Participant, ...], **options: Any) -> int:
+def sparse(participants: Participants, **options: Any) -> int:
     """Figure 5: UDRL, DQN and A2C on LunarLanderSparse.
 
     Example: udrl study sparse --scale paper
     """
-    return _run(lambda plan: comparison("sparse", plan, participants), **options)
+    return _run(lambda plan: comparison("sparse", plan, dict(participants)), **options)
 
 
 @study.command()

@@ -86,6 +86,14 @@ def test_curve_over_wall_time() -> None:
     assert x == [0, 1.5, 3, 4.5, 6]
 
 
+@pytest.mark.parametrize(("n", "scale"), [(5, "linear"), (31, "log")])
+def test_axis_is_logarithmic_if_one_line_is_much_longer(n: int, scale: str) -> None:
+    points = [*curve("UDRL", n=5), *curve("DQN", n=n)]
+    for x in ("env_steps", "wall_s"):
+        (axes,) = learning_curves(points, "LunarLander", x=x).axes
+        assert axes.get_xscale() == scale
+
+
 def test_band_is_the_interval() -> None:
     (band,) = learning_curves(curve(n=3), "LunarLander").axes[0].collections
     corners = {(round(x, 9), y) for x, y in np.asarray(band.get_paths()[0].vertices)}
