@@ -8,9 +8,9 @@ weakens in training until commands have no effect, and then returns decline. Wit
     p(s, c) + g (p(s, c) - p(s, c')),
 
 where c' is c with the lowest return: that of the examples, or with a ``baseline`` the lowest
-relative return (:mod:`udrl.value`). The learner chooses g for each weights version, so that the
-mean KL divergence of the policy for the highest return from that for the lowest is at least
-``guidance_kl``. Training does not use guidance.
+relative return (:mod:`udrl.value`). The learner chooses g for each weights version, from 0 to 30,
+so that the mean KL divergence of the policy for the highest return from that for the lowest is
+about ``guidance_kl``. It is 0 if the divergence is larger anyway. Training does not use guidance.
 
 This is classifier-free guidance (Ho and Salimans, 2022), which Frans et al. (2025) use as a policy
 improvement operator.
@@ -46,7 +46,7 @@ def choose_guidance(
     Args:
         behavior: the behavior function.
         batches: batches of examples, and with a memory, its states before their windows.
-        minimum: minimum of the mean divergence, in nats.
+        minimum: mean divergence that is aimed at, in nats.
     """
     drawn = list(batches)
     low, high = -behavior.bound, behavior.bound

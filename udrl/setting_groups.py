@@ -69,8 +69,8 @@ class NetworkSettings(SettingsGroup, frozen=True, kw_only=True):
             labelled with the average outcome of their action (:mod:`udrl.value`).
         advantage_bound: with a ``baseline``, largest absolute value of relative desired returns, in
             mean absolute deviations of the return.
-        guidance_kl: minimum mean KL divergence, in nats, of the policy for the highest return from
-            that for the lowest (:mod:`udrl.guidance`). 0: no guidance.
+        guidance_kl: mean KL divergence, in nats, of the policy for the highest return from that for
+            the lowest, to which guidance raises it (:mod:`udrl.guidance`). 0: no guidance.
     """
 
     behavior: Annotated[str, Meta(min_length=1, max_length=200)] | None = None

@@ -198,8 +198,8 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
     if np.ptp(returns) == 0:
         advice.append(
             f"All random episodes return {returns[0]:g}, so there is nothing to learn from until "
-            f"one of them finds a reward by chance; expect slow progress at first, or shape the "
-            f"reward."
+            f"one of them finds a reward by chance; raise n_warm_up_episodes, hold random actions "
+            f"longer (warm_up_hold_steps), or shape the reward."
         )
     if all(e.truncated and not e.terminated for e in episodes):
         advice.append(
