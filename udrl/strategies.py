@@ -20,8 +20,8 @@ from udrl.config import Config
 from udrl.errors import ConfigError
 from udrl.replay_buffer import Entry
 
-#: Largest absolute return and horizon of a command.
-_MOST = 10**9
+#: Largest absolute value of a desired return or horizon.
+MAX_DESIRED = 10**9
 
 
 class CommandStrategy(Protocol):
@@ -176,9 +176,9 @@ def choose_command(strategy: CommandStrategy, best: Sequence[Entry], u: float) -
             f"command strategy {name} failed: {type(error).__name__}: {error}; expected a desired "
             f"return and a desired horizon"
         ) from error
-    if not abs(desired_return) <= _MOST or abs(desired_horizon) > _MOST:
+    if not abs(desired_return) <= MAX_DESIRED or abs(desired_horizon) > MAX_DESIRED:
         raise ConfigError(
             f"command strategy {name} commands a return of {desired_return} within "
-            f"{desired_horizon} steps; expected numbers up to {_MOST:,}"
+            f"{desired_horizon} steps; expected numbers up to {MAX_DESIRED:,}"
         )
     return desired_return, max(1, desired_horizon)

@@ -15,9 +15,13 @@ from udrl.config import Configured, FlatSettings
 from udrl.environments import EnvironmentSpec
 
 Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9._-]+\Z")]
-Text = Annotated[str, Meta(max_length=4000)]
-Number = Annotated[int, Meta(ge=0, le=2**62)]
-Positive = Annotated[int, Meta(ge=1, le=2**62)]
+#: Maximum number of characters of a text.
+MAX_TEXT = 4000
+#: Largest integer; the store's integers have 64 bits.
+MAX_NUMBER = 2**62
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
+Number = Annotated[int, Meta(ge=0, le=MAX_NUMBER)]
+Positive = Annotated[int, Meta(ge=1, le=MAX_NUMBER)]
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Role = Literal["actor", "learner"]
 

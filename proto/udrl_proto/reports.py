@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from udrl_proto.messages import Message, Name, Number, Text
+from udrl_proto.messages import MAX_NUMBER, Message, Name, Number, Text
 
 #: Iterations in one :class:`History`.
 HISTORY_PAGE = 2000
@@ -142,7 +142,7 @@ class Status(Message, frozen=True, kw_only=True):
 class HistoryRequest(Message, frozen=True, kw_only=True):
     """Request for the results of the iterations after ``after``; -1: all."""
 
-    after: Annotated[int, Meta(ge=-1, le=2**62)]
+    after: Annotated[int, Meta(ge=-1, le=MAX_NUMBER)]
 
 
 class IterationStatus(Message, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from udrl.episode import Episode
 from udrl.errors import Refused
 from udrl_proto import verbs
 from udrl_proto.codec import encode_episode
-from udrl_proto.messages import FailureMessage, JoinRequest
+from udrl_proto.messages import MAX_TEXT, FailureMessage, JoinRequest
 from udrl_proto.replay_client import ReplayClient
 
 log = logging.getLogger("udrl")
@@ -24,7 +24,7 @@ _THREADS = 8
 #: Most bytes of observations in transit at once; a larger episode is sent alone.
 _BYTES_IN_TRANSIT = 256 * 1024
 #: Interval at which a waiting thread checks whether the outbox is closed, seconds.
-_LOOK_S = 0.5
+_CLOSED_CHECK_S = 0.5
 
 
 def deliver(client: ReplayClient, join: JoinRequest, outcome: Episode | Failure) -> int:
@@ -41,7 +41,7 @@ def deliver(client: ReplayClient, join: JoinRequest, outcome: Episode | Failure)
     """
     if isinstance(outcome, Failure):
         command_id = outcome.command.id
-        error = str(outcome.error)[:4000]
+        error = str(outcome.error)[:MAX_TEXT]
         failure = FailureMessage(actor=join.id, command_id=command_id, error=error)
         client.request(verbs.FAILURE, failure)
         return command_id
@@ -120,7 +120,7 @@ class Outbox:
                         self._in_transit += 1
                         self._bytes = together
                         return outcome
-                self._changed.wait(_LOOK_S)
+                self._changed.wait(_CLOSED_CHECK_S)
             return None
 
 

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeVar
 import msgspec
 
 from udrl.errors import ConfigError, PeerError, Refused, Unreachable
-from udrl_inspect.address import Address, connected, served_at
+from udrl_inspect.address import REPLY_S, Address, connected, served_at
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_run, read_status
 from udrl_inspect.obedience_report import ObedienceReport, load_report
@@ -34,8 +34,6 @@ log = logging.getLogger("udrl")
 Found = TypeVar("Found")
 Wanted = int | Literal["latest", "best"]
 
-#: Seconds that a reply may take.
-_ANSWER_S = 3.0
 #: Seconds for which a service that did not reply gets no further request.
 _SILENT_S = 10.0
 
@@ -152,7 +150,7 @@ class Served:
     def __init__(self, address: Address) -> None:
         self._address = address
         self._stack = ExitStack()
-        self._line: tuple[ReplayClient, Hello] | None = None
+        self._connection: tuple[ReplayClient, Hello] | None = None
         self._lock = threading.Lock()
 
     def place(self) -> RunLocation:
@@ -193,7 +191,7 @@ class Served:
     def close(self) -> None:
         """Disconnect from the run's router."""
         with self._lock:
-            self._line = None
+            self._connection = None
             self._stack.close()
 
     def _query(self, query: Callable[[ReplayClient], Found]) -> Found:
@@ -206,17 +204,17 @@ class Served:
                 raise
 
     def _connected(self) -> tuple[ReplayClient, Hello]:
-        if self._line is None:
+        if self._connection is None:
             transport, hello = self._stack.enter_context(connected("observer", self._address))
-            self._line = (
-                ReplayClient(transport, hello.run_id, "the board", patience_s=_ANSWER_S),
+            self._connection = (
+                ReplayClient(transport, hello.run_id, "the board", patience_s=REPLY_S),
                 hello,
             )
-        return self._line
+        return self._connection
 
     def _disconnect(self) -> None:
         """Disconnect from the router, without waiting for a service that hangs."""
-        self._line, stack = None, self._stack.pop_all()
+        self._connection, stack = None, self._stack.pop_all()
         threading.Thread(target=stack.close, name="leaving", daemon=True).start()
 
 
@@ -302,6 +300,6 @@ class Directory:
                 return None
             if self._served is None:
                 run_id = self._stored.hello().run_id
-                address = Address(endpoint, run_id, _ANSWER_S, self._keys_dir)
+                address = Address(endpoint, run_id, REPLY_S, self._keys_dir)
                 self._served = endpoint, Served(address)
             return self._served[1]

@@ -6,9 +6,11 @@ import msgspec
 from msgspec import Meta
 
 from udrl.setting_groups import Temperature
+from udrl.strategies import MAX_DESIRED
 from udrl_board.action_names import ActionComponent
+from udrl_proto.messages import Number
 
-Return = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Return = Annotated[float, Meta(ge=-MAX_DESIRED, le=MAX_DESIRED)]
 Horizon = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
 #: Multiple of the environment's own speed.
 Speed = Annotated[float, Meta(ge=1 / 16, le=64)]
@@ -21,7 +23,7 @@ class StartEpisode(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", ta
     desired_horizon: Horizon
     seed: Annotated[int, Meta(ge=0, le=2**31 - 1)]
     temperature: Temperature = 1.0
-    version: Annotated[int, Meta(ge=0, le=2**62)] | Literal["latest", "best"] = "latest"
+    version: Number | Literal["latest", "best"] = "latest"
     paused: bool = False
 
 

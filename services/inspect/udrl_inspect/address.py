@@ -27,11 +27,15 @@ from udrl_replay.remedies import unwritable
 
 log = logging.getLogger("udrl")
 
+#: Seconds to wait for a reply of a replay service.
+REPLY_S = 3.0
+
 #: File in a run directory with the endpoint, while the run is served.
 ENDPOINT_FILE = "endpoint.json"
 
-#: Most characters of a machine's name in the names of its services, which are used in keys.
-_LONGEST_HOST = 30
+#: Maximum number of characters of a machine's name in the names of its services, which are used in
+#: keys.
+_MAX_HOST = 30
 
 
 class Address(NamedTuple):
@@ -46,7 +50,7 @@ class Address(NamedTuple):
 
     endpoint: str
     run_id: str | None = None
-    patience_s: float = 3.0
+    patience_s: float = REPLY_S
     keys: Path | None = None
 
 
@@ -127,10 +131,10 @@ def unique_name(role: str) -> str:
 def host_name(role: str) -> str:
     """Return the prefix of the names of a role's services on this machine."""
     host = re.sub(r"[^A-Za-z0-9]+", "-", platform.node()) or "host"
-    if len(host) > _LONGEST_HOST:
+    if len(host) > _MAX_HOST:
         # Names of pods and of nodes differ at their ends.
         digest = hashlib.sha256(host.encode()).hexdigest()[:8]
-        host = f"{host[: _LONGEST_HOST - 9]}-{digest}"
+        host = f"{host[: _MAX_HOST - 9]}-{digest}"
     return f"{role}-{host}"
 
 

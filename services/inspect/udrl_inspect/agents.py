@@ -23,15 +23,13 @@ from udrl.replay_buffer import ReplayBuffer
 from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_inspect.hub import HUB_SCHEME, download
-from udrl_proto.messages import Hello
+from udrl_proto.messages import MAX_NUMBER, Hello
 from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
-#: Versions are below this; SQLite holds no larger integers.
-_MOST_VERSIONS = 2**63
 #: Seconds between tracebacks of a command that is reproduced.
-_SHOW_S = 60.0
+_TRACEBACK_S = 60.0
 
 
 class Agent(NamedTuple):
@@ -77,9 +75,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
         hello = store.fact("hello", Hello)
         progress = store.fact("progress", RunProgress)
         named = {"latest": progress.latest_version, "best": progress.best_version}
-        if version not in named and not (
-            isinstance(version, int) and abs(version) < _MOST_VERSIONS
-        ):
+        if version not in named and not (isinstance(version, int) and abs(version) <= MAX_NUMBER):
             raise ConfigError(f"weights {version!r}: expected latest, best or a version number")
         wanted = version if isinstance(version, int) else named[version]
         found = store.version(wanted)
@@ -161,7 +157,7 @@ def reproduce(run_dir: Path, command_id: int) -> Episode:
     command = outstanding[command_id]
     version = command.weights_version
     behavior = load_agent(run_dir, version).behavior if version else None
-    faulthandler.dump_traceback_later(_SHOW_S, repeat=True)  # it may hang, in native code too
+    faulthandler.dump_traceback_later(_TRACEBACK_S, repeat=True)  # it may hang, in native code too
     try:
         with closing(EpisodeGenerator(config, 1)) as generator:
             return generate_episodes(generator, [command], behavior)[0]

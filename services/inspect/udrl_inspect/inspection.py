@@ -10,7 +10,7 @@ import msgspec
 
 from udrl.config import Budget, build, flat, read_toml
 from udrl.errors import ConfigError, UdrlError
-from udrl_inspect.address import Address, connected, served_at
+from udrl_inspect.address import REPLY_S, Address, connected, served_at
 from udrl_proto import verbs
 from udrl_proto.messages import Hello
 from udrl_proto.replay_client import ReplayClient
@@ -22,8 +22,6 @@ from udrl_replay.store import Store
 
 log = logging.getLogger("udrl")
 
-_ANSWER_S = 3.0
-
 
 def status_at(address: Address) -> Status:
     """Return the status of a run from its replay service.
@@ -33,7 +31,7 @@ def status_at(address: Address) -> Status:
         ConfigError: the endpoint or the keys cannot be used, or a run id is needed.
     """
     with connected("observer", address) as (transport, hello):
-        client = ReplayClient(transport, hello.run_id, "udrl status", patience_s=_ANSWER_S)
+        client = ReplayClient(transport, hello.run_id, "udrl status", patience_s=REPLY_S)
         return client.request(verbs.STATUS, StatusRequest())
 
 
@@ -69,7 +67,7 @@ def status_of(
     try:
         with closing(Store(run_dir, read_only=True)) as store:
             run_id = store.fact("hello", Hello).run_id
-        return status_at(Address(endpoint, run_id, _ANSWER_S, keys_dir))
+        return status_at(Address(endpoint, run_id, REPLY_S, keys_dir))
     except UdrlError as error:
         warn(f"the replay service cannot be queried, so this is the status in the store: {error}")
         return read_status(run_dir)

@@ -4,6 +4,8 @@ from typing import Literal
 
 import msgspec
 
+from udrl_proto.messages import MAX_TEXT
+
 State = Literal["running", "finishing", "ended", "failed"]
 
 #: Reasons why no process is running a run that has not ended.
@@ -63,7 +65,9 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
     def why_ended(self) -> str:
         """Return why the run ended; empty: it has not."""
-        return f"failed: {self.problem}"[:4000] if self.state == "failed" else self.ended_because
+        if self.state == "failed":
+            return f"failed: {self.problem}"[:MAX_TEXT]
+        return self.ended_because
 
     def why_stopped(self) -> str:
         """Return why no process is running the run, although it has not ended."""

@@ -24,6 +24,7 @@ from udrl_proto import key_expressions, verbs
 from udrl_proto.codec import PAGE, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import (
+    MAX_TEXT,
     Acknowledged,
     ChangesReply,
     ChangesRequest,
@@ -147,7 +148,7 @@ class ReplayService:
         if self.run.progress.state == "ended":
             log.info("the run has ended; raise --max-env-steps or --stop-return to continue it")
         try:
-            self._answer_until_ended(stop)
+            self._reply_until_ended(stop)
             # Not after an error: then memory may be ahead of the disk.
             with self._store.transaction():
                 self.run.stop()
@@ -157,7 +158,7 @@ class ReplayService:
             for declaration in declared:
                 declaration.undeclare()
 
-    def _answer_until_ended(self, stop: threading.Event) -> None:
+    def _reply_until_ended(self, stop: threading.Event) -> None:
         ended_at: float | None = None
         while not stop.is_set():
             # With a short timeout: silent actors and the end must be noticed without requests.
@@ -249,12 +250,12 @@ class ReplayService:
                 self.run.progress.delivered += 1
                 self.run.progress.rejected += 1
             log.warning("invalid %s: %s", received.verb.name, printable(request))
-            return Problem(code="invalid", message=str(request)[:4000])
+            return Problem(code="invalid", message=str(request)[:MAX_TEXT])
         try:
             return self._handlers[received.verb.name](request, now)
         except Refused as error:
             log.warning("refused %s: %s", received.verb.name, printable(error))
-            return Problem(code=error.code, message=str(error)[:4000])
+            return Problem(code=error.code, message=str(error)[:MAX_TEXT])
 
     def _note_presence(self, presence: Presence, now: float) -> None:
         _, _, token = key_expressions.parse(presence.key)

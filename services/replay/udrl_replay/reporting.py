@@ -12,6 +12,7 @@ from udrl.commands import episodes_due
 from udrl.digests import replay_digest
 from udrl.strategies import Best
 from udrl.targets import ReturnInTime
+from udrl_proto.messages import MAX_TEXT
 from udrl_proto.reports import (
     HISTORY_PAGE,
     MOST_SHOWN,
@@ -34,12 +35,13 @@ from udrl_replay.store import COLUMNS, EvaluationRow, Store
 
 log = logging.getLogger("udrl")
 
+#: Period over which the throughput is averaged, in seconds.
 _WINDOW_S = 10.0
-#: Most waits remembered; services that wait need not have joined.
+#: Maximum number of waits to remember; services that wait need not have joined.
 _MOST_WAITS = 10_000
-#: Most characters of an actor's host name and of other texts in the status. Actors choose the host
-#: name, and a status with long ones of many actors would be larger than observers accept.
-_LONGEST_HOST, _LONGEST_TEXT = 100, 4000
+#: Maximum number of characters of an actor's host name in the status. Actors choose this name, and
+#: a status with many long ones would be larger than observers accept.
+_MAX_HOST = 100
 
 
 class MetricsFile:
@@ -185,12 +187,12 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         evaluation=_evaluation(run.store.last_evaluation(is_final=False)),
         final_evaluation=_evaluation(final),
         exact=progress.exact,
-        inexact_reason=progress.inexact_reason[:_LONGEST_TEXT],
+        inexact_reason=progress.inexact_reason[:MAX_TEXT],
         useful_concurrency=episodes_due(run.config.commands, run.buffer) * (run.config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
         waiting=waits.list(now),
-        problem=progress.problem[:_LONGEST_TEXT],
+        problem=progress.problem[:MAX_TEXT],
         ended_because=progress.why_ended(),
         advice=advice(run),
         audit=AuditStatus(
@@ -207,7 +209,7 @@ def _actor_statuses(run: RunState, now: float) -> tuple[ActorStatus, ...]:
     return tuple(
         ActorStatus(
             id=name,
-            host=actor.join.host[:_LONGEST_HOST],
+            host=actor.join.host[:_MAX_HOST],
             environments=actor.join.environments,
             env_steps_per_s=round(actor.request.env_steps_per_s, 1),
             weights_version=actor.request.weights_version,

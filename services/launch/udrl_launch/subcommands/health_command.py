@@ -5,13 +5,17 @@ from pathlib import Path
 import click
 
 from udrl.errors import Unreachable
-from udrl_inspect.address import Address, connected, host_name, is_of_this_machine
+from udrl_inspect.address import (
+    REPLY_S,
+    Address,
+    connected,
+    host_name,
+    is_of_this_machine,
+)
 from udrl_launch.subcommands.options import CONNECT_REQUIRED, KEYS, PATIENCE, RUN
 from udrl_proto import key_expressions
 from udrl_proto.access import REPLAY
 from udrl_proto.session import check_endpoint
-
-_ANSWER_S = 3.0
 
 
 @click.command()
@@ -35,7 +39,7 @@ def health(role: str, connect: str, keys: Path | None, patience: float, run_id: 
             click.echo(f"run {hello.run_id} is served at {connect}")
             return 0
         wanted = key_expressions.alive(hello.run_id, role, f"{host_name(role)}-$*")
-        found = [key.rpartition("/")[2] for key in transport.present(wanted, _ANSWER_S)]
+        found = [key.rpartition("/")[2] for key in transport.present(wanted, REPLY_S)]
     there = [name for name in found if is_of_this_machine(name, role)]
     if not there:
         raise Unreachable(

@@ -9,16 +9,13 @@ from typing import Any, Literal
 import click
 
 from udrl.errors import ConfigError
+from udrl.strategies import MAX_DESIRED
 from udrl_inspect.address import Address
 from udrl_launch import completions
 from udrl_launch.settings import read_steps
 from udrl_proto.credentials import load_credentials
+from udrl_proto.messages import MAX_NUMBER
 from udrl_proto.session import check_endpoint
-
-#: Most digits of a weights version.
-_MOST_DIGITS = 18
-#: Largest accepted absolute value of a return.
-_MOST = 1e9
 
 
 class _AbsolutePath(click.Path):
@@ -120,8 +117,9 @@ class _Return(click.ParamType):  # type: ignore[type-arg]
             number = float(value)
         except ValueError:
             number = math.nan
-        if not abs(number) <= _MOST:
-            self.fail(f"{value!r} is not a number from -{_MOST:g} to {_MOST:g}", param, ctx)
+        if not abs(number) <= MAX_DESIRED:
+            largest = f"{MAX_DESIRED:g}"
+            self.fail(f"{value!r} is not a number from -{largest} to {largest}", param, ctx)
         return number
 
 
@@ -181,7 +179,8 @@ def version(text: str) -> int | Literal["latest", "best"]:
     """
     if text == "latest" or text == "best":
         return text  # type: ignore[return-value]
-    if text.isdecimal() and len(text) <= _MOST_DIGITS:
+    # Python refuses to convert thousands of digits.
+    if text.isdecimal() and len(text) <= len(str(MAX_NUMBER)) and int(text) <= MAX_NUMBER:
         return int(text)
     raise ConfigError(f"--weights {text}: expected latest, best or a version number")
 
