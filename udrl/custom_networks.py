@@ -79,7 +79,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
     inputs.append(torch.zeros(2, ReturnInTime.size))
     try:
         with torch.no_grad():
-            _check(module(*inputs), spec)
+            _check_output(module(*inputs), spec)
         model = _export(module, inputs)
     except Exception as error:
         if isinstance(error, ConfigError):
@@ -106,7 +106,7 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
     return model
 
 
-def _check(found: Tensor, spec: EnvironmentSpec) -> None:
+def _check_output(found: Tensor, spec: EnvironmentSpec) -> None:
     expected = (2, spec.action_space.n_parameters)
     if tuple(found.shape) != expected or found.dtype != torch.float32:
         raise ConfigError(

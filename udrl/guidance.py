@@ -28,7 +28,7 @@ from udrl.behavior import BehaviorFunction
 from udrl.value import with_return
 
 #: Upper bound of g.
-_MOST = 30.0
+_MAX_FACTOR = 30.0
 #: Number of examples from which g is chosen; the last batch may exceed it.
 EXAMPLES = 4096
 
@@ -64,4 +64,4 @@ def choose_guidance(
             total += divergence.double().sum().cpu()
             n += len(divergence)
     unguided = float(total) / n
-    return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MOST), low
+    return min(max(0.0, math.sqrt(minimum / max(unguided, 1e-12)) - 1), _MAX_FACTOR), low

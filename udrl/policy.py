@@ -176,7 +176,7 @@ class Policy:
         Raises:
             InvalidData: see :meth:`logits`; also if the temperature is negative or not finite.
         """
-        _check(temperature)
+        _check_temperature(temperature)
         logits = self.logits(observation, desired_return, desired_horizon)
         space = self.spec.action_space
         if logits.ndim == 1:
@@ -211,7 +211,7 @@ class Policy:
         Raises:
             InvalidData: see :meth:`logits`; also if the temperature is negative or not finite.
         """
-        _check(temperature)
+        _check_temperature(temperature)
         temperature = 0.0 if deterministic else temperature
         logits, after = self.advance(observation, desired_return, desired_horizon, self._state)
         self._state = after if after.shape[1] else None  # without a memory, batches may change size
@@ -225,6 +225,6 @@ class Policy:
         return space.sample(logits, np.full((len(logits), 1), temperature), uniforms)
 
 
-def _check(temperature: float) -> None:
+def _check_temperature(temperature: float) -> None:
     if not 0 <= temperature < math.inf:
         raise InvalidData(f"temperature {temperature}: expected a finite number of at least 0")

@@ -25,7 +25,7 @@ from udrl.targets import ReturnInTime
 Result = TypeVar("Result")
 
 #: Steps for which random numbers are drawn at once.
-_AT_ONCE = 1024
+_STEPS_AT_ONCE = 1024
 
 
 class Rollout:
@@ -153,7 +153,7 @@ class Rollout:
         t = self.steps
         if t == len(self._decisions.random):
             shape = self._policy.spec.action_space.shape
-            self._decisions = self.command.decisions(t + _AT_ONCE, shape)
+            self._decisions = self.command.decisions(t + _STEPS_AT_ONCE, shape)
         return self._decisions.numbers[t], bool(self._decisions.random[t])
 
     def _advance(self) -> tuple[npt.NDArray[np.float64], MemoryState]:

@@ -17,7 +17,7 @@ from udrl.segments import Segments
 Network = Callable[[SeenTensors, Tensor, Tensor | None], tuple[Tensor, Tensor | None]]
 
 #: Number of episodes whose windows are evaluated at once.
-_AT_ONCE = 128
+_EPISODES_AT_ONCE = 128
 
 
 class BufferOutputs(NamedTuple):
@@ -76,7 +76,8 @@ def _window_by_window(
     outputs: npt.NDArray[np.float32] | None = None
     for chunk in range(int(windows.counts.max())):
         unfinished = np.flatnonzero(windows.counts > chunk)
-        for ranks in np.split(unfinished, range(_AT_ONCE, len(unfinished), _AT_ONCE)):
+        ends = range(_EPISODES_AT_ONCE, len(unfinished), _EPISODES_AT_ONCE)
+        for ranks in np.split(unfinished, ends):
             segments, valid = windows.steps(ranks, np.full(len(ranks), chunk))
             examples = experience.examples(Segments(*(s.reshape(-1) for s in segments)))
             numbers = torch.from_numpy(windows.first[ranks] + chunk).to(device)

@@ -24,7 +24,7 @@ _VERDICT_S = 0.3
 #: OpenSSL's codes for a mismatch of host name or IP address.
 _OTHER_NAME = (62, 64)
 #: Parts of OpenSSL's names for a server's rejection of our certificate.
-_COMPLAINTS = ("CERTIFICATE", "UNKNOWN_CA", "DECRYPT_ERROR")
+_REJECTIONS = ("CERTIFICATE", "UNKNOWN_CA", "DECRYPT_ERROR")
 
 _SAME_KEYS = "both sides need keys from the same `udrl keys create`"
 
@@ -85,7 +85,7 @@ class Credentials(NamedTuple):
             ) from error
         except ssl.SSLError as error:
             # Other errors, such as a server that dies meanwhile, are worth a retry.
-            if any(word in (error.reason or "") for word in _COMPLAINTS):
+            if any(word in (error.reason or "") for word in _REJECTIONS):
                 raise ConfigError(
                     f"tls/{host}:{port} does not trust {self.certificate} ({error.reason}); "
                     f"{_SAME_KEYS}"

@@ -27,7 +27,7 @@ def wrapped(env: Environment, name: str) -> Environment:
     try:
         if not colon:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
-        attribute, arguments = _called(call)
+        attribute, arguments = _parsed(call)
         found: Any = getattr(import_module(module), attribute)(env, **arguments)
         if not isinstance(found, gym.Env):
             raise TypeError(f"it returned {describe(found)}, not an environment")  # noqa: TRY301
@@ -47,7 +47,7 @@ def wrapped(env: Environment, name: str) -> Environment:
     return result
 
 
-def _called(call: str) -> tuple[str, dict[str, Any]]:
+def _parsed(call: str) -> tuple[str, dict[str, Any]]:
     """Return name and keyword arguments of a call; these are literals, nothing is evaluated."""
     node = ast.parse(call.strip(), mode="eval").body
     arguments: dict[str, Any] = {}

@@ -67,7 +67,7 @@ class Stage(threading.Thread):
         self._requests: queue.Queue[StageRequest | None] = queue.Queue(_MOST_REQUESTS)
         self._hello: Hello | None = None
         self._env: Adapter | None = None
-        self._draws = True
+        self._can_render = True
         self._policies: dict[int, Policy] = {}
         self._episode: StartEpisode | None = None
         self._actions: list[ActionComponent] = []
@@ -168,7 +168,7 @@ class Stage(threading.Thread):
             self._discard_environment()
         policy = self._policy(self._hello, request.version)
         if self._env is None:
-            self._env, self._draws = _make(self._hello)
+            self._env, self._can_render = _make(self._hello)
             self._actions = action_components(self._env)
         self._episode = request
         self._rollout = Rollout(
@@ -227,7 +227,7 @@ class Stage(threading.Thread):
         rollout, episode = self._rollout, self._episode
         assert rollout is not None
         assert episode is not None
-        picture = _jpeg(rollout.picture()) if self._draws else None
+        picture = _jpeg(rollout.picture()) if self._can_render else None
         moment = Moment(
             seed=episode.seed,
             version=self._version,

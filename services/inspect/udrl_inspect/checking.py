@@ -95,7 +95,7 @@ def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
     env = make_environment(config)
     make_s = time.perf_counter() - began
     memory = _memory() - before
-    advice = _of_gymnasium(env.unwrapped)
+    advice = _gymnasium_findings(env.unwrapped)
     env.close()
     config = with_offered_mask(config, automatic)
     with closing(EpisodeGenerator(config, 1)) as generator:
@@ -111,7 +111,7 @@ def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
         repeats = environment_digest(another) == digest
     returns = [e.episode_return for e in episodes]
     advice += _unusual(fitted, episodes, repeats=repeats)
-    advice += _indices(spec.observation_space, episodes)
+    advice += _index_images(spec.observation_space, episodes)
     if long := slow_training_warning(fitted, spec):
         advice.append(f"{long[0].upper()}{long[1:]}.")
     return Check(
@@ -163,7 +163,7 @@ def _play(generator: EpisodeGenerator, config: Config) -> tuple[list[Episode], f
     return episodes, resets / len(episodes), steps / sum(e.length for e in episodes)
 
 
-def _of_gymnasium(env: Any) -> list[str]:
+def _gymnasium_findings(env: Any) -> list[str]:
     """Return a sentence for each finding of Gymnasium's own checker."""
     logger = logging.getLogger("gymnasium")
     level = logger.level
@@ -220,7 +220,7 @@ def _unusual(config: Config, episodes: list[Episode], *, repeats: bool) -> list[
     return advice
 
 
-def _indices(space: ObservationSpace, episodes: list[Episode]) -> list[str]:
+def _index_images(space: ObservationSpace, episodes: list[Episode]) -> list[str]:
     """Return a sentence for each image that seems to hold indices, with its remedy."""
     advice = []
     for k, leaf in enumerate(leaves_of(space)):

@@ -122,7 +122,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None
     policy = agent.policy
     if found is not None:  # the command of the card's results
         policy.desired_return, policy.desired_horizon = found.desired_return, found.desired_horizon
-    report, again = report_of_agent(agent, run_dir), _again(agent, progress)
+    report, again = report_of_agent(agent, run_dir), _reproducibility(agent, progress)
     folders.save_folder(
         folder, policy, _card(agent, address or printable(folder.name), found, report, again)
     )
@@ -194,7 +194,7 @@ def export_buffer(run_dir: Path, name: str) -> int:
     return len(ids)
 
 
-def _again(agent: Agent, progress: RunProgress) -> str:
+def _reproducibility(agent: Agent, progress: RunProgress) -> str:
     """Return a sentence about the weights that the card's command trains."""
     config = agent.config
     if progress.inexact_reason:

@@ -39,10 +39,10 @@ _COMMANDS = {
     "completion": "udrl_launch.subcommands.completion_command",
 }
 
-#: Width from which descriptions are beside long options, characters.
-_WIDE = 70
-#: Width of the column of options and commands in a narrower terminal, characters.
-_NARROW = 12
+#: Minimum width of a terminal for descriptions beside long options, in characters.
+_MIN_WIDTH = 70
+#: Width of the column of options and commands in a narrower terminal, in characters.
+_NARROW_COLUMN = 12
 
 #: Entry points of other packages' commands.
 _GROUP = "udrl.commands"
@@ -102,7 +102,8 @@ class _HelpFormatter(click.HelpFormatter):
     def write_dl(
         self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2
     ) -> None:
-        super().write_dl(list(rows), col_max if self.width >= _WIDE else _NARROW, col_spacing)
+        width = col_max if self.width >= _MIN_WIDTH else _NARROW_COLUMN
+        super().write_dl(list(rows), width, col_spacing)
 
 
 class _Context(click.Context):

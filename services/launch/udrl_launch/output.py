@@ -17,10 +17,11 @@ from udrl_proto.text import as_json
 if TYPE_CHECKING:
     from rich.table import Table
 
+#: The original standard output, while :func:`keep_for_json` redirects it.
 _kept: TextIO | None = None
 
-#: Width of a table that is not printed to a terminal, characters.
-_WIDE = 1000
+#: Width of a table that is not printed to a terminal, in characters.
+_FILE_WIDTH = 1000
 
 
 def keep_for_json() -> None:
@@ -66,7 +67,7 @@ def print_table(table: "Table") -> None:
         Console().print(table)
         return
     text = io.StringIO()
-    Console(file=text, width=_WIDE).print(table)
+    Console(file=text, width=_FILE_WIDTH).print(table)
     for line in text.getvalue().splitlines():
         click.echo(line.rstrip())
 

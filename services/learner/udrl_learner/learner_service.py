@@ -42,7 +42,7 @@ from udrl_proto.transport import Transport
 log = logging.getLogger("udrl")
 
 #: Episodes in one request; the reply usually has fewer.
-_ASK_FOR = 10_000
+_EPISODES_PER_REQUEST = 10_000
 
 #: Pauses before the restarts of a learner without progress, seconds; after the last it gives up.
 _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
@@ -53,7 +53,7 @@ _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 _LONGEST_WAIT_S = 1.0
 
 #: Interval at which a wait for the buffer checks ``stop``, seconds.
-_LOOK_S = 0.5
+_STOP_CHECK_S = 0.5
 
 
 class Buffer(NamedTuple):
@@ -208,7 +208,7 @@ class LearnerService:
         """Wait for the buffer; raise earlier if the delivery fails meanwhile."""
         pending: list[Future[Any]] = [fetched] if delivered is None else [fetched, delivered]
         while not fetched.done() and not self._stop.is_set():
-            wait(pending, _LOOK_S, FIRST_COMPLETED)
+            wait(pending, _STOP_CHECK_S, FIRST_COMPLETED)
             if delivered is not None and delivered.done():
                 delivered.result()
                 pending = [fetched]
@@ -259,7 +259,7 @@ class LearnerService:
     def _episodes(self, missing: list[int]) -> list[Episode]:
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
-            requested = left[:_ASK_FOR]
+            requested = left[:_EPISODES_PER_REQUEST]
             page = self._client.request(verbs.EPISODES, EpisodesRequest(ids=tuple(requested)))
             if len(page.episodes) > len(requested):
                 raise _wrong(f"{len(page.episodes)} episodes, expected at most {len(requested)}")

@@ -80,7 +80,7 @@ class Admission:
 
     def note_accepted(self, role: Role, name: str) -> None:
         """Note that a delivery was accepted from a service that was checked."""
-        run, field = self._run, _FIELDS[role]
+        run, field = self._run, _CLASS_FIELDS[role]
         known, numerics_class = getattr(run.hello, field), self._class_of(role, name)
         if not known:
             run.hello = msgspec.structs.replace(run.hello, **{field: numerics_class})
@@ -119,7 +119,7 @@ class Admission:
 
     def _compare(self, role: Role, numerics_class: str) -> None:
         hello = self._run.hello
-        known = getattr(hello, _FIELDS[role])
+        known = getattr(hello, _CLASS_FIELDS[role])
         if known in ("", numerics_class) or hello.allow_inexact:
             return
         library = "onnxruntime" if role == "actor" else "torch"
@@ -132,4 +132,4 @@ class Admission:
 
 
 #: Field of the run specification with the numerics class of each role.
-_FIELDS: dict[Role, str] = {"actor": "acting_class", "learner": "training_class"}
+_CLASS_FIELDS: dict[Role, str] = {"actor": "acting_class", "learner": "training_class"}

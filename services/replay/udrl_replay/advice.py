@@ -9,7 +9,7 @@ from udrl_proto.reports import IterationStatus
 from udrl_replay.run_state import RunState
 
 #: Fraction of the budget after which a run should obtain more than random actions do.
-_PATIENCE = 1 / 3
+_BUDGET_FRACTION = 1 / 3
 
 
 def advice(run: RunState) -> str:
@@ -19,7 +19,7 @@ def advice(run: RunState) -> str:
     the warm-up, or than the dataset that replaces it.
     """
     best = run.progress.best_mean
-    if best is None or run.progress.env_steps < _PATIENCE * run.budget.max_env_steps:
+    if best is None or run.progress.env_steps < _BUDGET_FRACTION * run.budget.max_env_steps:
         return ""
     warm_up = run.store.iterations(-1, 1)[0]
     if best > warm_up.explored_return:

@@ -24,7 +24,7 @@ from udrl_replay.tallies import TALLIES, Tallies, Tally
 STORE_FILE = "run.sqlite"
 LOCK = "lock"
 #: Seconds to retry for the lock; :func:`is_locked` holds it only briefly.
-_LOOK_S = 0.2
+_LOCK_RETRY_S = 0.2
 
 #: Tables whose rows may be replaced.
 _REPLACED = {"facts", "evaluations", "versions"}
@@ -145,7 +145,7 @@ class Database:
         """
         path = run_dir / STORE_FILE
         try:
-            _make(run_dir)
+            _make_directory(run_dir)
             with _lock(run_dir):
                 if path.exists():
                     raise StoreError(
@@ -258,7 +258,7 @@ def _begin(db: sqlite3.Connection, facts: dict[str, object]) -> None:
     add(TALLIES, Tallies(db).held())
 
 
-def _make(run_dir: Path) -> None:
+def _make_directory(run_dir: Path) -> None:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -302,13 +302,13 @@ def _lock(run_dir: Path) -> Any:
         file = (run_dir / LOCK).open("a")
     except OSError as error:
         raise _unusable(run_dir, error) from error
-    deadline = time.monotonic() + _LOOK_S
+    deadline = time.monotonic() + _LOCK_RETRY_S
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             if time.monotonic() < deadline:  # is_locked() in another process may hold it briefly
-                time.sleep(_LOOK_S / 10)
+                time.sleep(_LOCK_RETRY_S / 10)
                 continue
             file.close()
             raise RunInUse(

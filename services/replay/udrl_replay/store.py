@@ -17,7 +17,7 @@ from udrl_proto.reports import IterationStatus
 from udrl_replay.database import Database
 from udrl_replay.schema import SEALED, sha256
 
-_FIELDS = IterationStatus.__struct_fields__
+_ITERATION_COLUMNS = IterationStatus.__struct_fields__
 #: Columns of evaluations in ``metrics.csv``, and in the store.
 EVALUATION_COLUMNS = {
     "eval_at_env_steps": "env_steps",
@@ -29,7 +29,7 @@ EVALUATION_COLUMNS = {
     "eval_ci95_high": "ci95_high",
 }
 #: All columns of ``metrics.csv``.
-COLUMNS = (*_FIELDS, *EVALUATION_COLUMNS)
+COLUMNS = (*_ITERATION_COLUMNS, *EVALUATION_COLUMNS)
 
 
 class StoredEpisode(NamedTuple):
@@ -193,7 +193,7 @@ class Store(Database):
             "WHERE iteration > ? ORDER BY iteration LIMIT ?",
             (after, limit),
         )
-        return [IterationStatus(**dict(zip(_FIELDS, row, strict=True))) for row in rows]
+        return [IterationStatus(**dict(zip(_ITERATION_COLUMNS, row, strict=True))) for row in rows]
 
     def issued_in(self, iteration: int) -> int:
         """Return the number of commands of a completed iteration."""
@@ -220,7 +220,7 @@ class Store(Database):
             "SELECT * FROM evaluations WHERE is_final = ? ORDER BY iteration DESC LIMIT 1",
             (int(is_final),),
         )
-        return _evaluation(rows[0]) if rows else None
+        return _evaluation_row(rows[0]) if rows else None
 
     def evaluation_of(self, iteration: int, *, is_final: bool) -> EvaluationRow | None:
         """Return the evaluation of an iteration."""
@@ -228,7 +228,7 @@ class Store(Database):
             "SELECT * FROM evaluations WHERE is_final = ? AND iteration = ?",
             (int(is_final), iteration),
         )
-        return _evaluation(rows[0]) if rows else None
+        return _evaluation_row(rows[0]) if rows else None
 
     def best_evaluation(self) -> float | None:
         """Return the greatest mean return of all evaluations, the final evaluation included."""
@@ -242,11 +242,12 @@ class Store(Database):
             "ORDER BY iteration",
             (after, until),
         )
-        return [_evaluation(row) for row in rows]
+        return [_evaluation_row(row) for row in rows]
 
     def metrics(self, after: int) -> list[tuple[Any, ...]]:
         """Return the rows of ``metrics.csv`` of the iterations after ``after``; -1: all."""
-        columns = [f"i.{c}" for c in _FIELDS] + [f"e.{c}" for c in EVALUATION_COLUMNS.values()]
+        columns = [f"i.{c}" for c in _ITERATION_COLUMNS]
+        columns += [f"e.{c}" for c in EVALUATION_COLUMNS.values()]
         return self._rows(
             f"SELECT {', '.join(columns)} FROM iterations i "  # noqa: S608
             "LEFT JOIN evaluations e ON e.iteration = i.iteration AND e.is_final = 0 "
@@ -319,7 +320,7 @@ class Store(Database):
         self._db.execute("DELETE FROM versions WHERE version > ?", (after,))
 
 
-def _evaluation(row: tuple[Any, ...]) -> EvaluationRow:
+def _evaluation_row(row: tuple[Any, ...]) -> EvaluationRow:
     iteration, is_final, env_steps, desired_return, desired_horizon, *found, _ = row
     result = Evaluation(*found)
     return EvaluationRow(

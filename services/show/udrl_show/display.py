@@ -17,13 +17,14 @@ from udrl.evaluation import interval_text, return_text
 from udrl_proto.reports import AuditStatus, EvaluationStatus, Status, Waiting
 from udrl_proto.text import printable
 
+#: Seconds between lines if there is no terminal.
 _PLAIN_EVERY_S = 5.0
-#: Width of the progress bar, characters; less in a narrow terminal.
+#: Width of the progress bar, in characters; less in a narrow terminal.
 _BAR_WIDTH = 20
-#: Weights versions that are listed; of more, the first and the last ones.
-_MOST_VERSIONS = 8
+#: Maximum number of weights versions to list; of more, the first and the last ones are listed.
+_MAX_LISTED = 8
 #: Texts for the states.
-_STATES = {
+_STATE_LABELS = {
     "running": "running",
     "finishing": "final evaluation",
     "ended": "ended",
@@ -81,7 +82,7 @@ def _can_be_redrawn(console: Console) -> bool:
 def line(status: Status) -> str:
     """Return a status in one line."""
     parts = [
-        f"{_STATES[status.state]}: iteration {status.iteration}",
+        f"{_STATE_LABELS[status.state]}: iteration {status.iteration}",
         f"{status.env_steps:,} of {status.max_env_steps:,} env steps "
         f"({status.env_steps_per_s:,.0f}/s)",
         f"evaluation {evaluation(status.evaluation)}",
@@ -92,7 +93,7 @@ def line(status: Status) -> str:
         parts.append(time_left(status))
     if status.ended_because:
         parts.append(status.ended_because)
-    parts += map(_waiting, _long(status))
+    parts += map(_waiting, _long_waits(status))
     return printable("; ".join(parts))
 
 
@@ -107,7 +108,7 @@ def panel(status: Status) -> Table:
 
     add("run", status.run_id)
     add("environment", status.environment)
-    add("state", f"{_STATES[status.state]}{'' if status.exact else ', NOT exact'}")
+    add("state", f"{_STATE_LABELS[status.state]}{'' if status.exact else ', NOT exact'}")
     table.add_row("progress", _progress(status))
     if status.stop_return is not None:
         add("target", f"mean return {return_text(status.stop_return)} in an evaluation")
@@ -132,7 +133,7 @@ def panel(status: Status) -> Table:
         add("advice", status.advice)
     for actor in status.quarantined:
         add("quarantined", f"{actor.id}: {actor.why}")
-    for wait in _long(status):
+    for wait in _long_waits(status):
         add("waiting", f"{wait.who} for {wait.on}:", f"{wait.why} ({wait.seconds:.1f} s)")
     return table
 
@@ -207,8 +208,8 @@ def _audit(audit: AuditStatus) -> list[str]:
 def _kept(versions: Sequence[int]) -> list[str]:
     """Return the number of versions, and the first and the last of them."""
     names = [f"{version}" for version in versions]
-    if len(names) > _MOST_VERSIONS:
-        half = _MOST_VERSIONS // 2
+    if len(names) > _MAX_LISTED:
+        half = _MAX_LISTED // 2
         names = [*names[:half], "…", *names[-half:]]
     listed = [f"{name}," for name in names[:-1]] + names[-1:]
     return [f"{_counted(len(versions), 'version')}:", *(n.replace("…,", "…") for n in listed)]
@@ -234,7 +235,7 @@ def _waiting(wait: Waiting) -> str:
     return f"{wait.who} waits for {wait.on}: {wait.why} ({wait.seconds:.1f} s)"
 
 
-def _long(status: Status) -> list[Waiting]:
+def _long_waits(status: Status) -> list[Waiting]:
     return [w for w in status.waiting if w.seconds >= 1.0]
 
 

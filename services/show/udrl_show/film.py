@@ -19,7 +19,7 @@ _LEAST_WIDTH = 320
 #: Most frames per second of a GIF; browsers slow down faster ones.
 _GIF_FPS = 25
 #: Options of ffmpeg for each kind of file.
-_KINDS = {
+_FFMPEG_OPTIONS = {
     ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "15"),
     # The palette is computed from all frames, so ffmpeg keeps them in memory until the end.
     ".gif": (
@@ -37,7 +37,7 @@ def check_video_name(path: Path) -> None:
     Raises:
         ConfigError: the extension is not supported.
     """
-    if path.suffix not in _KINDS:
+    if path.suffix not in _FFMPEG_OPTIONS:
         raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
 
 
@@ -69,7 +69,7 @@ class Film:
         self._fps = fps / self._every
         self._seen = 0
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the film
+        self._ffmpeg_log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the film
 
     def add(self, picture: Picture, caption: str) -> None:
         """Append a picture, uint8 [height, width, 3]; the first one sets the size of the video."""
@@ -88,7 +88,7 @@ class Film:
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
         except OSError as error:
-            raise self._failed() from error
+            raise self._failure() from error
 
     def frame(self, picture: Picture, caption: str) -> Picture:
         """Return a picture with its caption below it; both sides are even, as H.264 requires."""
@@ -107,8 +107,8 @@ class Film:
             ConfigError: ffmpeg could not write it.
         """
         if self._process is not None and self._finish() != 0:
-            raise self._failed()
-        self._said.close()
+            raise self._failure()
+        self._ffmpeg_log.close()
 
     def _finish(self) -> int:
         """Wait for the end of ffmpeg and return its exit code."""
@@ -121,13 +121,13 @@ class Film:
             process.communicate()
         return process.returncode
 
-    def _failed(self) -> ConfigError:
+    def _failure(self) -> ConfigError:
         """Return an error with the first line of ffmpeg's output, and remove the file."""
         if self._process is not None:
             self._finish()
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        self._said.close()
+        self._ffmpeg_log.seek(0)
+        lines = self._ffmpeg_log.read().decode(errors="replace").strip().splitlines()
+        self._ffmpeg_log.close()
         self._path.unlink(missing_ok=True)
         why = lines[0].strip() if lines else "it ended without a message"
         return ConfigError(f"--video {self._path}: ffmpeg cannot write it: {why}")
@@ -144,12 +144,13 @@ class Film:
         arguments = (
             "-y", "-loglevel", "error",
             "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-            "-r", f"{self._fps:g}", "-i", "-", *_KINDS[self._path.suffix], f"file:{self._path}",
+            "-r", f"{self._fps:g}", "-i", "-", *_FFMPEG_OPTIONS[self._path.suffix],
+            f"file:{self._path}",
         )  # fmt: skip
         try:
             return subprocess.Popen(  # noqa: S603 - the library's own program
                 [self._ffmpeg(), *arguments],
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._ffmpeg_log,
             )  # fmt: skip
         except (OSError, RuntimeError) as error:
             self._path.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: File name extensions of figures.
-_KINDS = (".png", ".svg", ".pdf")
+_EXTENSIONS = (".png", ".svg", ".pdf")
 #: Most panels in a row.
 _MOST_COLUMNS = 3
 
@@ -23,8 +23,8 @@ def check_picture_name(picture: Path) -> None:
     Raises:
         ConfigError: the extension is not supported.
     """
-    if picture.suffix not in _KINDS:
-        either = " or ".join([", ".join(_KINDS[:-1]), _KINDS[-1]])
+    if picture.suffix not in _EXTENSIONS:
+        either = " or ".join([", ".join(_EXTENSIONS[:-1]), _EXTENSIONS[-1]])
         raise ConfigError(f"{picture}: expected a name that ends with {either}")
 
 

@@ -45,14 +45,14 @@ def metrics(
         status_from(where, keys)  # a run that cannot be read would be down for ever
 
     def service(stop: threading.Event) -> None:
-        with closing(Exporter(partial(_ask, where, keys), host, port)) as exporter:
+        with closing(Exporter(partial(_known_status, where, keys), host, port)) as exporter:
             click.echo(f"metrics: http://{host}:{exporter.port}/metrics")
             stop.wait()
 
     return run_service(service)
 
 
-def _ask(where: Path | Address, keys: Path | None) -> Status | None:
+def _known_status(where: Path | Address, keys: Path | None) -> Status | None:
     try:
         return status_from(where, keys)
     except UdrlError:

@@ -88,12 +88,12 @@ def obedience(
             print_text(paragraph)
     if output is not None:
         draw_obedience(report, output)
-    for problem in _keep(run_dir, report, draws=output is None):
+    for problem in _write_files(run_dir, report, draws=output is None):
         click.echo(problem, err=True)
     return 0
 
 
-def _keep(run_dir: Path, report: reports.ObedienceReport, *, draws: bool) -> list[str]:
+def _write_files(run_dir: Path, report: reports.ObedienceReport, *, draws: bool) -> list[str]:
     """Write the files in the run's directory, and return what went wrong."""
     try:
         reports.save_report(run_dir, report)
