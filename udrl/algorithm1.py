@@ -94,7 +94,8 @@ def algorithm1(
     """
     if config.lead != 0:
         raise ConfigError(
-            f"lead = {config.lead}: Algorithm 1 trains, acts, trains, acts; set lead=0"
+            f"lead = {config.lead}: expected 0, because Algorithm 1 alternates training and "
+            f"acting; set lead = 0"
         )
     config = resolve_arithmetic(resolve_automatic(config, automatic))
     with closing(EpisodeGenerator(config, n_environments)) as generator:

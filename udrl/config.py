@@ -117,7 +117,7 @@ class Config(SettingsGroup, frozen=True, kw_only=True):
         last_few, replay_size = self.commands.last_few, self.buffer.replay_size
         if last_few > replay_size:
             raise ConfigError(
-                f"last_few = {last_few}: must be at most replay_size = {replay_size}, "
+                f"last_few = {last_few}: expected at most replay_size = {replay_size}, "
                 f"because exploratory commands are drawn from the replay buffer; "
                 f"lower last_few or raise replay_size"
             )

@@ -59,7 +59,10 @@ def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
             f"settings (udrl.custom_networks)"
         ) from error
     if not isinstance(made, nn.Module):
-        raise ConfigError(f"behavior {name!r} is {type(made).__name__}, expected a torch.nn.Module")
+        raise ConfigError(
+            f"behavior {name!r} is {type(made).__name__}, expected a torch.nn.Module; derive the "
+            f"class from it"
+        )
     return made
 
 
@@ -67,7 +70,8 @@ def exported(network: NetworkSettings, spec: EnvironmentSpec) -> onnx.ModelProto
     """Return the module as an ONNX model; its parameters are initializers without values.
 
     Raises:
-        ConfigError: it cannot be exported, or its output has the wrong shape or dtype.
+        ConfigError: it cannot be created or exported, its output has the wrong shape or dtype, or
+            it has tensors that are not trained or parameters that have no effect.
     """
     module = make_custom(network, spec).train(mode=False)
     shapes = FrameStack(spec.observation_space, network.frame_stack).shapes

@@ -244,6 +244,6 @@ def _session(model: bytes) -> onnxruntime.InferenceSession:
     if not any(known):
         raise InvalidWeights(
             f"acting graph: inputs {names[0]}, outputs {names[1]}; expected observations and "
-            f"command as inputs, logits as output; another version of udrl created the run"
+            f"command as inputs, logits as output; use the version of udrl that created the run"
         )
     return session

@@ -28,7 +28,7 @@ class SettingsGroup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     def __post_init__(self) -> None:
         for name, value in msgspec.structs.asdict(self).items():
             if not all(map(math.isfinite, _floats(value))):
-                raise ConfigError(f"{name} = {value}: must be a finite number")
+                raise ConfigError(f"{name} = {value}: expected a finite number")
 
 
 def _floats(value: Any) -> Iterator[float]:
@@ -121,7 +121,7 @@ class BufferSettings(SettingsGroup, frozen=True, kw_only=True):
         replay_size: episodes with the highest returns that it holds.
         recent_size: newest episodes that it holds in addition, whatever their return; 0 in the
             paper.
-        max_age: iterations after which an episode leaves. None: never, as in the paper.
+        max_age: iterations after which an episode is removed. None: never, as in the paper.
     """
 
     replay_size: Annotated[int, Meta(ge=1, le=1_000_000)] = 500

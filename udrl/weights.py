@@ -41,19 +41,19 @@ def decode_weights(blob: bytes, shapes: Shapes) -> Weights:
         tensors = safetensors.numpy.load(blob)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InvalidWeights(
-            f"weights: not safetensors: {error}; they are damaged, use another copy"
+            f"weights: not safetensors: {error}; the data are damaged, use another copy"
         ) from error
     if set(tensors) != set(shapes):
         odd = sorted(set(tensors) ^ set(shapes))
         raise InvalidWeights(
-            f"weights: tensors {odd[:4]} are missing or surplus; "
-            f"they belong to another architecture"
+            f"weights: tensors {odd[:4]} are missing or surplus; the weights belong to another "
+            f"architecture"
         )
     for name, tensor in tensors.items():
         if tensor.shape != shapes[name] or tensor.dtype != np.float32:
             raise InvalidWeights(
                 f"weights: tensor {name!r} is {tensor.dtype} {tensor.shape}, expected float32 "
-                f"{shapes[name]}; they belong to another architecture"
+                f"{shapes[name]}; the weights belong to another architecture"
             )
         if not np.isfinite(tensor).all():
             raise InvalidWeights(

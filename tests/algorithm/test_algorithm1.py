@@ -204,7 +204,7 @@ def test_buffer_discards_all_but_the_best_episodes() -> None:
 
 
 def test_lead_is_rejected_with_the_remedy() -> None:
-    with pytest.raises(ConfigError, match=r"lead = 2: .*set lead=0"):
+    with pytest.raises(ConfigError, match=r"lead = 2: .*set lead = 0"):
         algorithm1(settings(lead=2), BUDGET)
 
 

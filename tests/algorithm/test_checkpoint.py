@@ -173,7 +173,7 @@ def test_mismatched_optimizer_state_is_rejected(what: str) -> None:
 
 def test_weights_of_another_architecture_are_rejected() -> None:
     other = untrained(build(Config, {"environment": "CartPole-v1", "hidden": [8]}), SPEC)
-    with pytest.raises(InvalidWeights, match="they belong to another architecture"):
+    with pytest.raises(InvalidWeights, match="the weights belong to another architecture"):
         decode_weights(encode_weights(other.weights), SHAPES)
 
 

@@ -73,7 +73,7 @@ def test_settings_of_any_group_are_changed_by_name() -> None:
     [
         ({"bach_size": 1}, r"'bach_size': did you mean 'batch_size'\?"),
         ({"batch_size": 0}, r"^batch_size = 0: "),
-        ({"last_few": 501}, r"^last_few = 501: must be at most replay_size = 500"),
+        ({"last_few": 501}, r"^last_few = 501: expected at most replay_size = 500"),
         ({"segments": "all", "baseline": "value"}, r"^segments = 'all' with baseline = 'value'"),
     ],
 )
@@ -83,7 +83,7 @@ def test_invalid_change_is_rejected(values: dict[str, Any], complaint: str) -> N
 
 
 def test_rules_across_groups_are_checked_on_every_construction() -> None:
-    with pytest.raises(ConfigError, match="last_few = 75: must be at most replay_size = 10"):
+    with pytest.raises(ConfigError, match="last_few = 75: expected at most replay_size = 10"):
         Config(environment="CartPole-v1", buffer=BufferSettings(replay_size=10))
 
 

@@ -138,7 +138,10 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
         except UnsupportedEnvironment as error:
             problems.append(str(error))
     if not leaves:
-        problems.append(f"its actions are {space}, of which there is only one")
+        problems.append(
+            f"its action space {space} has no parts, so there is nothing to choose; expected at "
+            f"least one Discrete, MultiDiscrete, MultiBinary or Box"
+        )
     elif (
         not problems
         and (n := sum(n for _, c in parts for n in c.plain.components)) > _MAX_PARAMETERS
@@ -191,7 +194,8 @@ def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -
         place = np.argwhere(low >= high)[0].tolist()
         raise UnsupportedEnvironment(
             f"its {name}{place} is from {low[tuple(place)]:g} to {high[tuple(place)]:g}; "
-            f"expected a lower bound below the higher one"
+            f"expected a lower bound below the upper one; correct the space, or action_low and "
+            f"action_high"
         )
     whole = np.issubdtype(space.dtype, np.integer)
     if whole:

@@ -15,10 +15,14 @@ import numpy as np
 from udrl.environments import engine_keeper
 from udrl.environments.downsampling import AreaAverage, Pixels
 
+#: Height and width of the engine's screen, in pixels.
 _SCREEN = (120, 160)
 
+#: Held while an engine starts in its own working directory.
 _starting = threading.Lock()
+#: Mark of this process's engines (:mod:`.engine_keeper`).
 _mark = uuid.uuid4().hex
+#: Write end of the keeper's standard input, which is only closed when this process ends.
 _keeper: int | None = None
 
 
@@ -57,8 +61,8 @@ class Doom(gym.Env[Pixels, np.int64]):
     ) -> None:
         if not (0 < height <= _SCREEN[0] and 0 < width <= _SCREEN[1]):
             raise ValueError(
-                f"height = {height}, width = {width}: the screen is {_SCREEN[0]} x {_SCREEN[1]}, "
-                f"and cannot be enlarged"
+                f"height = {height}, width = {width}: expected 1 x 1 to {_SCREEN[0]} x "
+                f"{_SCREEN[1]}, the size of the screen"
             )
         self.render_mode = render_mode
         self.max_return = max_return
@@ -107,6 +111,7 @@ class Doom(gym.Env[Pixels, np.int64]):
 
 
 def _tics(frame_skip: Any) -> int:
+    """Return the tics of a step, after checking ``frame_skip``."""
     if not isinstance(frame_skip, int | np.integer) or frame_skip < 1:
         raise ValueError(
             f"frame_skip = {frame_skip!r}: expected an integer, 1 or more; 1 acts in every tic"
@@ -125,7 +130,8 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
     if not path.is_file():
         known = sorted(p.stem for p in Path(vizdoom.scenarios_path).glob("*.cfg"))
         raise ValueError(
-            f"scenario {scenario!r}: neither a file nor one of ViZDoom's {', '.join(known)}"
+            f"scenario {scenario!r}: neither a file nor one of ViZDoom's; expected a .cfg file or "
+            f"one of {', '.join(known)}"
         )
     folder = tempfile.TemporaryDirectory(prefix="udrl-doom-")
     game = vizdoom.DoomGame()
@@ -168,7 +174,7 @@ def _start(game: Any, folder: str) -> None:
     Engines write to their working directory, and conflict if two share one. So this process changes
     to the engine's own directory for the tenth of a second that the start takes.
     """
-    global _keeper  # write end of the keeper's standard input; only closed when this process ends
+    global _keeper
     with _starting:
         if _keeper is None and Path("/proc/self/environ").exists():
             reads, _keeper = os.pipe()

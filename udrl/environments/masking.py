@@ -15,6 +15,7 @@ from udrl.spaces import Key
 
 #: Key of the mask in ``info``, and in observations.
 MASK = "action_mask"
+#: Key of the wrapped environment's observation in the ``Dict`` observations of our wrappers.
 OBSERVATION = "observation"
 
 #: Name of the mask in messages.
@@ -122,8 +123,8 @@ def mask_in(
         given = info[MASK]
     except (KeyError, TypeError, IndexError) as error:
         raise EnvironmentFault(
-            f"{where}() returned {describe(info)} as info, without {MASK!r}; set "
-            f"action_mask only where every info has it"
+            f"{where}() returned {describe(info)} as info, without {MASK!r}; use action_mask = "
+            f"'info' only if every reset and step returns it"
         ) from error
     size = sum(components)
     try:
