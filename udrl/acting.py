@@ -235,12 +235,12 @@ def _failure(where: str, command: Command, error: Exception) -> Failure:
     what = str(error)
     if not isinstance(error, EnvironmentFault):
         what = raised(where, error)
-    fault = EnvironmentFault(
+    wrapped = EnvironmentFault(
         f"the environment failed under command {command.id} (seed {command.environment_seed}): "
         f"{what}"
     )
-    fault.__cause__ = error
-    return Failure(command, fault)
+    wrapped.__cause__ = error
+    return Failure(command, wrapped)
 
 
 def generate_episodes(

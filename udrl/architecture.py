@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from udrl.setting_groups import NetworkSettings
 from udrl.spaces import Image, ObservationSpace
 
-# Appendix B.2.
+# Of convolutions, in pixels (Appendix B.2).
 FILTER, STRIDE, PADDING = 3, 2, 1
 
 #: Units in each hidden layer of the value function.
@@ -23,7 +23,7 @@ MIN_DEVIATION = 3e-3
 #: whose rounding IEEE 754 defines, so the result does not depend on the processor's instructions.
 SQUAREPLUS = 2.0
 
-#: Normalised observations are clipped to this many deviations from their mean.
+#: Normalised observations are clipped to this many standard deviations from their mean.
 NORMAL_BOUND = 10.0
 
 #: Added to the logits of masked actions.

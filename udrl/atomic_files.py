@@ -7,7 +7,7 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; the file there then replaces ``path``.
+    """Yield a path to write to; at the end of the block, that file replaces ``path``.
 
     If the block raises, ``path`` is unchanged.
 

@@ -35,7 +35,7 @@ log = logging.getLogger("udrl")
 _SEED = 1_000_000
 #: Usual and maximum number of random episodes to sample.
 _EPISODES, _MAX_EPISODES = 40, 500
-#: Env steps above which sampling stops: after the usual number of episodes, and before.
+#: Env steps at which sampling stops: after the usual number of episodes, and before.
 _STEPS, _MAX_STEPS = 1_000, 10_000
 #: Upper bound of the step limit of sampled episodes, in steps.
 _MAX_LENGTH = 2_000
@@ -43,19 +43,20 @@ _MAX_LENGTH = 2_000
 _HOLDS, _N_BEST = (2, 8, 32), 3
 #: ``hold_rate`` in stochastic and in other environments.
 _STOCHASTIC_RATE, _RATE = 0.15, 0.05
-#: Magnitudes of the network's inputs that it learns well from.
+#: Range of input magnitudes from which a network learns well.
 _MIN_INPUT, _MAX_INPUT = 0.1, 10.0
 #: Minimum episodes and env steps of the warm-up. If rewards are rare, random actions must find one
 #: before there is anything to learn from.
 _WARM_UP, _WARM_UP_STEPS = 50, 4_000
-#: The newest iterations whose episodes are usually kept, and a number of episodes that exceeds
-#: theirs.
+#: ``max_age`` and ``replay_size`` if rewards are not rare: the buffer keeps all episodes of a
+#: window of iterations, which are fewer than ``replay_size``.
 _MAX_AGE, _ALL = 12, 12_000
-#: Fewest episodes above the median that this window has to have by chance. If rewards are rarer,
-#: they would be forgotten before enough are found, so the best of all time and the newest are kept.
+#: Rewards are rare if random play is expected to leave fewer than _FEWEST episodes above the median
+#: in this window, which would drop them before it has enough. The buffer then keeps the _BEST
+#: episodes of all time and the _NEWEST.
 _FEWEST, _BEST, _NEWEST = 10, 100, 60
-#: ``guidance_kl`` and ``reset_every`` if rewards are rare. Few examples then say what a high return
-#: needs, so the response to it is weak, and networks adapt to what the first ones had in common.
+#: ``guidance_kl`` and ``reset_every`` if rewards are rare. Few examples then show what a high
+#: return takes, so the agent responds weakly to it, and its network overfits to the first of them.
 _RARE_GUIDANCE, _RARE_RESETS = 0.1, 100
 #: Minimum ``return_lambda``. Lambda-returns reach over at least 1 / _REACH of a random episode.
 _MIN_LAMBDA, _REACH = 0.95, 4.0
@@ -114,7 +115,7 @@ def choose(
     else:
         hold, sample = _best_hold(config, generator)
     returns, length = sample.returns, sum(sample.lengths) / len(sample.lengths)
-    reach = max(*map(abs, returns), max(returns) - min(returns), 0.0)
+    magnitude = max(*map(abs, returns), max(returns) - min(returns), 0.0)
     if episodes is None:
         n_warm_up = max(_WARM_UP, math.ceil(_WARM_UP_STEPS / length))
     stochastic = sample.is_stochastic
@@ -127,7 +128,7 @@ def choose(
         # To plan for the step limit, an agent must observe the time left. If episodes usually end
         # long before the limit, agents that observe it learn more slowly.
         "observe_time": 2 * length > _limit(config, generator),
-        "return_scale": _rounded(1 / reach) if reach else 1.0,
+        "return_scale": _rounded(1 / magnitude) if magnitude else 1.0,
         # Short episodes are partly luck; given a short horizon, the agent would take risks.
         "horizon_scale": 0.0 if stochastic else _rounded(1 / length),
         "baseline": baseline,
@@ -263,8 +264,9 @@ def _play(config: Config, generator: EpisodeGenerator, hold: int) -> Sample:
 def rewards_are_rare(sample: Sample, settings: CommandSettings) -> bool:
     """Return whether few random episodes of the usual window would exceed the median.
 
-    A window of many episodes is large enough, and the best of all time may only have been lucky. In
-    the sample one more episode counts as better, so that a small one without any does not decide.
+    A window of at least ``_BEST`` episodes is always large enough; the best episodes of all time
+    may only have been lucky. The share of better episodes is estimated by the rule of succession,
+    so that a small sample without any does not decide.
     """
     n, steps = len(sample.returns), settings.n_steps_per_iter or 0
     median = sorted(sample.returns)[n // 2]

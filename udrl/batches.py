@@ -185,7 +185,8 @@ class Batches:
         """Yield the batches of all updates, or of the first ones.
 
         Args:
-            hide: whether to hide the previous action and reward, from the examples drawn for it.
+            hide: whether to hide the previous action and reward in the examples drawn for this
+                (:class:`Draw`).
             most: maximum number of batches. None: all.
         """
         draw = self._draw

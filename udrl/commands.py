@@ -202,7 +202,10 @@ class CommandSampler:
         )
 
     def training_command(self, episode_id: int) -> Command:
-        """Return a training command again, without desired return, horizon and random actions."""
+        """Return the command of an earlier training episode, without what depended on the buffer.
+
+        Desired return and horizon are 0, and there are no random actions.
+        """
         iteration, index = divmod(episode_id, COMMANDS_PER_ITERATION)
         kind: CommandKind = "explore" if iteration else "warm_up"
         return self._commands(kind, iteration, 0, [(0.0, 0)] * (index + 1), TRAINING_SEEDS)[index]

@@ -25,15 +25,16 @@ def training_s(config: Config, spec: EnvironmentSpec) -> float:
     network, training = config.network, config.training
     space, first = spec.observation_space, network.hidden[0]
     widths = layer_widths(space, network)
-    acting = _features(config, spec, first, network.memory_size)
-    acting += sum(i * o for i, o in pairwise(widths))
+    # Multiplications per example: of the behavior function, and of a value function or critic.
+    behavior = _features(config, spec, first, network.memory_size)
+    behavior += sum(i * o for i, o in pairwise(widths))
     width = VALUE_WIDTH
     if network.memory == "none":
         width = n_features(space, network.convolutions, VALUE_WIDTH)
-    expecting = _features(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
-    networks = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
+    value = _features(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
+    n_values = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
     examples = training.n_updates_per_iter * training.batch_size
-    operations = _UPDATE_OPERATIONS * examples * (acting + networks * expecting)
+    operations = _UPDATE_OPERATIONS * examples * (behavior + n_values * value)
     return operations / _OPERATIONS_PER_S / config.arithmetic.training_threads
 
 
@@ -80,6 +81,7 @@ def _encoder(config: Config, spec: EnvironmentSpec, width: int) -> float:
 
 
 def _leaf(space: LeafSpace, depth: int, network: NetworkSettings, width: int) -> float:
+    """Return the multiplications of a leaf's encoder; ``depth`` is the input's first dimension."""
     if not isinstance(space, Image):
         return depth * width
     channels = (depth, *network.convolutions)

@@ -27,7 +27,7 @@ PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 def fully_connected(n_in: int, n_out: int) -> nn.Linear:
-    """Return a layer without values; these come from ``initialise`` or a checkpoint."""
+    """Return an uninitialised layer; ``initialise`` or a checkpoint sets its parameters."""
     layer: nn.Linear = nn.utils.skip_init(nn.Linear, n_in, n_out)
     return layer
 
@@ -56,7 +56,13 @@ class Encoder(nn.Module):
         raise NotImplementedError
 
     def normalise(self, leaf: int, mean: Tensor, deviation: Tensor) -> None:
-        """Set mean and deviation for the normalisation of a leaf, float64 [size]."""
+        """Set mean and standard deviation for the normalisation of a leaf, float64 [size] each.
+
+        Args:
+            leaf: index of the leaf in the observation space; it must be a vector.
+            mean: mean of the leaf's elements.
+            deviation: their standard deviation.
+        """
         raise NotImplementedError
 
 
@@ -75,7 +81,7 @@ class Normaliser(nn.Module):
         self.scale: Tensor
 
     def set(self, mean: Tensor, deviation: Tensor) -> None:
-        """Set mean and deviation, float64 [size]; constant elements are not rescaled."""
+        """Set mean and standard deviation, float64 [size]; constant elements are not rescaled."""
         self.mean.copy_(mean)
         self.scale.copy_(1 / torch.where(deviation > 0, deviation, 1))
 
@@ -85,7 +91,15 @@ class Normaliser(nn.Module):
 
 
 class VectorEncoder(Encoder):
-    """One fully connected layer, with optional normalisation of its input."""
+    """One fully connected layer, with optional normalisation of its input.
+
+    Args:
+        size: size of the vectors.
+        width: number of features.
+        activation: activation after the layer.
+        precision: dtype of the arithmetic.
+        normalised: whether the input is normalised.
+    """
 
     def __init__(
         self,
@@ -149,7 +163,14 @@ class CategoryEncoder(Encoder):
 
 
 class ImageEncoder(Encoder):
-    """Convolutions."""
+    """Convolutions of images whose values are scaled to [0, 1].
+
+    Args:
+        n_channels: channels of the input: those of an image, times the length of the stack.
+        channels: output channels of each layer.
+        activation: activation after each layer.
+        precision: dtype of the arithmetic.
+    """
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ class Evaluation(NamedTuple):
 
 
 def return_text(value: float) -> str:
-    """Format a return: one decimal, or three significant digits below 10.
+    """Format a return: one decimal, or up to three significant digits below 10.
 
     Environments differ by orders of magnitude: returns of 0 to 1 need more decimals.
     """
@@ -37,7 +37,10 @@ def return_text(value: float) -> str:
 
 
 def interval_text(mean: float, half: float) -> str:
-    """Format a mean and the half width of its interval, with as many decimals as that has."""
+    """Format a mean and the half width of its interval, with as many decimals as that needs.
+
+    These show its first significant digit, but are at least 1 and at most 6.
+    """
     if half == 0:
         return f"{return_text(mean)} ± 0.0"
     decimals = min(max(1, math.ceil(-math.log10(half))), 6)

@@ -44,6 +44,8 @@ class Examples(NamedTuple):
 
 @dataclass(frozen=True)
 class _Place:
+    """Where an episode is held: its row in the tables of episodes, and its pages of steps."""
+
     slot: int
     pages: IndexArray
 
@@ -204,8 +206,8 @@ class RankedExperience:
         """Label all trailing segments with lambda-returns as their desired returns.
 
         G_t = r_t + (1 - lambda) V(s_t+1) + lambda G_t+1. V is 0 after a terminal state. After a
-        truncation it is V of the last stored observation, because that after it is not kept. At the
-        environment's own limit it is 0 if the time left is observed.
+        truncation it is V of the last stored observation, because the next one is not stored. At
+        the environment's own limit it is 0 if the time left is observed.
 
         Args:
             expected: V at every step, not scaled, in the order of :meth:`steps`, [steps].
@@ -242,6 +244,7 @@ class RankedExperience:
         return stack.join(held._observations[self._row(slot[:, None], stack.times(t))])
 
     def _row(self, slot: IndexArray, t: IndexArray) -> IndexArray:
+        """Return the index of steps in the flat arrays, given their episodes' slots and times."""
         page = self._experience._page_table[slot, t // _PAGE]
         rows: IndexArray = page * _PAGE + t % _PAGE
         return rows

@@ -4,7 +4,7 @@ import errno
 
 FREE_DISK = "free some disk space"
 _RAISE_LIMIT = "raise the limit of open files, e.g. ulimit -n 4096"
-#: Reasons that another file or directory would not remove.
+#: Remedies for errors that choosing another file or directory would not fix.
 _REMEDIES = {
     errno.ENOSPC: FREE_DISK,
     errno.EDQUOT: FREE_DISK,

@@ -56,7 +56,11 @@ _OPERATORS = {"relu": "Relu", "tanh": "Tanh"}
 
 
 def acting_graph(network: NetworkSettings, spec: EnvironmentSpec) -> bytes:
-    """Return the graph of a run, an ONNX model with weights without values."""
+    """Return the graph of a run: an ONNX model whose weights have no values.
+
+    Raises:
+        ConfigError: a custom behavior function cannot be created or exported.
+    """
     graph = _Builder(network, spec)
     graph.logits()
     return graph.model()
@@ -272,10 +276,10 @@ class _Builder(Nodes):
             bias = self.weight(f"{name}.cell.bias_{of}_l0", 3 * size)
             all_ = self.append("Gemm", given, weight, bias, transB=1)
             gates.append([self.columns(all_, k * size, (k + 1) * size) for k in range(3)])
-        (r_in, z_in, n_in_), (r_then, z_then, n_then) = gates
-        r = self.append("Sigmoid", self.append("Add", r_in, r_then))
-        z = self.append("Sigmoid", self.append("Add", z_in, z_then))
-        new = self.append("Tanh", self.append("Add", n_in_, self.append("Mul", r, n_then)))
+        (r_in, z_in, new_in), (r_state, z_state, new_state) = gates
+        r = self.append("Sigmoid", self.append("Add", r_in, r_state))
+        z = self.append("Sigmoid", self.append("Add", z_in, z_state))
+        new = self.append("Tanh", self.append("Add", new_in, self.append("Mul", r, new_state)))
         # (1 - z) new + z before
         kept = self.append("Mul", z, self.append("Sub", before, new))
         self._states.append(self.append("Add", new, kept))

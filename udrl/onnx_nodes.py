@@ -40,7 +40,7 @@ class Nodes:
         return self.append("Slice", matrix, *where)
 
     def weight(self, name: str, *shape: int) -> str:
-        """Append a weight without values, float32. Networks that share it name it again."""
+        """Append a weight without values, float32; a name that exists refers to the same weight."""
         if name not in self._weights:
             self._weights.add(name)
             tensor = onnx.TensorProto(name=name, dims=shape, data_type=TensorProto.FLOAT)

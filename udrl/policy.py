@@ -65,6 +65,9 @@ class Policy:
 
         Args:
             rows: the rows of a batch whose episodes begin, bool [n]. None: all.
+
+        Raises:
+            InvalidData: the number of rows is not that of the batch so far.
         """
         if rows is None:
             self._state: MemoryState | None = None
@@ -140,6 +143,9 @@ class Policy:
             desired_return: likewise.
             desired_horizon: likewise.
             state: the memory. None: empty, as at the beginning of an episode.
+
+        Raises:
+            InvalidData: see :meth:`logits`.
         """
         seen, desired, n = self._inputs.convert(observation, desired_return, desired_horizon)
         if state is not None and len(state) != (n or 1):

@@ -62,7 +62,7 @@ class PolicyInputs:
             stacked = part.shape[1:]
             expected = stacked[1:] if length == 1 else joined
             if seen.shape not in ((*rows, *expected), (*rows, *stacked)):
-                if found := _of_other_number(seen.shape, n, (expected, stacked)):
+                if found := _count_mismatch(seen.shape, n, (expected, stacked)):
                     raise InvalidData(found)
                 raise InvalidData(
                     f"an observation{leaf.name} of shape {seen.shape}: expected "
@@ -99,10 +99,10 @@ def _commands(
     return (desired[None], None) if desired.ndim == 1 else (desired, len(desired))
 
 
-def _of_other_number(
+def _count_mismatch(
     shape: tuple[int, ...], n: int | None, singles: tuple[tuple[int, ...], ...]
 ) -> str | None:
-    """Return what is wrong if observations are valid, but not as many as the commands; else None.
+    """Return a message if valid observations are not as many as the commands, else None.
 
     Args:
         shape: shape of the observations.

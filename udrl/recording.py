@@ -9,9 +9,10 @@ from udrl.episode import Episode
 from udrl.frame_stack import FrameStack, Seen
 from udrl.spaces import Observations
 
+#: Rings whose content becomes part of an episode.
 _KEPT = ("observations", "actions", "rewards")
-_FIRST_CAPACITY = 1024
-_FIRST_BYTES = 64 << 20
+#: Upper bounds of the initial capacity, in rounds and in bytes; it is at least 64 rounds.
+_FIRST_CAPACITY, _FIRST_BYTES = 1024, 64 << 20
 
 
 class Recording:

@@ -21,7 +21,7 @@ Environment = gym.Env[Any, Any]
 
 _RESET = "(observation, info)"
 _STEP = "(observation, reward, terminated, truncated, info)"
-#: The largest reward.
+#: Largest absolute value of a reward.
 _LARGEST = float(np.finfo(np.float32).max)
 #: Python's message if an environment's step() has the interface of Gym before version 0.26.
 _OLD_STEP = "not enough values to unpack (expected 5, got 4)"
@@ -112,9 +112,13 @@ def close(env: Environment) -> None:
 
 
 def raised(where: str, error: BaseException) -> str:
-    """Return what a method of an environment raised, and the line of the environment's code.
+    """Describe an exception of an environment's method, with the line of the environment's code.
 
     That is the innermost line outside of installed packages, or the innermost one of all.
+
+    Args:
+        where: name of the method.
+        error: the exception.
     """
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(_INSTALLED)]

@@ -16,17 +16,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from udrl.errors import InvalidData
-from udrl.spaces import (
-    Key,
-    Space,
-)
+from udrl.spaces import Key, Space
 
 Array = npt.NDArray[Any]
 #: Keys of dictionaries and indices of tuples that lead to a leaf.
 Path = tuple[Key, ...]
 
-#: Maximum number of elements in a lookup table, and in a message.
-_FEW = 1000
+#: Maximum number of elements to list, in a lookup table or in a message.
+_MAX_LISTED = 1000
 
 
 class Conversion(ABC):
@@ -108,10 +105,10 @@ class Indexed(Conversion):
     def __init__(self, name: str, declared: "spaces.Discrete[Any]", plain: Space) -> None:
         super().__init__(name, declared, plain)
         self._start, self._n = int(declared.start), int(declared.n)
-        self._back = list(self.back(np.arange(self._n))) if self._n <= _FEW else None
+        self._back = list(self.back(np.arange(self._n))) if self._n <= _MAX_LISTED else None
 
     def one(self, value: Any) -> Any:
-        """Plain, with a fast path for integers."""
+        """Convert one element to an index, of the plain dtype; integers take a fast path."""
         if type(value) is int or isinstance(value, np.integer):
             index = int(value) - self._start
             if 0 <= index < self._n:
@@ -160,7 +157,7 @@ class MultiIndexed(Conversion):
         if ((shifted < 0) | (shifted >= self._ns)).any():
             raise InvalidData(
                 f"{self.name}: {array.tolist()}, expected an element of {self.declared}"
-                if array.size <= _FEW
+                if array.size <= _MAX_LISTED
                 else f"{self.name}: an invalid index, expected an element of {self.declared}"
             )
         return shifted.astype(self.plain.dtype)

@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from udrl.config import Config
 
-#: Our extras that install a package, by words in the messages about a missing one.
+#: Extras of this project, by the word for the missing package in an exception's message.
 _EXTRAS = {
     "Box2D": "box2d",
     "pygame": "box2d",

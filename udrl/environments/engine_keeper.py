@@ -16,6 +16,7 @@ from pathlib import Path
 #: Environment variable that marks the engines of an owner.
 MARK = "UDRL_ENGINES_OF"
 
+#: Command-line argument of an engine that comes before its instance id.
 _INSTANCE = b"+viz_instance_id"
 #: Number of scans without a match before exit: an engine may just be starting.
 _SCANS = 3

@@ -168,9 +168,9 @@ def is_image(space: spaces.Space[Any]) -> bool:
 
 
 def channel_axis(space: spaces.Box) -> int | None:
-    """Return which dimension of an image has its channels, 0 or 2; None: there are only two.
+    """Return the dimension of an image that holds its channels, 0 or 2; None: it has no channels.
 
-    Spaces do not declare it: it is the smallest.
+    Spaces do not declare it: it is 0 if no dimension is smaller than the first, otherwise 2.
     """
     if len(space.shape) == 2:
         return None

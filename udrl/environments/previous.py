@@ -97,7 +97,8 @@ def add_previous(
 
     Args:
         space: space of the actions.
-        observations: arrays of one more than actions (:meth:`.conversions.Conversion.convert`).
+        observations: arrays with one element more than ``actions`` has
+            (:meth:`.conversions.Conversion.convert`).
         actions: arrays of the environment's actions.
         rewards: one for each action.
     """
