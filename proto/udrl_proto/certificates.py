@@ -13,6 +13,7 @@ from cryptography.x509.oid import NameOID
 
 from udrl.errors import ConfigError
 
+#: Remedy for a damaged key or certificate.
 _ANEW = "copy it again, or create new keys with `udrl keys create`"
 
 

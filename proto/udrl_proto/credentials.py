@@ -23,7 +23,7 @@ _EXAMINE_S = 1.0
 _VERDICT_S = 0.3
 #: OpenSSL's codes for a mismatch of host name or IP address.
 _OTHER_NAME = (62, 64)
-#: Parts of OpenSSL's names for a server's rejection of our certificate.
+#: Parts of the names of OpenSSL's errors if a server rejects our certificate.
 _REJECTIONS = ("CERTIFICATE", "UNKNOWN_CA", "DECRYPT_ERROR")
 
 _SAME_KEYS = "both sides need keys from the same `udrl keys create`"

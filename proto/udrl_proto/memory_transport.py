@@ -93,6 +93,8 @@ class MemoryTransport:
 
 
 class _Declared:
+    """A declaration that a function withdraws."""
+
     def __init__(self, undeclare: Callable[[], object]) -> None:
         self._undeclare = undeclare
 

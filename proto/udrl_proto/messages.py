@@ -25,7 +25,7 @@ Positive = Annotated[int, Meta(ge=1, le=MAX_NUMBER)]
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Role = Literal["actor", "learner"]
 
-#: Most episodes in one request of a learner.
+#: Maximum number of episodes in one request of a learner.
 MAX_EPISODES = 100_000
 
 
@@ -112,6 +112,7 @@ class JoinRequest(Message, frozen=True, kw_only=True):
     """Request of an actor or learner to join the run.
 
     Attributes:
+        role: the role that it joins in.
         id: unique to this process.
         host: name of its machine.
         pid: id of its process.
@@ -203,7 +204,7 @@ class ChangesRequest(Message, frozen=True, kw_only=True):
 
 
 class ChangesReply(Message, frozen=True, kw_only=True):
-    """The buffer's episodes by rank, least return first; or the reason to wait; or the end."""
+    """The buffer's episodes by rank, lowest return first; or the reason to wait; or the end."""
 
     ids: tuple[Number, ...] = ()
     wait: Wait | None = None

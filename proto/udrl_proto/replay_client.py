@@ -23,7 +23,7 @@ log = logging.getLogger("udrl")
 ATTEMPT_S, LONGEST_ATTEMPT_S = 3.0, 30.0
 #: Seconds that a service retries a request without a reply.
 PATIENCE_S = 300.0
-#: Most times that a service rejoins for one request before it raises the refusal.
+#: Maximum number of times that a service rejoins for one request before it raises the refusal.
 _JOINS = 5
 
 
@@ -72,11 +72,11 @@ class ReplayClient:
         while not self._stop.is_set():
             sent = time.monotonic()
             key = key_expressions.key(self._run_id, verb.name)
-            for answer in self._transport.query(key, payload, attempt_s):
-                if answer.is_problem:
-                    problem = decode(answer.data, Problem)
+            for reply in self._transport.query(key, payload, attempt_s):
+                if reply.is_problem:
+                    problem = decode(reply.data, Problem)
                     raise Refused(problem.code, printable(problem.message))
-                return decode(answer.data, verb.reply, verb.reply_limit)
+                return decode(reply.data, verb.reply, verb.reply_limit)
             now = time.monotonic()
             if now - sent >= attempt_s:
                 attempt_s = min(2 * attempt_s, LONGEST_ATTEMPT_S)
@@ -88,7 +88,7 @@ class ReplayClient:
                 )
             if waited >= warn_at:
                 log.warning(
-                    "%s has been waiting %.0f s for the replay service to answer %r",
+                    "%s has been waiting %.0f s for the replay service to reply to %r",
                     self._who, waited, verb.name,
                 )  # fmt: skip
                 warn_at *= 2
@@ -99,7 +99,16 @@ class ReplayClient:
     def request_joined(
         self, verb: Verb[Request, Reply], request: Request | bytes, join: JoinRequest
     ) -> Reply:
-        """Send a request as :meth:`request` does; rejoin if the replay service was restarted."""
+        """Send a request like :meth:`request`; rejoin if the replay service was restarted.
+
+        Args:
+            verb: the kind of request.
+            request: its message, encoded or not.
+            join: the request to join with.
+
+        Raises:
+            UdrlError: see :meth:`request`.
+        """
         for _ in range(_JOINS):
             try:
                 return self.request(verb, request)

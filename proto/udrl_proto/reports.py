@@ -7,9 +7,9 @@ from msgspec import Meta
 
 from udrl_proto.messages import MAX_NUMBER, Message, Name, Number, Text
 
-#: Iterations in one :class:`History`.
+#: Maximum number of iterations in one :class:`History`.
 HISTORY_PAGE = 2000
-#: Episodes and commands in one :class:`Contents`.
+#: Maximum number of episodes and of commands in one :class:`Contents`.
 MOST_SHOWN = 2000
 
 
@@ -187,7 +187,7 @@ class Contents(Message, frozen=True, kw_only=True):
 
     Attributes:
         iteration: the iteration after which the buffer is shown.
-        returns: returns of the episodes, least first; a regular subset if there are more than
+        returns: returns of the episodes, lowest first; a regular subset if there are more than
             :data:`MOST_SHOWN`.
         lengths: lengths of the same episodes, steps.
         iterations: the iterations that produced them.

@@ -34,7 +34,7 @@ _FIRST_PAUSE_S = 0.05
 #: Milliseconds after which a service that hangs or is cut off is noticed.
 LEASE_MS = 2000
 
-#: Most clients of a router; Zenoh's default is 1,000.
+#: Maximum number of clients of a router; Zenoh's default is 1,000.
 MAX_SESSIONS = 11_000
 
 
@@ -186,6 +186,12 @@ def connect(
     credentials: Credentials | None = None,
 ) -> zenoh.Session:
     """Open a session with the router at an endpoint, retrying until it is reachable.
+
+    Args:
+        endpoint: where the router listens.
+        patience_s: seconds to retry.
+        stop: ends the wait.
+        credentials: proof of a role, for a ``tls/`` endpoint.
 
     Raises:
         ConfigError: the endpoint is malformed, or one side does not trust the other's keys.

@@ -186,8 +186,8 @@ def test_long_wait_is_logged_with_service_and_verb(
     with caplog.at_level(logging.WARNING, "udrl"), pytest.raises(Unreachable):
         learner.request(verbs.STATE, REQUEST)
     assert [record.getMessage() for record in caplog.records] == [
-        "learner l has been waiting 2 s for the replay service to answer 'state'",
-        "learner l has been waiting 4 s for the replay service to answer 'state'",
+        "learner l has been waiting 2 s for the replay service to reply to 'state'",
+        "learner l has been waiting 4 s for the replay service to reply to 'state'",
     ]
 
 
