@@ -31,9 +31,9 @@ from udrl_proto.text import as_json
 
 log = logging.getLogger("udrl")
 
-#: Most stages at once; each has its own environment.
+#: Maximum number of stages at once; each has its own environment.
 MOST_STAGES = 8
-#: Largest request to a stage, bytes; the web server checks it.
+#: Maximum size of a request to a stage, in bytes; the web server checks it.
 MOST_BYTES = 4096
 #: Seconds without a request after which an idle stage is closed.
 IDLE_S = 300.0
@@ -134,7 +134,11 @@ class _Guard:
         except ValueError:
             return PlainTextResponse("Invalid Host or Origin header.", 400)
         if self._hosts and name not in self._hosts:
-            return PlainTextResponse(f"This board is not served as {name!r}.", 421)
+            return PlainTextResponse(
+                f"This board is not served as {name!r}; open the address that `udrl board` "
+                f"printed.",
+                421,
+            )
         if page != host and origin not in self._origins:
             return PlainTextResponse(
                 f"Requests from {origin} are not allowed; if the board is behind a proxy with this "

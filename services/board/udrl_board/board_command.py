@@ -123,7 +123,8 @@ def _serve(server: "uvicorn.Server", listener: socket.socket, stop: threading.Ev
 def _check_token(token: str) -> None:
     if not re.fullmatch(r"[A-Za-z0-9._~-]{1,200}", token):
         raise ConfigError(
-            "--token: expected only letters, digits and . _ ~ -, since it is part of an address"
+            "--token: expected 1 to 200 letters, digits and . _ ~ -, because it is part of an "
+            "address"
         )
 
 

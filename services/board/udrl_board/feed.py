@@ -16,7 +16,7 @@ from udrl_proto.reports import Contents, EvaluationStatus, IterationStatus, Stat
 
 #: Seconds between queries of the run.
 FRESH_S = 1.0
-#: Most pages of history in one update; the rest follows with the next.
+#: Maximum number of pages of history in one query of the run; the next query reads on.
 _PAGES = 20
 
 

@@ -32,6 +32,7 @@ from udrl_replay.store import Store
 log = logging.getLogger("udrl")
 
 Found = TypeVar("Found")
+#: A weights version, by number or by name.
 Wanted = int | Literal["latest", "best"]
 
 #: Seconds for which a service that did not reply gets no further request.
@@ -118,7 +119,7 @@ class Stored:
         return read_status(self._run_dir)
 
     def history(self, after: int) -> History:
-        """Return the iterations after one, or the first of them."""
+        """Return a page of the iterations after ``after``."""
         with closing(Store(self._run_dir, read_only=True)) as store:
             return history(store, after)
 
@@ -171,7 +172,7 @@ class Served:
         return self._query(lambda client: client.request(verbs.STATUS, StatusRequest()))
 
     def history(self, after: int) -> History:
-        """Return the iterations after one, or the first of them."""
+        """Return a page of the iterations after ``after``."""
         request = HistoryRequest(after=after)
         return self._query(lambda client: client.request(verbs.HISTORY, request))
 
@@ -215,7 +216,7 @@ class Served:
     def _disconnect(self) -> None:
         """Disconnect from the router, without waiting for a service that hangs."""
         self._connection, stack = None, self._stack.pop_all()
-        threading.Thread(target=stack.close, name="leaving", daemon=True).start()
+        threading.Thread(target=stack.close, name="disconnecting", daemon=True).start()
 
 
 class Directory:
@@ -232,7 +233,7 @@ class Directory:
         self._stored = Stored(run_dir)
         self._served: tuple[str, Served] | None = None
         self._silent_since = float("-inf")
-        self._why = ""
+        self._silent_because = ""
         self._lock = threading.Lock()
 
     def place(self) -> RunLocation:
@@ -243,7 +244,8 @@ class Directory:
         """Return a message if there is a replay service that does not reply."""
         if served_at(self._run_dir) is None or not self._is_silent():
             return ""
-        return f"The replay service does not reply; the board shows the run's file: {self._why}"
+        why = self._silent_because
+        return f"The replay service does not reply; the board shows the run's file: {why}"
 
     def hello(self) -> Hello:
         """Return the run's specification."""
@@ -254,7 +256,7 @@ class Directory:
         return self._query(lambda source: source.status())
 
     def history(self, after: int) -> History:
-        """Return the iterations after one, or the first of them."""
+        """Return a page of the iterations after ``after``."""
         return self._query(lambda source: source.history(after))
 
     def contents(self) -> Contents:
@@ -284,7 +286,8 @@ class Directory:
             except Refused as error:
                 log.debug("reading %s, since the replay service refused: %s", self._run_dir, error)
             except (PeerError, ConfigError) as error:
-                self._silent_since, self._why = time.monotonic(), str(error)
+                self._silent_since = time.monotonic()
+                self._silent_because = str(error)
         return query(self._stored)
 
     def _is_silent(self) -> bool:

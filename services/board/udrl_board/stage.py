@@ -42,10 +42,11 @@ from udrl_show.playing import filmed, fps_of
 
 log = logging.getLogger("udrl")
 
-#: Most requests that may wait.
+#: Maximum number of waiting requests.
 _MOST_REQUESTS = 64
-#: Most frames per second; faster environments skip frames.
+#: Maximum frames per second; faster environments skip frames.
 _FPS = 30.0
+#: Quality of JPEG pictures, 1 to 100.
 _QUALITY = 80
 
 Show = Callable[[Moment | StageProblem, bytes | None], None]
@@ -76,7 +77,7 @@ class Stage(threading.Thread):
         self._is_paused = False
         self._is_changed = False
         self._speed = 1.0
-        self._due = 0.0
+        self._due = 0.0  # time of the next frame, seconds
         self._closed = threading.Event()
 
     @property

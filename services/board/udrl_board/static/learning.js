@@ -47,7 +47,7 @@ export class Learning {
     this.loss.show(xs, [rows.map((r) => r.loss ?? undefined)], last.loss == null ? "Nothing is trained yet." : `${number(last.loss, 3)} in the last iteration.`,
       after((i) => number(rows[i].loss, 3), rows));
     const trained = rows.filter((r) => r.iteration > 0); // all warm-up episodes are among the best so far
-    this.admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)], `${number(last.admitted)} of the last iteration.`,
+    this.admitted.show(trained.map((r) => r.env_steps), [trained.map((r) => r.admitted)], `${number(last.admitted)} from the last iteration.`,
       after((i) => number(trained[i].admitted), trained));
   }
 

@@ -43,7 +43,7 @@ export function showRun(known) {
     ["results", status.exact ? "exact" : "not exact"],
     ["iteration", number(status.iteration)],
     ["weights", `version ${status.weights_version}`],
-    ["lag of the weights", `${count(status.weights_lag, "version")}, ${number(status.weights_lag_s)} s`],
+    ["weights lag", `${count(status.weights_lag, "version")}, ${number(status.weights_lag_s)} s`],
     ["loss", number(status.loss, 3)],
     ["env steps in evaluations", number(status.eval_env_steps)],
     ["commands issued", number(c.issued)],
