@@ -21,7 +21,7 @@ from udrl_experiments.study import Study, StudyFolders
 from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
-#: Table and figure for each x axis, without suffix.
+#: File names, without suffix, of the table and the figure for each x axis.
 _FILES = {
     "env_steps": ("curves", "learning-curves"),
     "wall_s": ("curves-wall-time", "learning-curves-wall-time"),

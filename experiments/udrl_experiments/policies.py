@@ -36,6 +36,7 @@ _RMS_PROP_EPS = 1e-5
 
 #: Attributes of a model that are part of its state, besides tensors.
 _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
+#: Arrays of DQN's replay buffer, which are part of the state as tensors.
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 

@@ -113,7 +113,9 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
     try:
         file = msgspec.convert(values, _File)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {error}; the page on studies shows a file") from error
+        raise ConfigError(
+            f"{source}: {error}; the documentation's page on studies has an example"
+        ) from error
     for name in file.networks:
         if name not in NETWORKS:
             raise ConfigError(

@@ -25,10 +25,10 @@ from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
-#: Interval at which the watchdog is re-armed, as a fraction of its timeout. Each time starts a
-#: thread; four times a second took 2 % of an actor's time.
+#: Interval at which the watchdog is re-armed, as a fraction of its timeout. Re-arming starts a
+#: thread; doing so four times a second took 2 % of an actor's time.
 _REARM_PART = 0.05
-#: Least timeout for creating an environment, and for the probe, seconds.
+#: Minimum timeout for creating an environment, and for the probe, in seconds.
 _MAKING_S = 300.0
 
 

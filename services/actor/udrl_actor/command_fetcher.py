@@ -60,10 +60,10 @@ class CommandFetcher(threading.Thread):
         self._stop_event = stop
         self._changed = threading.Condition()
         self._assignments: deque[Assignment] = deque()
-        self._held: set[int] = set()
-        self._free = 0
-        self._steps = 0
-        self._acknowledged = False
+        self._held: set[int] = set()  # ids of commands without an acknowledged outcome
+        self._free = 0  # idle environments
+        self._steps = 0  # env steps since the last rate was computed
+        self._acknowledged = False  # whether an outcome was acknowledged since the last request
         self._behaviors = Behaviors(hello, client, self._changed)
         self.ended = False
         self.error: Exception | None = None

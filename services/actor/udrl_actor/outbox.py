@@ -20,8 +20,9 @@ from udrl_proto.replay_client import ReplayClient
 
 log = logging.getLogger("udrl")
 
+#: Number of threads, each with one delivery in transit.
 _THREADS = 8
-#: Most bytes of observations in transit at once; a larger episode is sent alone.
+#: Maximum size of observations in transit, in bytes; a larger episode is sent alone.
 _BYTES_IN_TRANSIT = 256 * 1024
 #: Interval at which a waiting thread checks whether the outbox is closed, seconds.
 _CLOSED_CHECK_S = 0.5

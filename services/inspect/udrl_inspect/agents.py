@@ -28,7 +28,7 @@ from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
-#: Seconds between tracebacks of a command that is reproduced.
+#: Seconds between tracebacks while a command is reproduced.
 _TRACEBACK_S = 60.0
 
 
@@ -36,7 +36,11 @@ class Agent(NamedTuple):
     """A trained behavior function and the state of its run.
 
     Attributes:
+        run_id: id of the run.
+        config: settings of the run.
+        environment: specification of its environment.
         version: weights version.
+        behavior: the behavior function of this version.
         buffer: replay buffer after ``iteration``.
         iteration: last completed iteration of the run.
         weights: the version's weights, safetensors.
@@ -70,6 +74,7 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
     Raises:
         ConfigError: the version is neither a number nor ``latest`` or ``best``.
         StoreError: the directory holds no run, or the run does not keep that version.
+        InvalidWeights: the weights do not belong to the run's graph.
     """
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)

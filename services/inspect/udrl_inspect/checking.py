@@ -28,7 +28,7 @@ from udrl.spaces import Image, ObservationSpace, leaves_of, parts_of
 _EPISODES = 20
 _PATIENCE_S = 20.0
 _MIB = 2**20
-#: Images that are never brighter, of 255, may hold indices.
+#: Images whose values never exceed this, of 255, may hold indices.
 _DARK = 31
 
 
@@ -89,7 +89,7 @@ def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
 
     Raises:
         UnsupportedEnvironment: it cannot be created or is not supported.
-        EnvironmentFault: it raised, or returned an invalid value.
+        EnvironmentFault: it raised an exception, or returned an invalid value.
     """
     before, began = _memory(), time.perf_counter()
     env = make_environment(config)

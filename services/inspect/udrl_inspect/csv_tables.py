@@ -27,8 +27,12 @@ def write(path: Path, kind: type[AnyRow], rows: Iterable[AnyRow]) -> None:
 def read(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     """Return the rows of a file.
 
+    Args:
+        path: the file.
+        kind: type of the rows, whose fields are the columns.
+
     Raises:
-        InvalidData: the file is no such table.
+        InvalidData: the file cannot be read, has other columns, or has an invalid value.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:

@@ -150,7 +150,7 @@ def check_model_name(path: Path) -> None:
     """Check the extension of an ONNX model's file name.
 
     Raises:
-        ConfigError: the extension is another.
+        ConfigError: the name does not end with ``.onnx``.
     """
     if path.suffix != ".onnx":
         raise ConfigError(f"--onnx {path}: expected a name that ends with .onnx")

@@ -9,7 +9,7 @@ import msgspec
 from udrl.evaluation import return_text
 from udrl_inspect.obedience_report import TOLERANCE, ObediencePoint, ObedienceReport
 
-#: Least correlation at which means follow their commands without obeying them.
+#: Minimum correlation at which obtained means count as following commands that are not obeyed.
 _FOLLOWS = 0.8
 
 _HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "mean length", ""

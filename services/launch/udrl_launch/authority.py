@@ -24,7 +24,9 @@ from udrl_proto.credentials import CA, CERTIFICATE, KEY, load_credentials
 #: Folder of the authority itself, which is not copied to other machines, and its key file.
 AUTHORITY, AUTHORITY_KEY = "ca", "ca.key"
 
+#: Names of the loopback interface, for which the replay service's certificate is always valid.
 _ALWAYS = ("localhost", "127.0.0.1", "::1")
+#: A part of a host name, and a host name.
 _LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(?:\.{_LABEL})*")
 #: Clocks differ between machines, so certificates are valid from slightly earlier.
@@ -160,6 +162,11 @@ def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def _alternative(host: str) -> x509.GeneralName:
+    """Return a host as an alternative name of a certificate's subject.
+
+    Raises:
+        ConfigError: it is neither a host name nor an IP address.
+    """
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from udrl.errors import ConfigError
 
+#: Working directory at the start of the command.
 STARTED_IN = Path.cwd()
 
-#: Where the parent looks for modules; a child appends these to its own search path.
+#: Environment variable with the parent's module search path, which a child appends to its own.
 _MODULE_PATH = "UDRL_MODULE_PATH"
 
 

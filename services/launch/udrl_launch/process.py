@@ -21,7 +21,7 @@ GRACE_S, PARENTS_GRACE_S = 3.0, 4.5
 
 _PR_SET_PDEATHSIG = 1
 
-#: Open files: six for each service that may join.
+#: Limit of open files to set: six for each service that may join.
 _MOST_FILES = 65_536
 
 #: Parameters of the C library's ``mallopt``.

@@ -62,7 +62,7 @@ def _from_file(file: Path, environment: str) -> dict[str, Any]:
     return values
 
 
-#: Most environments per actor by default; more rows per call gain little.
+#: Maximum number of environments per actor by default; more rows per call gain little.
 _MOST_ENVS = 16
 
 

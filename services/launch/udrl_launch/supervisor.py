@@ -19,7 +19,7 @@ FINAL_CODES = frozenset({2, 7, 8, 9, 10})
 
 #: Deaths of a child without progress in between after which the run fails.
 _MOST_DEATHS = 6
-#: Longest log of a child, bytes; when it is longer, only the last quarter is kept.
+#: Maximum size of a child's log, in bytes; if it is larger, only the last quarter of this is kept.
 _LONGEST_LOG = 1 << 20
 #: Seconds for services to end after the run has ended or after SIGTERM.
 END_S = 4.0
@@ -35,12 +35,14 @@ class Child:
     Attributes:
         name: name in log messages, and of the log file.
         arguments: arguments of the ``udrl`` command.
+        log_file: file for its standard output and standard error.
         prefix: another program, with its arguments, that runs the command, e.g. in a container.
+        process: the process; None before the first start.
         starts: number of starts.
         deaths: number of deaths since the last progress.
         work: progress at the last death.
         done: whether it has ended and is not restarted.
-        done_at: when it was, seconds.
+        done_at: when that was noticed, in seconds on the monotonic clock.
     """
 
     name: str

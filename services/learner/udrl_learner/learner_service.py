@@ -41,7 +41,7 @@ from udrl_proto.transport import Transport
 
 log = logging.getLogger("udrl")
 
-#: Episodes in one request; the reply usually has fewer.
+#: Maximum number of episodes in one request; the reply usually has fewer.
 _EPISODES_PER_REQUEST = 10_000
 
 #: Pauses before the restarts of a learner without progress, seconds; after the last it gives up.
@@ -138,28 +138,28 @@ class LearnerService:
         """Train from the latest version; start over whenever the replay service expects another.
 
         Raises:
-            Refused: there is no progress after the last of the pauses either.
+            Refused: there is still no progress after the last pause.
         """
-        began_with, in_vain = -1, 0
+        began_with, failures = -1, 0
         while True:
             state = self._latest()
             if state.version > began_with:
-                in_vain = 0  # another learner was faster
+                failures = 0  # another learner was faster
             began_with, self._delivered = state.version, False
             refusal = self._train_from(state)
             if refusal is None:
                 return
             log.warning("learner %s starts over: %s", self._name, refusal)
-            in_vain = 0 if self._delivered else in_vain + 1
-            if in_vain > len(_PAUSES_S):
+            failures = 0 if self._delivered else failures + 1
+            if failures > len(_PAUSES_S):
                 raise Refused(
                     refusal.code,
-                    f"learner {self._name} failed {in_vain} times to train the version after "
+                    f"learner {self._name} failed {failures} times to train the version after "
                     f"{began_with}: {refusal}; the replay service is inconsistent: stop it and "
                     f"restart it with --resume",
                 )
-            if in_vain:
-                self._stop.wait(_PAUSES_S[in_vain - 1])
+            if failures:
+                self._stop.wait(_PAUSES_S[failures - 1])
 
     def _latest(self) -> TrainingState:
         """Return the state of the replay service's latest version."""
@@ -176,15 +176,15 @@ class LearnerService:
         Returns the refusal if the replay service expects a version other than the next one here.
         """
         experience = Experience(self._config, self._spec)
-        useless = threading.Event()
+        abandoned = threading.Event()
         with ThreadPoolExecutor(2, f"learner {self._name}") as pool:
             try:
-                fetched = pool.submit(self._fetch, state.version + 1, experience.ids(), useless)
+                fetched = pool.submit(self._fetch, state.version + 1, experience.ids(), abandoned)
                 delivered: Future[None] | None = None
                 while (buffer := self._result(fetched, delivered)) is not None:
                     self._take(experience, buffer)
                     following = state.version + 2
-                    fetched = pool.submit(self._fetch, following, experience.ids(), useless)
+                    fetched = pool.submit(self._fetch, following, experience.ids(), abandoned)
                     began = time.monotonic()
                     train(state, experience.by_rank(list(buffer.ids)), self._config)
                     message = self._message(state, time.monotonic() - began)
@@ -198,7 +198,7 @@ class LearnerService:
                     raise
                 return refusal
             finally:
-                useless.set()
+                abandoned.set()
                 self._progress.set()
             return None
 
@@ -235,15 +235,15 @@ class LearnerService:
 
     # Called in threads, in parallel with training.
 
-    def _fetch(self, version: int, held: set[int], useless: threading.Event) -> Buffer | None:
+    def _fetch(self, version: int, held: set[int], abandoned: threading.Event) -> Buffer | None:
         """Wait for the buffer that a version is trained on; None: the run or the wait has ended.
 
         Args:
             version: the version to train.
             held: ids of episodes that need not be fetched.
-            useless: ends the wait.
+            abandoned: set when the buffer is no longer needed; ends the wait.
         """
-        while not useless.is_set():
+        while not abandoned.is_set():
             self._progress.clear()
             request = ChangesRequest(learner=self._name, version=version)
             changes = self._client.request_joined(verbs.CHANGES, request, self._join)

@@ -13,7 +13,7 @@ from udrl_proto.messages import JoinRequest, Role
 from udrl_replay.dispatching import MOST_ACTORS
 from udrl_replay.run import StoredRun
 
-#: Most learners remembered; the one whose last join is oldest is forgotten first.
+#: Maximum number of learners to remember; the one whose last join is oldest is forgotten first.
 _MOST_LEARNERS = 1000
 
 

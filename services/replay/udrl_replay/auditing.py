@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from udrl.commands import Command
 
-#: Most audits open at once.
+#: Maximum number of open audits.
 MOST_OPEN = 256
 
 

@@ -79,7 +79,7 @@ def create_run(
     Raises:
         ConfigError: the command strategy cannot be created, or the dataset cannot be used.
         UnsupportedEnvironment: the environment does not exist or is not supported.
-        EnvironmentFault: the environment raises, or returns an invalid value.
+        EnvironmentFault: the environment raised an exception, or returned an invalid value.
         StoreError: the directory already holds a run, or cannot be written.
     """
     with no_empty_folder_left(run_dir):

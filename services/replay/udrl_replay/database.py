@@ -23,7 +23,7 @@ from udrl_replay.tallies import TALLIES, Tallies, Tally
 
 STORE_FILE = "run.sqlite"
 LOCK = "lock"
-#: Seconds to retry for the lock; :func:`is_locked` holds it only briefly.
+#: Seconds to retry to take the lock; :func:`is_locked` holds it only briefly.
 _LOCK_RETRY_S = 0.2
 
 #: Tables whose rows may be replaced.

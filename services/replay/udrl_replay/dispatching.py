@@ -21,11 +21,11 @@ from udrl_proto.messages import CommandsRequest, JoinRequest
 
 #: Multiple of the expected duration after which a command is a straggler.
 STRAGGLER = 3.0
-#: Most commands in one reply, to keep the message small.
+#: Maximum number of commands in one reply, to keep the message small.
 MAX_ASSIGNED = 4096
 #: Seconds of silence after which an actor without a liveliness token is forgotten.
 SILENCE_S = 30.0
-#: Most actors that may have joined at once; each costs a little memory.
+#: Maximum number of actors that have joined; each costs a little memory.
 MOST_ACTORS = 10_000
 #: Number of actors that vanished while they held a command, after which it is run alone.
 SUSPICIOUS = 3

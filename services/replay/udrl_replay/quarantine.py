@@ -11,9 +11,9 @@ log = logging.getLogger("udrl")
 
 #: Invalid deliveries after which an actor is quarantined.
 OFFENCES = 10
-#: Most actors whose offences are counted at once.
+#: Maximum number of actors whose offences are counted.
 _MOST_COUNTED = 1000
-#: Most quarantined actors remembered; the oldest is forgotten first.
+#: Maximum number of quarantined actors to remember; the oldest is forgotten first.
 _MOST_REMEMBERED = 1000
 
 

@@ -70,9 +70,10 @@ from udrl_replay.store import Store, Version
 
 log = logging.getLogger("udrl")
 
-#: Most requests that may wait, and their bytes; others are dropped, and their senders retry.
+#: Maximum number of waiting requests, and of their bytes; others are dropped, and their senders
+#: retry.
 _INBOX, _INBOX_BYTES = 4096, 512 << 20
-#: Most requests in one transaction, and bytes after which no more are added.
+#: Maximum number of requests in one transaction, and bytes after which no more are added.
 _GROUP, _GROUP_BYTES = 64, 8 << 20
 #: Seconds that the service stays after the end of the run, so that all its peers learn of it.
 _LINGER_S = 10.0
@@ -116,7 +117,8 @@ class ReplayService:
         self._inbox: Inbox[ReceivedRequest | Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
         self._waits = Waits()
-        self._here: set[tuple[str, str]] = set()
+        self._here: set[tuple[str, str]] = set()  # role and name of the connected services
+        # To measure the lag from the delivery of a version to the first command with it.
         self._version_at = 0.0
         self._acting_with = self.run.progress.latest_version
         self._lag_s = 0.0
@@ -174,7 +176,10 @@ class ReplayService:
         self._metrics.close()
 
     def open(self) -> list[Declaration]:
-        """Start to receive requests, which are checked on the thread that receives them."""
+        """Start to receive requests, and return the declarations; undeclare them to stop.
+
+        Requests are checked on the thread that receives them.
+        """
         spec = self.run.hello.environment
         shapes = weight_shapes(self.run.hello.graph)
         with_critic = optimizer_shapes(shapes, critic_shapes(self.run.config.network, spec))

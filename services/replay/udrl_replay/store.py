@@ -147,7 +147,7 @@ class Store(Database):
         self.remove_episodes(i for (i,) in rows)
 
     def buffer(self, iteration: int) -> list[StoredEpisode]:
-        """Return the buffer as it was after an iteration, least return first."""
+        """Return the buffer as it was after an iteration, lowest return first."""
         rows = self._rows(
             "SELECT episode_return, id, length, digest FROM episodes "
             "WHERE admitted <= ? AND (evicted IS NULL OR evicted > ?) ORDER BY episode_return, id",
@@ -231,7 +231,7 @@ class Store(Database):
         return _evaluation_row(rows[0]) if rows else None
 
     def best_evaluation(self) -> float | None:
-        """Return the greatest mean return of all evaluations, the final evaluation included."""
+        """Return the highest mean return of all evaluations, the final evaluation included."""
         ((best,),) = self._rows("SELECT max(mean) FROM evaluations")
         return None if best is None else float(best)
 

@@ -43,7 +43,7 @@ _COLUMNS = (
 
 #: Label and divisor of the x-axis.
 _X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time, minutes", 60.0)}
-#: Most settings in the label of a line.
+#: Maximum number of settings in the label of a line.
 _MOST_NAMED = 3
 
 

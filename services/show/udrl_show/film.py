@@ -13,10 +13,11 @@ from udrl.file_remedies import file_remedy
 
 Picture = npt.NDArray[np.uint8]
 
+#: Height of the caption, in pixels.
 _CAPTION_HEIGHT = 26
-#: Least width of a video, pixels; smaller frames are enlarged.
+#: Minimum width of a video, in pixels; smaller frames are enlarged.
 _LEAST_WIDTH = 320
-#: Most frames per second of a GIF; browsers slow down faster ones.
+#: Maximum frames per second of a GIF; browsers slow down faster ones.
 _GIF_FPS = 25
 #: Options of ffmpeg for each kind of file.
 _FFMPEG_OPTIONS = {

@@ -12,7 +12,7 @@ from udrl_show.scalars import Scalar
 
 #: Tags: the run's id here, by which a resumed run is found; why it ended.
 _RUN_ID, _ENDED = "udrl.run_id", "udrl.ended_because"
-#: The most metrics, and parameters, that a server accepts at once.
+#: Maximum number of metrics, and of parameters, that a server accepts at once.
 _MOST_METRICS, _MOST_PARAMETERS = 1000, 100
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 #: File name extensions of figures.
 _EXTENSIONS = (".png", ".svg", ".pdf")
-#: Most panels in a row.
+#: Maximum number of panels in a row.
 _MOST_COLUMNS = 3
 
 

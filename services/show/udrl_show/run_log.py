@@ -41,7 +41,7 @@ class Writer(Protocol):
     """Writes scalars in the format of another program.
 
     Attributes:
-        place: where the log is, for people. Empty until it has begun.
+        place: location of the log, as text for the user. Empty until the log has begun.
     """
 
     place: str

@@ -55,7 +55,7 @@ class RowScalars:
     def __init__(self, eval_episodes: int) -> None:
         self._eval_episodes = eval_episodes
         self._env_steps = 0
-        self._timed = 0, 0.0
+        self._timed = 0, 0.0  # env steps and wall time at the last value of time/fps
 
     def of(self, row: dict[str, str]) -> list[Scalar]:
         """Return the scalars of the next row."""

@@ -12,9 +12,8 @@ KEYS_HELP = (
     "horizon; g = greedy; q = quit"
 )
 
-_LEAST_WIDTH = 480
-_LINE = 22
-_MARGIN = 6
+#: Minimum width of a picture, height of a line of text, and margin around the text, in pixels.
+_LEAST_WIDTH, _LINE, _MARGIN = 480, 22, 6
 
 
 class Window:

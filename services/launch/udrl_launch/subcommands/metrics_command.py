@@ -42,7 +42,7 @@ def metrics(
     where = place(run_dir, connect, run_id, keys)
     log_to_stderr()
     if isinstance(where, Path):
-        status_from(where, keys)  # a run that cannot be read would be down for ever
+        status_from(where, keys)  # else a run that cannot be read would always be reported as down
 
     def service(stop: threading.Event) -> None:
         with closing(Exporter(partial(_known_status, where, keys), host, port)) as exporter:
@@ -53,6 +53,7 @@ def metrics(
 
 
 def _known_status(where: Path | Address, keys: Path | None) -> Status | None:
+    """Return the status of a run; None if it cannot be read."""
     try:
         return status_from(where, keys)
     except UdrlError:

@@ -39,6 +39,7 @@ from udrl_show.run_logs import WRITERS, opened
 log = logging.getLogger("udrl")
 
 _COMMAND_LINE = click.core.ParameterSource.COMMANDLINE
+#: Options that the run directory does not store, so that the command to resume repeats them.
 _NOT_STORED = {
     "actors", "envs_per_actor", "hang_timeout", "in_process", "listen", "insecure", "keys", "audit",
     "logs", "metrics_port", "metrics_host", "as_json",
