@@ -19,8 +19,8 @@ from udrl_proto.credentials import load_credentials
 from udrl_proto.reports import Status
 from udrl_replay.store import Store
 
-#: Seconds for services to find the replay service after the start.
-_PATIENCE_S = "60"
+#: Seconds for a service to find the replay service after the start.
+START_S = 60.0
 
 
 class Local(Protocol):
@@ -79,12 +79,12 @@ class Processes:
             "--listen", endpoint, *(["--insecure"] if insecure else []), "--audit", str(audit),
         )  # fmt: skip
         connect = from_this_machine(endpoint)
-        start("learner", "learner", "--connect", connect, "--patience", _PATIENCE_S)
+        start("learner", "learner", "--connect", connect, "--patience", f"{START_S:g}")
         envs = str(settings.envs_per_actor)
         for number in range(1, fleet.actors + 1):
             start(
                 f"actor-{number}", "actor", "--connect", connect, "--envs", envs,
-                "--nice", "10", "--patience", _PATIENCE_S,
+                "--nice", "10", "--patience", f"{START_S:g}",
                 "--hang-timeout", f"{fleet.hang_timeout:g}",
                 "--first-index", str((number - 1) * settings.envs_per_actor),
             )  # fmt: skip
@@ -150,7 +150,7 @@ class Threads:
                 audit=audit,
             ),
         )
-        address = Address(from_this_machine(endpoint), patience_s=float(_PATIENCE_S), keys=keys)
+        address = Address(from_this_machine(endpoint), patience_s=START_S, keys=keys)
         self._start("learner", partial(roles.learner, address, self._stop))
         for number in range(1, fleet.actors + 1):
             self._start(

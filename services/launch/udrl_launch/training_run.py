@@ -13,7 +13,7 @@ from typing import Protocol
 from udrl.errors import Interrupted, Unreachable
 from udrl_inspect.address import Address, connected, from_this_machine
 from udrl_inspect.inspection import read_status
-from udrl_launch.local import Local, Processes, Threads
+from udrl_launch.local import START_S, Local, Processes, Threads
 from udrl_launch.paths import shown
 from udrl_launch.roles import load_learner_service, open_run, require_device, require_torch
 from udrl_launch.settings import Settings
@@ -83,8 +83,6 @@ class Adviser:
 _STALE_S = 10.0
 #: Seconds between checks of the processes, and between status requests.
 _CHECK_S, _POLL_S = 0.1, 0.5
-#: Seconds for the replay service to reply after the start.
-_START_S = 60.0
 
 
 def run_training(
@@ -149,7 +147,7 @@ def run_training(
     services: Local = kind(
         run_dir, store, settings, endpoint, insecure=insecure, keys=keys, audit=audit
     )
-    address = Address(from_this_machine(endpoint), patience_s=_START_S, keys=keys)
+    address = Address(from_this_machine(endpoint), patience_s=START_S, keys=keys)
     try:
         with suppress(Interrupted):  # while it connects to the replay service
             _watch(services, address, stop, watcher)
