@@ -46,7 +46,7 @@ def decode(data: bytes, kind: type[AnyMessage], limit: int = SMALL) -> AnyMessag
         InvalidMessage: the data are too large, not MessagePack, or not a valid ``kind``.
     """
     if len(data) > limit:
-        raise InvalidMessage(f"{kind.__name__}: {len(data)} bytes, at most {limit} are allowed")
+        raise InvalidMessage(f"{kind.__name__}: {len(data)} bytes, expected at most {limit}")
     try:
         plain: Any = msgpack.unpackb(
             data,

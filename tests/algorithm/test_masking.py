@@ -170,9 +170,9 @@ def test_rollout_takes_allowed_actions_only() -> None:
         ({"fault": "no mask"}, "a dict of nothing as info, without 'action_mask'"),
         (
             {"fault": "too short"},
-            r"info\['action_mask'\] an array of int8, shape \(3,\), expected 4",
+            r"an array of int8, shape \(3,\) as info\['action_mask'\], expected 4",
         ),
-        ({"fault": "ragged"}, r"info\['action_mask'\] a list .*, expected 4"),
+        ({"fault": "ragged"}, r"a list .* as info\['action_mask'\], expected 4"),
     ],
 )
 def test_invalid_mask_is_an_error_of_the_environment(given: dict[str, Any], message: str) -> None:

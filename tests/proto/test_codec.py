@@ -240,7 +240,7 @@ def test_size_is_checked_before_decoding(monkeypatch: pytest.MonkeyPatch) -> Non
         pytest.fail("decoded")
 
     monkeypatch.setattr(msgpack, "unpackb", unpackb)
-    with pytest.raises(InvalidMessage, match=r"^WeightsMessage: 11 bytes, at most 10 are allowed$"):
+    with pytest.raises(InvalidMessage, match=r"^WeightsMessage: 11 bytes, expected at most 10$"):
         decode(bytes(11), WeightsMessage, limit=10)
 
 

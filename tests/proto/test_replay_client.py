@@ -211,7 +211,7 @@ def test_reply_of_another_type_is_rejected(inbox: Received, ask: Ask) -> None:
 def test_reply_above_its_size_limit_is_rejected(inbox: Received, ask: Ask) -> None:
     future = ask(limit=10)
     first(inbox).reply(ANSWER)
-    with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
+    with pytest.raises(InvalidMessage, match="expected at most 10"):
         future.result(WAIT_S)
 
 
@@ -223,7 +223,7 @@ def test_reply_above_its_size_limit_is_rejected(inbox: Received, ask: Ask) -> No
     [
         (b"", "incomplete input"),
         (encode(FailureMessage(actor="a", command_id=1, error="")), "StateRequest"),
-        (bytes(101), "101 bytes, at most 100"),
+        (bytes(101), "101 bytes, expected at most 100"),
     ],
 )
 def test_invalid_request_reaches_the_service_as_an_error(

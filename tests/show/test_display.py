@@ -179,7 +179,7 @@ def test_number_and_label_are_on_one_line() -> None:
         "weights kept   3 versions: 2, 4, 6",
         "actors         0 with 0 environments;",
         "               0 episodes running;",
-        "               training needs 60",
+        "               at most 60 at once",
         "time           1:01 elapsed; 1:01:40 left",
         "waiting        learner l for actors:",
         "               iteration 7 (2.5 s)",

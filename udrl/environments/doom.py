@@ -150,7 +150,7 @@ def _open(scenario: str, *, colour: bool) -> tuple[Any, tempfile.TemporaryDirect
         _discard(game, folder)
         raise RuntimeError(
             f"scenario {str(path)!r}: ViZDoom does not start with it: {type(error).__name__}: "
-            f"{error}"
+            f"{error}; correct the file, or what it names"
         ) from error
     if n == 0:
         _discard(game, folder)

@@ -133,7 +133,7 @@ def mask_in(
         mask = np.empty(0)
     if mask.size != size or mask.dtype.kind not in "biuf":
         raise EnvironmentFault(
-            f"{where}() returned as {_NAME} {describe(given)}, expected {size} numbers, 0 or 1"
+            f"{where}() returned {describe(given)} as {_NAME}, expected {size} numbers, 0 or 1"
         )
     return _checked(_NAME, mask, components, where, is_over=is_over)
 

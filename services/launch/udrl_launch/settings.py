@@ -176,7 +176,9 @@ def gather(
         name, value = parse_assignment(text)
         assigned.append(name)
         if name == "environment":
-            raise ConfigError(f"--set {text}: the environment is the argument ENV, {environment!r}")
+            raise ConfigError(
+                f"--set {text}: the environment is the argument ENV, {environment!r}; leave it out"
+            )
         values[name] = value
     values["environment"] = environment
     values = with_steps_as_numbers(values)

@@ -102,7 +102,7 @@ def _create(
 ) -> Store:
     make_strategy(config)
     if automatic:
-        log.info("choosing settings by random episodes of %s", config.environment)
+        log.info("choosing settings from random episodes of %s", config.environment)
     config = resolve_arithmetic(resolve_automatic(config, automatic))
     with closing(EpisodeGenerator(config, 1)) as generator:
         # First and in a fresh instance, as actors do.

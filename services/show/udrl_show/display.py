@@ -196,7 +196,7 @@ def _actors(status: Status) -> list[str]:
         f"{len(status.actors)} with",
         f"{_counted(environments, 'environment')};",
         f"{_counted(running, 'episode')} running;",
-        f"training needs {status.useful_concurrency:,}",
+        f"at most {status.useful_concurrency:,} at once",
     ]
 
 
