@@ -259,6 +259,7 @@ def test_action_component_out_of_range_is_rejected() -> None:
         ),
         (spaces.Box(-1, 1, (0, 3)), "supported are Box"),
         (spaces.Discrete(2**20 + 1), "1,048,577 states.*at most 1,048,576"),
+        (spaces.MultiDiscrete([2**20, 2]), "1,048,578 values in all.*at most 1,048,576"),
         (spaces.Dict({}), "0 parts; supported are 1 to 256"),
     ],
     ids=str,

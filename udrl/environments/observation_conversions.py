@@ -41,7 +41,7 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
     """
     leaves = list(leaves_within(space))
     if [path for path, _ in leaves] == [()]:
-        return _of_leaf("observation", space)
+        return _leaf_conversion("observation", space)
     if not 1 <= len(leaves) <= MAX_LEAVES or max(len(path) for path, _ in leaves) > _MAX_DEPTH:
         raise UnsupportedEnvironment(
             f"its observations have {len(leaves)} parts; supported are 1 to {MAX_LEAVES}, at most "
@@ -51,7 +51,7 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
     for path, inner in leaves:
         name = "observation" + "".join(f"[{key!r}]" for key in path)
         try:
-            parts.append((path, _of_leaf(name, inner)))
+            parts.append((path, _leaf_conversion(name, inner)))
         except UnsupportedEnvironment as error:
             problems.append(str(error))
     if problems:
@@ -59,17 +59,15 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
     return _Records("observation", space, parts)
 
 
-def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
+def _leaf_conversion(name: str, space: spaces.Space[Any]) -> Conversion:
     match space:
         case spaces.Discrete(n=n) if n <= MAX_CATEGORIES:
             return Indexed(name, space, Category(n=int(n)))
         case spaces.Discrete(n=n):
-            raise UnsupportedEnvironment(
-                f"its {name} is one of {n:,} states, and the network would learn a vector for "
-                f"each; at most {MAX_CATEGORIES:,} are supported; use a wrapper that returns "
-                f"numbers that describe a state"
-            )
-        case spaces.MultiDiscrete() if space.nvec.size and space.nvec.sum() <= MAX_CATEGORIES:
+            raise _too_many(f"its {name} is one of {n:,} states")
+        case spaces.MultiDiscrete() if space.nvec.size:
+            if (total := int(space.nvec.sum())) > MAX_CATEGORIES:
+                raise _too_many(f"its {name} has {total:,} values in all components together")
             return MultiIndexed(name, space, Categories(ns=tuple(space.nvec.reshape(-1).tolist())))
         case spaces.MultiBinary() if np.prod(space.shape) > 0:
             return Boxed(name, space, Bits(size=int(np.prod(space.shape))))
@@ -81,6 +79,14 @@ def _of_leaf(name: str, space: spaces.Space[Any]) -> Conversion:
     raise UnsupportedEnvironment(
         f"its {name} is {space}; supported are Box, Discrete, MultiDiscrete, MultiBinary, and Dict "
         f"and Tuple of these; {_remedy(name, space)}"
+    )
+
+
+def _too_many(what: str) -> UnsupportedEnvironment:
+    """Return the error for a space with too many categories."""
+    return UnsupportedEnvironment(
+        f"{what}, and the network would learn a vector for each; at most {MAX_CATEGORIES:,} are "
+        f"supported; use a wrapper that returns numbers that describe a state"
     )
 
 
