@@ -202,6 +202,7 @@ class EpisodeGenerator:
         return actions
 
     def _finish(self, row: int, terminated: bool, truncated: bool) -> Episode | Failure:
+        """Return the episode that ended in a row, or a failure if it is invalid; free the row."""
         episode = self._recording.end(row, terminated=terminated, truncated=truncated)
         command = self._release(row)
         if found := fault(episode, self.spec):
@@ -210,12 +211,14 @@ class EpisodeGenerator:
         return episode
 
     def _fail(self, row: int, error: Exception) -> Failure:
+        """Discard the episode of a row whose environment raised an exception; free the row."""
         self._recording.drop(row)
         command = self._release(row)
         self._rows.replace(row)
         return _failure("step", command, error)
 
     def _release(self, row: int) -> Command:
+        """Mark a row as free, and return its command."""
         command = self._command_of(row)
         self._commands[row] = self._behaviors[row] = None
         self._planned = False

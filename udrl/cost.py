@@ -26,12 +26,12 @@ def training_s(config: Config, spec: EnvironmentSpec) -> float:
     space, first = spec.observation_space, network.hidden[0]
     widths = layer_widths(space, network)
     # Multiplications per example: of the behavior function, and of a value function or critic.
-    behavior = _features(config, spec, first, network.memory_size)
+    behavior = _feature_multiplications(config, spec, first, network.memory_size)
     behavior += sum(i * o for i, o in pairwise(widths))
     width = VALUE_WIDTH
     if network.memory == "none":
         width = n_features(space, network.convolutions, VALUE_WIDTH)
-    value = _features(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
+    value = _feature_multiplications(config, spec, VALUE_WIDTH, VALUE_WIDTH) + width * VALUE_WIDTH
     n_values = {"none": 0, "value": 1, "action_value": 2}[network.baseline]
     examples = training.n_updates_per_iter * training.batch_size
     operations = _UPDATE_OPERATIONS * examples * (behavior + n_values * value)
@@ -57,30 +57,35 @@ def slow_training_warning(config: Config, spec: EnvironmentSpec) -> str:
     )
 
 
-def _features(config: Config, spec: EnvironmentSpec, width: int, remembered: int) -> float:
+def _feature_multiplications(
+    config: Config, spec: EnvironmentSpec, width: int, remembered: int
+) -> float:
     """Return the multiplications of an encoder and the memory after it, per observation."""
     network = config.network
-    encoding = _encoder(config, spec, width)
+    encoding = _encoder_multiplications(config, spec, width)
     if network.memory == "none":
         return encoding
     n_in = n_features(spec.observation_space, network.convolutions, width)
     return encoding + 3 * remembered * (n_in + remembered)
 
 
-def _encoder(config: Config, spec: EnvironmentSpec, width: int) -> float:
+def _encoder_multiplications(config: Config, spec: EnvironmentSpec, width: int) -> float:
     """Return the multiplications of an encoder, per observation."""
     space, network = spec.observation_space, config.network
     shapes = FrameStack(space, network.frame_stack).shapes
     leaves = [leaf.space for leaf in leaves_of(space)]
     encoding = sum(
-        _leaf(leaf, shape[0], network, width) for leaf, shape in zip(leaves, shapes, strict=True)
+        _leaf_multiplications(leaf, shape[0], network, width)
+        for leaf, shape in zip(leaves, shapes, strict=True)
     )
     if not isinstance(space, Record):
         return encoding
     return encoding + width * sum(n_features(leaf, network.convolutions, width) for leaf in leaves)
 
 
-def _leaf(space: LeafSpace, depth: int, network: NetworkSettings, width: int) -> float:
+def _leaf_multiplications(
+    space: LeafSpace, depth: int, network: NetworkSettings, width: int
+) -> float:
     """Return the multiplications of a leaf's encoder; ``depth`` is the input's first dimension."""
     if not isinstance(space, Image):
         return depth * width

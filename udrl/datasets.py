@@ -265,6 +265,7 @@ class _Form(NamedTuple):
 
 
 def _form(config: Config, spec: EnvironmentSpec) -> _Form:
+    """Return the environment's own spaces if it can be created, else the algorithm's."""
     try:
         env = make_environment(config)
     except UnsupportedEnvironment as error:

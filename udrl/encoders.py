@@ -252,14 +252,14 @@ def make_encoder(
         precision: dtype of the arithmetic.
     """
     if not isinstance(space, Record):
-        return _of_leaf(space, network, width, activation, precision)
+        return _leaf_encoder(space, network, width, activation, precision)
     leaves = [leaf.space for leaf in space.leaves]
-    encoders = [_of_leaf(leaf, network, width, activation, precision) for leaf in leaves]
+    encoders = [_leaf_encoder(leaf, network, width, activation, precision) for leaf in leaves]
     together = sum(n_features(leaf, network.convolutions, width) for leaf in leaves)
     return RecordEncoder(encoders, together, width, activation, precision)
 
 
-def _of_leaf(
+def _leaf_encoder(
     space: LeafSpace,
     network: NetworkSettings,
     width: int,

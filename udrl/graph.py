@@ -299,6 +299,7 @@ class _Builder(Nodes):
         return self.append(activation, self.layer(f"{name}.joined", joined, together, width))
 
     def _encode_leaf(self, number: int, name: str, activation: str, width: int) -> str:
+        """Append the encoder of the leaf with index ``number``."""
         (observation, leaf), (first, *_) = self._leaves[number], self._shapes[number]
         match leaf:
             case Image():
@@ -317,11 +318,13 @@ class _Builder(Nodes):
         return self.append(activation, features)
 
     def _normalised(self, observation: str, name: str, size: int) -> str:
+        """Append a normalised vector; see :class:`udrl.encoders.Normaliser`."""
         above = self.append("Sub", observation, self.weight(f"{name}.mean", size))
         scaled = self.append("Mul", above, self.weight(f"{name}.scale", size))
         return self.append("Clip", scaled, self.number(-NORMAL_BOUND), self.number(NORMAL_BOUND))
 
     def _embedding(self, observation: str, name: str, ns: tuple[int, ...], width: int) -> str:
+        """Append the sum of learned vectors; see :class:`udrl.encoders.CategoryEncoder`."""
         sizes = np.array(ns * self._network.frame_stack, np.int32)
         table = self.weight(f"{name}.embedding.weight", int(sizes.sum()), width)
         first = self.constant(np.cumsum(sizes, dtype=np.int32) - sizes)
@@ -330,6 +333,7 @@ class _Builder(Nodes):
         return self.append("Add", features, self.weight(f"{name}.bias", width))
 
     def _convolutions(self, observation: str, n_channels: int, name: str, activation: str) -> str:
+        """Append the layers for an image; see :class:`udrl.encoders.ImageEncoder`."""
         features = self.append("Cast", observation, to=TensorProto.FLOAT)
         features = self.append("Mul", features, self.number(1 / 255))
         channels = pairwise((n_channels, *self._network.convolutions))

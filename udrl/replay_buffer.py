@@ -59,6 +59,7 @@ class ReplayBuffer:
         return [entry for entry in before if entry not in kept]
 
     def _kept(self, entries: list[Entry]) -> list[Entry]:
+        """Return the entries that remain: young enough, and among the best or the newest."""
         if self._max_age is not None and entries:
             oldest = max(entry.iteration for entry in entries) - self._max_age
             entries = [entry for entry in entries if entry.iteration > oldest]

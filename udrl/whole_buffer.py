@@ -58,6 +58,7 @@ def at_all_steps(
 def _part_by_part(
     network: Network, experience: RankedExperience, device: str
 ) -> npt.NDArray[np.float32]:
+    """Evaluate a network without a memory, some steps at a time; return its outputs."""
     return np.concatenate(
         [
             network(_to_device(arrays, device), _to_indices(actions, device), None)[0].cpu().numpy()
@@ -69,6 +70,10 @@ def _part_by_part(
 def _window_by_window(
     network: Network, size: int, experience: RankedExperience, config: Config
 ) -> tuple[npt.NDArray[np.float32], Tensor]:
+    """Evaluate a network with a memory; return its outputs, and its state before each window.
+
+    The k-th windows of all episodes are evaluated before their next ones.
+    """
     lengths, device = experience.lengths, config.arithmetic.device
     windows = Windows(lengths, config.training.memory_window)
     states = torch.zeros(int(windows.counts.sum()), size, device=device)

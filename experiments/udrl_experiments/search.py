@@ -204,6 +204,7 @@ def _study(
     configurations: int | None,
     final: Final | None,
 ) -> Study:
+    """Return the study of a search; for the arguments see :func:`search_tasks`."""
     by_environment = {subject.space.environment: subject for subject in subjects}
 
     def runs_of(environment: str, algorithm: Algorithm, number: int, steps: StudyPlan) -> list[Job]:
@@ -293,6 +294,7 @@ def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> i
 
 
 def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
+    """Return the run of a configuration with one seed."""
     steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_SEARCH_STEPS)
     space, variant = subject.space, f"configuration {number}"
     drawn = space.draw(algorithm, number)

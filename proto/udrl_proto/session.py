@@ -139,6 +139,7 @@ def check_listening(endpoint: str, *, insecure: bool = False, secure: bool = Fal
 
 
 def _check_audience(endpoint: str, *, insecure: bool, secure: bool) -> None:
+    """Check an endpoint to listen on: only loopback may be without authentication."""
     check_endpoint(endpoint, secure=secure)
     if not secure and not insecure and not _is_loopback(endpoint):
         raise ConfigError(

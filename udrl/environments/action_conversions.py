@@ -134,7 +134,7 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
     for path, inner in leaves:
         name = "action" + "".join(f"[{key!r}]" for key in path)
         try:
-            parts.append((path, _of_leaf(name, inner, settings, bins)))
+            parts.append((path, _leaf_conversion(name, inner, settings, bins)))
         except UnsupportedEnvironment as error:
             problems.append(str(error))
     if not leaves:
@@ -163,7 +163,7 @@ def default_bins(dimensions: int) -> int:
     return 11 if dimensions <= 2 else 7
 
 
-def _of_leaf(
+def _leaf_conversion(
     name: str, space: spaces.Space[Any], settings: ActionSettings, bins: int
 ) -> Conversion:
     match space:
@@ -174,14 +174,16 @@ def _of_leaf(
         case spaces.MultiBinary() if np.prod(space.shape) > 0:
             return _Bits(name, space, Product(ns=(2,) * int(np.prod(space.shape))))
         case spaces.Box() if np.prod(space.shape) > 0:
-            return _of_box(name, space, settings, bins)
+            return _box_conversion(name, space, settings, bins)
     raise UnsupportedEnvironment(
         f"its {name} is {space}; supported are Discrete, MultiDiscrete, MultiBinary, Box, and Dict "
         f"and Tuple of these; wrap it in gymnasium.wrappers.TransformAction"
     )
 
 
-def _of_box(name: str, space: spaces.Box, settings: ActionSettings, bins: int) -> Conversion:
+def _box_conversion(
+    name: str, space: spaces.Box, settings: ActionSettings, bins: int
+) -> Conversion:
     low, high = _bounds(space, settings)
     missing = np.isnan(low) | np.isnan(high)
     if missing.any():

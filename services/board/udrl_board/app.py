@@ -126,6 +126,7 @@ class _Guard:
         await self._app(scope, receive, with_headers)
 
     def _refusal(self, connection: HTTPConnection) -> Response | None:
+        """Return the response to a request that is not admitted; None: it is."""
         host = connection.headers.get("host", "")
         origin = connection.headers.get("origin")
         try:

@@ -151,6 +151,7 @@ class Feed:
             self._queried_at = self._clock()
 
     def _query(self) -> None:
+        """Query the run; keep what it replied, or the reason why it did not."""
         self._problem = ""
         try:
             self._status = self.source.status()

@@ -279,6 +279,7 @@ class Directory:
                 self._served = None
 
     def _query(self, query: Callable[[Source], Found]) -> Found:
+        """Query the replay service, or the file if there is none that replies."""
         served = None if self._is_silent() else self._service()
         if served is not None:
             try:
@@ -294,6 +295,7 @@ class Directory:
         return time.monotonic() - self._silent_since < _SILENT_S
 
     def _service(self) -> Served | None:
+        """Return the run's replay service; None if the run is not served."""
         endpoint = served_at(self._run_dir)
         with self._lock:
             if self._served is not None and self._served[0] != endpoint:

@@ -225,6 +225,7 @@ class Stage(threading.Thread):
         self._due = max(self._due, time.monotonic() - 0.5) + steps / fps
 
     def _present(self, actions: list[ActionComponent] | None = None) -> None:
+        """Send the state of the episode and its picture to the viewer."""
         rollout, episode = self._rollout, self._episode
         assert rollout is not None
         assert episode is not None

@@ -257,6 +257,7 @@ class LearnerService:
         return None
 
     def _episodes(self, missing: list[int]) -> list[Episode]:
+        """Request episodes, page by page."""
         episodes: list[Episode] = []
         while left := missing[len(episodes) :]:
             requested = left[:_EPISODES_PER_REQUEST]
@@ -278,6 +279,7 @@ class LearnerService:
         return episode
 
     def _deliver(self, message: VersionMessage) -> None:
+        """Deliver a version, and publish its weights when the replay service has stored them."""
         self._client.request_joined(verbs.VERSION, message, self._join)
         self._delivered = True
         # Without acknowledgement, so that a stopped actor cannot stall training. An actor that

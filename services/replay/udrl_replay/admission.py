@@ -118,6 +118,7 @@ class Admission:
         self._run.mark_inexact(f"the environment of actor {request.id} behaves differently")
 
     def _compare(self, role: Role, numerics_class: str) -> None:
+        """Refuse a service of another numerics class than the run's."""
         hello = self._run.hello
         known = getattr(hello, _CLASS_FIELDS[role])
         if known in ("", numerics_class) or hello.allow_inexact:

@@ -111,6 +111,7 @@ class Database:
         return db
 
     def _check_seals(self) -> None:
+        """Raise :class:`DamagedStore` if a row was changed."""
         for table, columns in SEALED.items():
             key = columns.split(",")[0]
             broken = self._rows(
@@ -120,6 +121,7 @@ class Database:
                 raise self._damaged(f"{key} {broken[0][0]!r} of {table} does not match its seal")
 
     def _check_tallies(self) -> None:
+        """Raise :class:`DamagedStore` if a row is missing or was added."""
         try:
             self._tallies = Tallies(self._db)
         except sqlite3.Error as error:
@@ -208,6 +210,7 @@ class Database:
             raise self._fault(error) from error
 
     def _fault(self, error: sqlite3.Error) -> StoreError:
+        """Return the error for one of SQLite's, with its remedy."""
         if primary_code(error) in _DAMAGE:
             return self._damaged(error)
         what_to_do = database_remedy(error, read_only=self.read_only)

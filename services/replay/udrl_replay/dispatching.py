@@ -152,6 +152,7 @@ class Dispatcher:
         return len(failures) >= MAX_FAILURES and (len(set(failures)) >= 2 or not untried)
 
     def _put_back(self, command_id: int, name: str) -> None:
+        """Note that an actor no longer holds a command; without holders, it is unassigned again."""
         item = self.outstanding.get(command_id)
         if item is not None and item.holders.pop(name, None) is not None and not item.holders:
             heapq.heappush(self._unassigned, command_id)
@@ -196,6 +197,7 @@ class Dispatcher:
         return next(ready, None)
 
     def _give(self, item: Outstanding, actor: Actor, now: float) -> Command:
+        """Assign an outstanding command to an actor, and return it."""
         actor.reruns += item.was_assigned
         item.was_assigned = True
         item.holders[actor.join.id] = now

@@ -76,6 +76,7 @@ class Enforcement:
         return "duplicate"
 
     def _quarantine_wrong_actor(self, actor: str, command_id: int) -> None:
+        """Quarantine an actor that delivered a false episode; the run may have learned from it."""
         why = f"its episode of command {command_id} differs from those of two other actors"
         self.quarantine(actor, why)
         progress = self._run.progress

@@ -161,6 +161,7 @@ class ReplayService:
                 declaration.undeclare()
 
     def _reply_until_ended(self, stop: threading.Event) -> None:
+        """Reply until the run has ended and its peers can know it, or ``stop`` is set."""
         ended_at: float | None = None
         while not stop.is_set():
             # With a short timeout: silent actors and the end must be noticed without requests.
@@ -217,6 +218,7 @@ class ReplayService:
         self._reply_to_all(self._inbox.take(_GROUP, _GROUP_BYTES, timeout_s))
 
     def _reply_to_all(self, group: list[ReceivedRequest | Presence]) -> None:
+        """Handle requests and changes of presence in one transaction, then send the replies."""
         now = time.monotonic()
         run = self.run
         before = run.progress.iteration
@@ -246,6 +248,7 @@ class ReplayService:
             )
 
     def _reply(self, received: ReceivedRequest, now: float) -> Message:
+        """Return the reply to a request; a refused or invalid one gets a :class:`Problem`."""
         request: Any = received.request
         if isinstance(request, Malformed):
             self.run.enforcement.count_offence(request.actor, str(request.error))
@@ -276,6 +279,7 @@ class ReplayService:
             log.info("%s disconnected", printable(f"{role} {name}"))
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
+        """Note that a service waits, and return the part of its reply that says so."""
         self._waits.begin(who, on, why, now)
         return Wait(on=f"{on}: {why}", retry_after_s=self.run.dispatcher.retry_after_s())
 
@@ -312,6 +316,7 @@ class ReplayService:
         return CommandsReply(wait=self._wait(who, *self._what_actors_wait_for(), now))
 
     def _what_actors_wait_for(self) -> tuple[str, str]:
+        """Return which services idle actors wait for, and why."""
         run = self.run
         version = run.awaits_version()
         if version is not None:

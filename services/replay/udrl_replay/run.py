@@ -122,6 +122,7 @@ class StoredRun(RunState):
         return "accepted"
 
     def _accept_again(self, arrival: Arrival) -> Literal["duplicate"]:
+        """Reply to an episode whose command is not outstanding: a duplicate, or to be rejected."""
         command_id = arrival.entry.id
         iteration, index = divmod(command_id, COMMANDS_PER_ITERATION)
         digest = self.store.episode_digest(command_id)
@@ -182,6 +183,7 @@ class StoredRun(RunState):
                 self._give_up(item, "its environment hangs or crashes")
 
     def _give_up(self, item: Outstanding, cause: str) -> None:
+        """Fail the run because of a command that cannot be run."""
         if self.progress.state == "failed":
             return
         cause = cause[:3000]  # so that the status has the rest, too
@@ -337,6 +339,7 @@ class StoredRun(RunState):
             self._issue(self.sampler.evaluate_final(final, self.buffer))
 
     def _end_if_evaluated(self) -> None:
+        """Record the final evaluation and end the run, if all its episodes have arrived."""
         final = self.progress.iteration
         if self.dispatcher.outstanding:
             return
@@ -357,6 +360,7 @@ class StoredRun(RunState):
         return [c for c in self.open_commands() if c.index >= FINAL_EVALUATION]
 
     def _cancel(self, ids: list[int]) -> None:
+        """Cancel outstanding commands; a run that is resumed after its end restores them."""
         for i in ids:
             self.dispatcher.remove_command(i)
         self.store.mark_commands(ids, cancelled=True)

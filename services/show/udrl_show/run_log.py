@@ -135,6 +135,7 @@ class RunLog:
             )  # fmt: skip
 
     def _update(self, status: Status) -> None:
+        """Write the iterations and the end of the run that are not yet in the log."""
         if not self._has_begun:
             self._has_begun = True
             settings = settings_of(self._run_dir)
