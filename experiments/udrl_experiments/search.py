@@ -24,7 +24,6 @@ from udrl_experiments.comparison import baseline
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import (
     EVAL_EVERY,
-    LAST,
     PAPER_STEPS,
     Algorithm,
     StudyPlan,
@@ -313,7 +312,7 @@ def _score(runs: Sequence[Job], root: Path) -> float | None:
     """Return the mean score of a configuration's runs; None if there are none, or one failed."""
     if not runs or not all(run.done(root) for run in runs):
         return None
-    return fmean(score([row.mean for row in run.evaluations(root)], LAST) for run in runs)
+    return fmean(score([row.mean for row in run.evaluations(root)]) for run in runs)
 
 
 def _write_preset(

@@ -13,6 +13,7 @@ import numpy as np
 
 from udrl.errors import ConfigError
 from udrl.streams import Stream
+from udrl_experiments.protocol import LAST
 from udrl_experiments.records import EvaluationRecord
 
 _KEY = hashlib.sha256(b"udrl/study/bootstrap/1").digest()[:16]
@@ -93,7 +94,7 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
-def score(means: Sequence[float], last: int = 20) -> float:
+def score(means: Sequence[float], last: int = LAST) -> float:
     """Return the score of a run: the mean of its last evaluations (Appendix B).
 
     Args:

@@ -84,7 +84,7 @@ class Credentials(NamedTuple):
                 f"{error.verify_message}; {remedy}"
             ) from error
         except ssl.SSLError as error:
-            # Other errors, such as a server that dies meanwhile, are worth a retry.
+            # Other errors, e.g. of a server that dies during the check, are worth a retry.
             if any(word in (error.reason or "") for word in _REJECTIONS):
                 raise ConfigError(
                     f"tls/{host}:{port} does not trust {self.certificate} ({error.reason}); "

@@ -197,7 +197,7 @@ def connect(
     Raises:
         ConfigError: the endpoint is malformed, or one side does not trust the other's keys.
         Unreachable: there is no reply within ``patience_s`` seconds.
-        Interrupted: ``stop`` was set meanwhile.
+        Interrupted: ``stop`` was set.
     """
     check_endpoint(endpoint, secure=credentials is not None)
     config = _config("client", credentials)
@@ -262,7 +262,7 @@ def find_run(
     Raises:
         Unreachable: no such run replies.
         ConfigError: there are several runs and ``run_id`` is None, or the run has another protocol.
-        Interrupted: ``stop`` was set meanwhile.
+        Interrupted: ``stop`` was set.
     """
     deadline = time.monotonic() + patience_s
     stop = stop or threading.Event()

@@ -51,7 +51,7 @@ def deliver(client: ReplayClient, join: JoinRequest, outcome: Episode | Failure)
     except Refused as refusal:
         if refusal.code != "rejected":
             raise
-        # Cancelled: the run has ended meanwhile.
+        # The command was cancelled, because the run has ended.
         log.info("episode %d was rejected: %s", outcome.command_id, refusal)
     return outcome.command_id
 

@@ -1,7 +1,7 @@
 """A stage: runs an agent for one viewer, who gives it commands.
 
 A stage is a thread that runs one episode at a time (:class:`udrl.rollout.Rollout`), at a multiple
-of the environment's own speed, and receives requests meanwhile. With the same seed, command and
+of the environment's own speed, and handles requests between frames. With the same seed, command and
 weights, the episode is that of ``udrl play --seed``.
 """
 

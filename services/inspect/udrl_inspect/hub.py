@@ -82,7 +82,7 @@ def download(address: str) -> Path:
                     f"{address}: {name} has {size} bytes, at most {MAX_BYTES:,} are accepted; "
                     f"name a repository that udrl export --hub wrote"
                 )
-        # All of one commit, even if another one is uploaded meanwhile.
+        # All of one commit, even if another one is uploaded during the download.
         paths = [api.hf_hub_download(repo_id, name, revision=info.sha) for name in names]
         return Path(paths[0]).parent
 

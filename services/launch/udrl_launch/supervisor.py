@@ -24,7 +24,7 @@ _LONGEST_LOG = 1 << 20
 #: Seconds for services to end after the run has ended or after SIGTERM.
 END_S = 4.0
 #: Seconds that the first child may run on after another has ended without an error; a replay
-#: service stays for 10 s after the end of the run.
+#: service continues for 10 s after the end of the run.
 _AHEAD_S = 20.0
 
 
@@ -89,8 +89,8 @@ class Child:
         """Shorten a long log: environments may print without limit."""
         if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
             end = _end_of(self.log_file, _LONGEST_LOG // 4)
-            # The child appends meanwhile. What it writes before the file is truncated is lost; what
-            # it writes afterwards follows, because its file is in append mode.
+            # The child continues to append. What it writes before the file is truncated is lost;
+            # what it writes afterwards follows, because its file is in append mode.
             with self.log_file.open("r+", encoding="utf-8") as log_file:
                 log_file.write(f"... earlier output was removed\n{end}")
                 log_file.truncate()

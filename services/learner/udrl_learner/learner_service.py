@@ -205,7 +205,7 @@ class LearnerService:
     def _result(
         self, fetched: "Future[Buffer | None]", delivered: "Future[None] | None"
     ) -> Buffer | None:
-        """Wait for the buffer; raise earlier if the delivery fails meanwhile."""
+        """Wait for the buffer; raise at once if the delivery fails."""
         pending: list[Future[Any]] = [fetched] if delivered is None else [fetched, delivered]
         while not fetched.done() and not self._stop.is_set():
             wait(pending, _STOP_CHECK_S, FIRST_COMPLETED)

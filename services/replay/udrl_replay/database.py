@@ -40,7 +40,7 @@ class Database:
 
     Args:
         run_dir: directory of the run.
-        read_only: read a snapshot; another service may write meanwhile.
+        read_only: read a snapshot, without the lock; a replay service may write at the same time.
 
     Attributes:
         run_dir: directory of the run.

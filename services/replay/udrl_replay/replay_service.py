@@ -75,10 +75,10 @@ log = logging.getLogger("udrl")
 _INBOX, _INBOX_BYTES = 4096, 512 << 20
 #: Maximum number of requests in one transaction, and bytes after which no more are added.
 _GROUP, _GROUP_BYTES = 64, 8 << 20
-#: Seconds that the service stays after the end of the run, so that all its peers learn of it.
+#: Seconds for which the service continues after the end of the run, so that all peers learn of it.
 _LINGER_S = 10.0
-#: Seconds that it stays if no peers are left.
-_FAREWELL_S = 0.3
+#: Seconds for which it continues if no peers are connected.
+_LINGER_ALONE_S = 0.3
 
 
 class _Delivery(NamedTuple):
@@ -169,7 +169,7 @@ class ReplayService:
             now = time.monotonic()
             if self.run.progress.state in ("ended", "failed"):
                 ended_at = ended_at or now
-                if now - ended_at > (_LINGER_S if self._here else _FAREWELL_S):
+                if now - ended_at > (_LINGER_S if self._here else _LINGER_ALONE_S):
                     return
 
     def close(self) -> None:
