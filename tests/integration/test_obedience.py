@@ -146,6 +146,8 @@ def with_horizons_from_returns(agent: Agent) -> Agent:
 
 def test_horizons_that_follow_from_returns_are_not_varied(ended_run: Path) -> None:
     agent = with_horizons_from_returns(load_agent(ended_run))
+    with pytest.raises(ConfigError, match=r"^--desired-returns 0.1:0.9: .* of 1, .* wider range"):
+        plan_commands(agent, points=9, episodes=2, desired_returns=(0.1, 0.9))
     plan = plan_commands(agent, points=9, episodes=2, desired_returns=(1.0, 4.0))
     commanded = [(c[0].desired_return, c[0].desired_horizon) for c in plan.by_return]
     assert commanded == [(1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4)]

@@ -186,6 +186,12 @@ def plan_commands(
     by_return = list({group[0].desired_return: group for group in by_return}.values())
     if len(by_return) < 2:
         only = by_return[0][0].desired_return
+        if desired_returns is not None:
+            low, high = desired_returns
+            raise ConfigError(
+                f"--desired-returns {low:g}:{high:g}: all commands would have a desired return of "
+                f"{only:g}, because this run's are integers of at least 1; give a wider range"
+            )
         raise ConfigError(
             f"all returns in the replay buffer are {only:g}, so there is no range to command; give "
             f"one with --desired-returns LOW:HIGH"

@@ -60,7 +60,10 @@ def print_text(text: str, label: str = "") -> None:
 
 
 def print_table(table: "Table") -> None:
-    """Print a table. Unless standard output is a terminal, no line is wrapped or padded."""
+    """Print a table.
+
+    Unless standard output is a terminal, lines are not padded, and only wrapped at ``_FILE_WIDTH``.
+    """
     from rich.console import Console  # it takes a tenth of a second to import
 
     if sys.stdout.isatty():
