@@ -117,6 +117,9 @@ class EpisodeGenerator:
 
         Returns:
             A failure if the environment could not be reset, otherwise None.
+
+        Raises:
+            UnsupportedEnvironment: a failed environment could not be created again.
         """
         row = self._commands.index(None)
         error = self._rows.reset(row, command.environment_seed, command.max_steps)
@@ -139,7 +142,11 @@ class EpisodeGenerator:
         return None
 
     def step(self) -> list[Episode | Failure]:
-        """Advance all running episodes by one step and return those that ended, in any order."""
+        """Advance all running episodes by one step and return those that ended, in any order.
+
+        Raises:
+            UnsupportedEnvironment: a failed environment could not be created again.
+        """
         rows, recording = self._rows, self._recording
         if not self._planned:
             self._plan()

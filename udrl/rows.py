@@ -103,7 +103,11 @@ class Rows:
         return Step(ended, failed)
 
     def replace(self, row: int) -> None:
-        """Replace a failed environment with a new one."""
+        """Replace a failed environment with a new one.
+
+        Raises:
+            UnsupportedEnvironment: the environment can no longer be created.
+        """
         self._envs[row].close()
         self._envs[row] = self._make_row(row)
         self._limits[row] = self.spec.max_episode_steps

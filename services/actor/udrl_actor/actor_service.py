@@ -41,9 +41,9 @@ class ActorService:
         name: unique to this process.
         environments: number of environments to step at once.
         stop: ends the service.
-        hang_s: watchdog timeout, seconds: the process is ended, from outside Python, if one step of
-            all environments takes longer (creating an environment has at least five minutes); None:
-            no watchdog.
+        hang_s: watchdog timeout in seconds: a native thread ends the process if one step of all
+            environments takes longer (creating one may always take five minutes). None: no
+            watchdog.
         first_index: index of its first environment (:data:`udrl.environments.making.INDEX`).
     """
 
@@ -70,6 +70,7 @@ class ActorService:
 
         Raises:
             UnsupportedEnvironment: this machine cannot create the run's environment.
+            EnvironmentFault: the environment failed in the probe, before any command was run.
             Refused: the run does not accept this actor.
             Unreachable: the replay service has not replied for too long.
         """

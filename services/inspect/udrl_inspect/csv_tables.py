@@ -16,7 +16,11 @@ AnyRow = TypeVar("AnyRow", bound=msgspec.Struct)
 
 
 def write(path: Path, kind: type[AnyRow], rows: Iterable[AnyRow]) -> None:
-    """Write rows below a header with the field names; the file is written atomically."""
+    """Write rows below a header with the field names; the file is written atomically.
+
+    Raises:
+        OSError: the file cannot be written; an existing file is unchanged.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(kind.__struct_fields__)

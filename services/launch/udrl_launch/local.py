@@ -40,7 +40,7 @@ class Local(Protocol):
         ...
 
     def end(self) -> None:
-        """End all of them."""
+        """End all services."""
         ...
 
 
@@ -112,12 +112,12 @@ class Processes:
         }
 
     def end(self) -> None:
-        """End all of them."""
+        """End all services."""
         self._supervisor.end()
 
 
 class Threads:
-    """A thread for each service. The first error ends all of them."""
+    """A thread for each service. The first error ends all threads."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class Threads:
         """Do nothing: threads are not restarted."""
 
     def end(self) -> None:
-        """End all of them."""
+        """End all services."""
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)

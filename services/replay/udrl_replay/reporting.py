@@ -45,7 +45,11 @@ _MAX_HOST = 100
 
 
 class MetricsFile:
-    """``metrics.csv``: one line per iteration, rewritten from the store at every start."""
+    """``metrics.csv``: one line per iteration, rewritten from the store at every start.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
 
     def __init__(self, run_dir: Path, store: Store) -> None:
         self._path = run_dir / "metrics.csv"
@@ -60,7 +64,11 @@ class MetricsFile:
             raise unwritable(self._path, error) from error
 
     def update(self, iteration: int) -> None:
-        """Append the lines of all iterations up to ``iteration``."""
+        """Append the lines of all iterations up to ``iteration``.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
         if iteration <= self._written:
             return
         try:
