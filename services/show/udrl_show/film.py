@@ -16,7 +16,7 @@ Picture = npt.NDArray[np.uint8]
 #: Height of the caption, in pixels.
 _CAPTION_HEIGHT = 26
 #: Minimum width of a video, in pixels; smaller frames are enlarged.
-_LEAST_WIDTH = 320
+_MIN_VIDEO_WIDTH = 320
 #: Maximum frames per second of a GIF; browsers slow down faster ones.
 _GIF_FPS = 25
 #: Options of ffmpeg for each kind of file.
@@ -93,7 +93,7 @@ class Film:
 
     def frame(self, picture: Picture, caption: str) -> Picture:
         """Return a picture with its caption below it; both sides are even, as H.264 requires."""
-        enlarge = max(1, -(-_LEAST_WIDTH // picture.shape[1]))
+        enlarge = max(1, -(-_MIN_VIDEO_WIDTH // picture.shape[1]))
         large = picture.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
         height, width = (n - n % 2 for n in large.shape[:2])
         page = self._image.new("RGB", (width, height + _CAPTION_HEIGHT))

@@ -13,7 +13,7 @@ KEYS_HELP = (
 )
 
 #: Minimum width of a picture, height of a line of text, and margin around the text, in pixels.
-_LEAST_WIDTH, _LINE, _MARGIN = 480, 22, 6
+_MIN_PICTURE_WIDTH, _LINE, _MARGIN = 480, 22, 6
 
 
 class Window:
@@ -99,7 +99,7 @@ class Window:
     def _draw(self, picture: Picture, caption: str, rollout: Rollout) -> None:
         pygame = self._pygame
         height, width, _ = picture.shape
-        enlarge = max(1, -(-_LEAST_WIDTH // width))
+        enlarge = max(1, -(-_MIN_PICTURE_WIDTH // width))
         size = width * enlarge, height * enlarge
         if self._surface is None:
             self._surface = pygame.display.set_mode((size[0], size[1] + 2 * _LINE + 2 * _MARGIN))
