@@ -158,11 +158,12 @@ def tuned(algorithm: BaselineAlgorithm, environment: str) -> Tuned:
     """
     text = (resources.files("udrl_experiments") / "tuned.toml").read_text(encoding="utf-8")
     shipped: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(text)
-    if environment not in shipped:
+    chosen = shipped.get(environment, {}).get(algorithm)
+    if chosen is None:
+        known = ", ".join(name for name, of in shipped.items() if algorithm in of)
         raise ConfigError(
             f"tuned.toml has no hyperparameters of {algorithm} for {environment!r}, only for "
-            f"{', '.join(shipped)}"
+            f"{known}; search for some with: udrl study search {environment} --space FILE"
         )
-    chosen = shipped[environment][algorithm]
     networks = {name: chosen.pop(name) for name in NETWORKS if name in chosen}
     return Tuned(chosen, networks)

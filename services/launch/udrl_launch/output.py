@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 #: The original standard output, while :func:`keep_for_json` redirects it.
 _kept: TextIO | None = None
 
-#: Width of a table that is not printed to a terminal, in characters.
-_FILE_WIDTH = 1000
+#: Width of a table that is not printed to a terminal, in characters; texts of a status are shorter.
+_FILE_WIDTH = 10_000
 
 
 def keep_for_json() -> None:
