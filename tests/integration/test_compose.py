@@ -1,5 +1,6 @@
 """``docker compose up`` under faults gives the result of a single process."""
 
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -203,7 +204,8 @@ def test_missing_replay_service_is_reported() -> None:
         "learner", "--connect", "tcp/127.0.0.1:7447", "--patience", "3", image=LEARNER_IMAGE
     )
     assert code == 6
-    assert "no reply from 'tcp/127.0.0.1:7447' after 3 s; start `udrl replay" in log
+    # The elapsed time: 3 s, or more on a busy machine.
+    assert re.search(r"no reply from 'tcp/127\.0\.0\.1:7447' after \d+ s; start `udrl replay", log)
 
 
 def test_learner_without_torch_is_reported() -> None:
