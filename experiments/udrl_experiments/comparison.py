@@ -38,12 +38,7 @@ def comparison(name: str, plan: StudyPlan, participants: Mapping[Participant, in
     """
     task = TASKS[name]
     jobs = [
-        job(
-            task,
-            plan if steps is None else plan._replace(max_env_steps=steps),
-            participant,
-            seed,
-        )
+        job(task, plan._replace(max_env_steps=steps or plan.max_env_steps), participant, seed)
         for participant, steps in participants.items()
         for seed in plan.seeds_of_runs()
     ]

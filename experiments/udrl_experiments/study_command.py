@@ -49,8 +49,6 @@ class _Entry(click.ParamType):  # type: ignore[type-arg]
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[Participant, int | None]:
-        if isinstance(value, tuple):  # converted already
-            return value
         name, separator, steps = str(value).partition("=")
         participant: Any = self._names.convert(name, param, ctx)
         return participant, STEPS.convert(steps, param, ctx) if separator else None

@@ -146,16 +146,6 @@ def export_to_hub(agent: Agent, run_dir: Path, repo_id: str, *, public: bool) ->
         return upload(folder, repo_id, public=public)
 
 
-def check_model_name(path: Path) -> None:
-    """Check the extension of an ONNX model's file name.
-
-    Raises:
-        ConfigError: the name does not end with ``.onnx``.
-    """
-    if path.suffix != ".onnx":
-        raise ConfigError(f"--onnx {path}: expected a name that ends with .onnx")
-
-
 def export_model(agent: Agent, path: Path) -> None:
     """Write an agent's acting graph (:mod:`udrl.graph`) as an ONNX model.
 

@@ -18,6 +18,7 @@ import msgspec
 from udrl.config import flat
 from udrl.errors import StoreError, UdrlError
 from udrl.evaluation import Evaluation
+from udrl.file_endings import check_ending
 from udrl_inspect.run_list import run_directories
 from udrl_proto.messages import Hello
 from udrl_proto.text import printable
@@ -126,7 +127,7 @@ def compare(places: Sequence[Path], picture: Path, x: X = "env_steps") -> list[s
         ConfigError: matplotlib is not installed, or the file's extension is not supported.
         StoreError: a run has no metrics, or no run has an evaluation.
     """
-    pictures.check_picture_name(picture)
+    check_ending(picture, pictures.ENDINGS)
     lines, missing = _lines(places)
     curves = [curve for line in lines for curve in line]
     if not any(_points(line, x) or line[0].final for line in lines):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from udrl.errors import ConfigError
+from udrl.file_endings import check_ending
 from udrl.file_remedies import file_remedy
 
 Picture = npt.NDArray[np.uint8]
@@ -28,18 +29,10 @@ _FFMPEG_OPTIONS = {
         "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
     ),
 }
+#: Endings of the names of videos.
+ENDINGS = tuple(_FFMPEG_OPTIONS)
 #: Seconds for ffmpeg to finish a file.
 _FINISH_S = 60.0
-
-
-def check_video_name(path: Path) -> None:
-    """Check the extension of a file name.
-
-    Raises:
-        ConfigError: the extension is not supported.
-    """
-    if path.suffix not in _FFMPEG_OPTIONS:
-        raise ConfigError(f"--video {path}: expected a name that ends with .mp4 or .gif")
 
 
 class Film:
@@ -55,7 +48,7 @@ class Film:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        check_video_name(path)
+        check_ending(path, ENDINGS)
         try:
             import imageio_ffmpeg
             from PIL import Image, ImageDraw, ImageFont

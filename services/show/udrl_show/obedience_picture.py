@@ -4,6 +4,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
+from udrl.file_endings import check_ending
 from udrl_inspect.obedience_report import ObedienceReport
 from udrl_inspect.obedience_text import answer
 from udrl_show import pictures
@@ -27,7 +28,7 @@ def draw_obedience(report: ObedienceReport, picture: Path) -> None:
         ConfigError: matplotlib is not installed, the extension is not supported, or the file cannot
             be written.
     """
-    pictures.check_picture_name(picture)
+    check_ending(picture, pictures.ENDINGS)
     figure, axes = pictures.empty(2 if report.by_horizon else 1)
     _returns(axes[0], report)
     if report.by_horizon:

@@ -11,21 +11,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: File name extensions of figures.
-_EXTENSIONS = (".png", ".svg", ".pdf")
+#: Endings of the names of figures.
+ENDINGS = (".png", ".svg", ".pdf")
 #: Maximum number of panels in a row.
 _MOST_COLUMNS = 3
-
-
-def check_picture_name(picture: Path) -> None:
-    """Check the extension of a file name.
-
-    Raises:
-        ConfigError: the extension is not supported.
-    """
-    if picture.suffix not in _EXTENSIONS:
-        either = " or ".join([", ".join(_EXTENSIONS[:-1]), _EXTENSIONS[-1]])
-        raise ConfigError(f"{picture}: expected a name that ends with {either}")
 
 
 def empty(panels: int = 1) -> "tuple[Figure, list[Axes]]":

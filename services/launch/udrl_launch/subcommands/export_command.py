@@ -5,14 +5,9 @@ from pathlib import Path
 import click
 
 from udrl.errors import ConfigError
+from udrl.file_endings import check_ending
 from udrl_inspect.agents import load_agent
-from udrl_inspect.exporting import (
-    check_model_name,
-    export_buffer,
-    export_folder,
-    export_model,
-    export_to_hub,
-)
+from udrl_inspect.exporting import export_buffer, export_folder, export_model, export_to_hub
 from udrl_inspect.hub import HUB_SCHEME
 from udrl_inspect.obedience_report import report_of_agent
 from udrl_launch.subcommands.options import FILE, FOLDER, RUN_DIR, WEIGHTS, version
@@ -60,7 +55,7 @@ def export(
     if public and repo_id is None:
         raise ConfigError("--public needs --hub REPO_ID")
     if onnx is not None:
-        check_model_name(onnx)
+        check_ending(onnx, (".onnx",))
     if minari is not None:
         click.echo(f"dataset: {minari}, {export_buffer(run_dir, minari)} episodes")
     if folder is None and onnx is None and repo_id is None:

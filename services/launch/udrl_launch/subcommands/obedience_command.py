@@ -7,6 +7,7 @@ import click
 import msgspec
 
 from udrl.errors import ConfigError, StoreError
+from udrl.file_endings import check_ending
 from udrl_inspect import csv_tables, obedience_text
 from udrl_inspect import obedience_report as reports
 from udrl_inspect.agents import load_agent
@@ -65,7 +66,7 @@ def obedience(
     Example: udrl obedience runs/mine
     """
     if output is not None:
-        pictures.check_picture_name(output)
+        check_ending(output, pictures.ENDINGS)
     agent = load_agent(run_dir, version(weights))
     plan = reports.plan_commands(
         agent, points=points, episodes=episodes,

@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from udrl.evaluation import return_text
+from udrl.file_endings import check_ending
 from udrl.rollout import Rollout
 from udrl_inspect.agents import Agent, evaluation_commands, load_agent
 from udrl_inspect.greedy import caution
@@ -65,7 +66,7 @@ def play(
     Example: udrl play runs/mine --desired-return 200 --desired-horizon 300 --video landing.mp4
     """
     if video is not None:
-        film.check_video_name(video)
+        check_ending(video, film.ENDINGS)
     agent = load_agent(run_dir, version(weights))
     commands = with_seeds(
         evaluation_commands(
