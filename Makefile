@@ -19,6 +19,9 @@ PIP_INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check --qu
 train: setup  ## Train LunarLander to a mean return of 200.
 	$(VENV)/bin/udrl train $(ENV) --stop-return 200 $(ARGS)
 
+# Tests start hundreds of processes: keep compiled modules even where the environment says not to.
+test test-slow test-browser: export PYTHONDONTWRITEBYTECODE =
+
 test: setup-dev  ## Run the tests, except the slow ones.
 	$(VENV)/bin/python -m pytest -m "not slow and not compose and not browser" -n 4 $(ARGS)
 
