@@ -184,6 +184,8 @@ class Batches:
     def gather(self, *, hide: bool = False, most: int | None = None) -> Iterator[Batch]:
         """Yield the batches of all updates, or of the first ones.
 
+        A batch is valid until the next one, which may overwrite its tensors.
+
         Args:
             hide: whether to hide the previous action and reward in the examples drawn for this
                 (:class:`Draw`).

@@ -17,7 +17,7 @@ improvement operator.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ EXAMPLES = 4096
 
 def choose_guidance(
     behavior: BehaviorFunction,
-    batches: Iterable[tuple[Batch, Tensor | None]],
+    batches: Callable[[], Iterable[tuple[Batch, Tensor | None]]],
     minimum: float,
 ) -> tuple[float, float]:
     """Return g and the return of c', scaled, for a trained behavior function.
@@ -45,17 +45,18 @@ def choose_guidance(
 
     Args:
         behavior: the behavior function.
-        batches: batches of examples, and with a memory, its states before their windows.
+        batches: returns batches of examples, and with a memory, its states before their windows;
+            called once, or twice without a baseline. A batch is not used after the next one.
         minimum: mean divergence that is aimed at, in nats.
     """
-    drawn = list(batches)
     low, high = -behavior.bound, behavior.bound
     if behavior.value is None:
-        returns = torch.cat([batch.counted(batch.command)[:, 0] for batch, _ in drawn])
-        low, high = float(returns.min()), float(returns.max())
+        returns = [b.counted(b.command)[:, 0].aminmax() for b, _ in batches()]
+        low = min(float(lowest) for lowest, _ in returns)
+        high = max(float(highest) for _, highest in returns)
     total, n = torch.zeros((), dtype=torch.float64), 0
     with torch.no_grad():
-        for batch, states in drawn:
+        for batch, states in batches():
             highest, lowest = (
                 behavior.forward_relative(batch.seen, with_return(batch.command, level), states)
                 for level in (high, low)

@@ -211,8 +211,12 @@ def _update(
     if behavior.guidance is not None:
         minimum = config.network.guidance_kl
         most = math.ceil(EXAMPLES / config.training.batch_size)
-        examples = ((b, _initial_states(b, states)) for b in batches.gather(most=most))
-        behavior.guidance.copy_(torch.tensor([choose_guidance(behavior, examples, minimum)]))
+        chosen = choose_guidance(
+            behavior,
+            lambda: ((b, _initial_states(b, states)) for b in batches.gather(most=most)),
+            minimum,
+        )
+        behavior.guidance.copy_(torch.tensor([chosen]))
     return float(losses)
 
 

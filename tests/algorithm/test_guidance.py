@@ -1,5 +1,6 @@
 """Guidance: acting goes further than the examples, by a chosen divergence."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ def mean_divergence(network: BehaviorFunction, batch: Batch, guidance: float) ->
 def test_guided_policy_diverges_by_the_minimum(minimum: float) -> None:
     network, batch = behavior(), examples(5000)
     assert mean_divergence(network, batch, 0.0) < minimum / 2
-    guidance, lowest = choose_guidance(network, [(batch, None)], minimum)
+    guidance, lowest = choose_guidance(network, lambda: [(batch, None)], minimum)
     assert lowest == -2.0
     assert mean_divergence(network, batch, guidance) == pytest.approx(minimum, rel=0.2)
 
@@ -63,18 +64,21 @@ def test_guided_policy_diverges_by_the_minimum(minimum: float) -> None:
 def test_strong_response_is_not_guided() -> None:
     network, batch = behavior(), examples(5000)
     assert mean_divergence(network, batch, 0.0) > 0.001
-    assert choose_guidance(network, [(batch, None)], 0.001)[0] == 0.0
+    assert choose_guidance(network, lambda: [(batch, None)], 0.001)[0] == 0.0
 
 
 def test_guidance_is_bounded() -> None:
-    assert choose_guidance(behavior(response=0.0), [(examples(10), None)], 0.05)[0] == 30.0
+    assert choose_guidance(behavior(response=0.0), lambda: [(examples(10), None)], 0.05)[0] == 30.0
 
 
 def test_padding_does_not_count() -> None:
     batch = examples(100)
     padded = batch._replace(valid=torch.arange(100) < 50)
     first = batch._replace(seen=(batch.seen[0][:50],), command=batch.command[:50])
-    guidance = [choose_guidance(behavior(), [(b, None)], 0.05)[0] for b in (padded, first, batch)]
+    guidance = [
+        choose_guidance(behavior(), partial(iter, [(b, None)]), 0.05)[0]
+        for b in (padded, first, batch)
+    ]
     assert guidance[0] == pytest.approx(guidance[1], rel=1e-5)
     assert guidance[0] != pytest.approx(guidance[2], rel=1e-5)
 
@@ -96,7 +100,7 @@ def test_acting_is_guided_and_training_is_not() -> None:
 def test_without_a_baseline_the_returns_are_those_of_the_examples(valid: Any) -> None:
     network, batch = behavior(baseline="none"), examples(10)._replace(valid=valid)
     returns = batch.command[:, 0] if valid is None else batch.command[:5, 0]
-    guidance, lowest = choose_guidance(network, [(batch, None)], 0.05)
+    guidance, lowest = choose_guidance(network, lambda: [(batch, None)], 0.05)
     assert lowest == returns.min()
     assert network.guidance is not None
     network.guidance.copy_(torch.tensor([[guidance, lowest]]))

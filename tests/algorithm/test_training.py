@@ -300,10 +300,11 @@ def test_learner_computes_deterministically_in_one_thread() -> None:
     assert torch.are_deterministic_algorithms_enabled()
 
 
+@pytest.mark.parametrize("baseline", ["none", "value"])
 def test_chunked_gathering_gives_identical_results(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, baseline: str
 ) -> None:
-    config = settings(n_updates_per_iter=7)
+    config = settings(n_updates_per_iter=7, guidance_kl=0.05, baseline=baseline)
     digests = set()
     for gathered in (1, 2000, 1 << 20):  # bytes: one update, some, all
         monkeypatch.setattr("udrl.batches._GATHERED_BYTES", gathered)
