@@ -220,8 +220,8 @@ class Sample:
         self.returns.append(episode.episode_return)
         self.lengths.append(episode.length)
         seen = [blake2b(o.tobytes(), digest_size=16).digest() for o in episode.observations]
-        # The outcome of a truncated last step is unknown.
-        for t in range(episode.length - episode.truncated):
+        # The outcome of a last step that did not terminate is unknown.
+        for t in range(episode.length - (not episode.terminated)):
             step = seen[t] + episode.actions[t].tobytes()
             outcome = episode.rewards[t].tobytes() + b"".join(seen[t + 1 : t + 2])
             self.is_stochastic |= self._outcomes.setdefault(step, outcome) != outcome

@@ -72,7 +72,7 @@ class Experience:
         self._page_table = np.zeros((n_episodes, 1), np.int64)
         self._lengths = np.zeros(n_episodes, np.int64)
         self._returns = np.zeros(n_episodes)
-        self._truncated = np.zeros(n_episodes, np.bool_)
+        self._terminated = np.zeros(n_episodes, np.bool_)
         self._free_slots = list(range(n_episodes))[::-1]
         self._free_pages: list[int] = []
         self._places: dict[int, _Place] = {}
@@ -101,7 +101,7 @@ class Experience:
         self._page_table[slot, :count] = pages
         self._lengths[slot] = episode.length
         self._returns[slot] = episode.episode_return
-        self._truncated[slot] = episode.truncated
+        self._terminated[slot] = episode.terminated
         self._places[episode.command_id] = _Place(slot, pages)
 
     def _make_room(self, count: int) -> None:
@@ -216,7 +216,7 @@ class RankedExperience:
         held, slots, first = self._experience, self._slots, self._first_step
         last = first + self.lengths - 1
         earned = held._earned[self._row(*self._all_steps())]
-        continues = held._truncated[slots] & (self.lengths < held._ends_at)
+        continues = ~held._terminated[slots] & (self.lengths < held._ends_at)
         beyond = np.where(continues, expected[last], 0.0)
         # Values after each step: rewards earned so far, V, and at the end the label.
         earned_next, expected_next = np.roll(earned, -1), np.roll(expected, -1)

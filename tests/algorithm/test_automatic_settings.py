@@ -104,14 +104,16 @@ def test_algorithm_1_chooses_automatic_settings() -> None:
     assert ways[0].weights_sha256 == ways[1].weights_sha256
 
 
-def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
+def walk(
+    *steps: tuple[int, int, float], truncated: bool = False, terminated: bool | None = None
+) -> Episode:
     """An episode of (observed category, action, reward) steps."""
     return Episode(
         command_id=0,
         observations=np.array([[s[0]] for s in steps], np.int32),
         actions=np.array([s[1] for s in steps], np.uint8),
         rewards=np.array([s[2] for s in steps], np.float32),
-        terminated=not truncated,
+        terminated=not truncated if terminated is None else terminated,
         truncated=truncated,
     )
 
@@ -125,6 +127,7 @@ def walk(*steps: tuple[int, int, float], truncated: bool = False) -> Episode:
         ([walk((0, 0, 0.5), (1, 1, 1.0))], True),  # another reward
         ([walk((0, 0, 0.0))], True),  # terminal
         ([walk((0, 0, 0.0), truncated=True)], False),  # truncated: the next state is unknown
+        ([walk((0, 0, 0.0), truncated=True, terminated=True)], True),  # terminal, at the limit
         ([], False),
     ],
 )

@@ -1,5 +1,6 @@
 """The value function, and desired returns relative to it (udrl.value)."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,16 @@ def test_labels_are_lambda_returns(
         expected = [lambda_return(rewards[t:], values[rank][t:], end, lam) for t in range(n)]
         got = experience.examples(segments).command[:, 0]
         np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-6)
+
+
+def test_terminal_state_at_the_step_limit_has_no_value() -> None:
+    at_limit = dataclasses.replace(episode(0, [1.0, 2.0]), truncated=True)
+    assert at_limit.terminated
+    experience = ranked([at_limit])
+    experience.label(np.array([50.0, 100.0]), 0.5)
+    segments = Segments(np.zeros(2, int), np.arange(2), np.full(2, 2))
+    labels = experience.examples(segments).command[:, 0]
+    assert labels.tolist() == [0.5 * (1 + 100) + 0.5 * (1 + 2), 2.0]
 
 
 def test_labels_with_lambda_1_are_observed_returns() -> None:
