@@ -33,11 +33,18 @@ FORBIDDEN = -1e9
 NORMALISER = "normaliser"
 #: Name of the weight of guidance (:mod:`udrl.guidance`).
 GUIDANCE = "guidance"
+#: First part of the names of a custom network's tensors (:mod:`udrl.custom_networks`).
+CUSTOM = "custom"
+
+
+def is_custom(name: str) -> bool:
+    """Return whether a layer or tensor of this name belongs to a custom network."""
+    return name.split(".")[0] == CUSTOM
 
 
 def is_trained(name: str) -> bool:
     """Return whether the optimizer updates a tensor of this name."""
-    return name != GUIDANCE and NORMALISER not in name.split(".")
+    return is_custom(name) or (name != GUIDANCE and NORMALISER not in name.split("."))
 
 
 def layer_widths(space: ObservationSpace, network: NetworkSettings) -> tuple[int, ...]:

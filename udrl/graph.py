@@ -24,6 +24,7 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
 from udrl.architecture import (
+    CUSTOM,
     FILTER,
     FORBIDDEN,
     GUIDANCE,
@@ -196,14 +197,14 @@ class _Builder(Nodes):
             if tensor.raw_data:
                 names[tensor.name] = self.constant(numpy_helper.to_array(tensor))
             else:
-                names[tensor.name] = self.weight(f"custom.{tensor.name}", *tensor.dims)
+                names[tensor.name] = self.weight(f"{CUSTOM}.{tensor.name}", *tensor.dims)
         for node in model.graph.node:
             copy = onnx.NodeProto()
             copy.CopyFrom(node)
             copy.name = ""
             copy.input[:] = [names[name] if name else "" for name in node.input]
             for name in node.output:
-                names[name] = f"custom.{len(self.nodes)}.{name}"
+                names[name] = f"{CUSTOM}.{len(self.nodes)}.{name}"
             copy.output[:] = [names[name] for name in node.output]
             self.nodes.append(copy)
         # model() renames the output of the last node.

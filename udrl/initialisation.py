@@ -5,6 +5,7 @@ from collections.abc import Collection
 import torch
 from torch import nn
 
+from udrl.architecture import is_custom
 from udrl.config import Config
 from udrl.streams import Purpose, Stream, stream_key
 
@@ -12,7 +13,7 @@ from udrl.streams import Purpose, Stream, stream_key
 def draw_weights(
     module: nn.Module, config: Config, number: int, without_activation: Collection[str]
 ) -> None:
-    """Draw all weights of a network.
+    """Draw all weights of a network, except for those that a custom network has drawn itself.
 
     Args:
         module: the network.
@@ -24,6 +25,8 @@ def draw_weights(
     generator = torch.Generator().manual_seed(int(stream.integers(1, 0, 2**52)[0]))
     gain = nn.init.calculate_gain(config.network.activation)
     for name, layer in module.named_modules():
+        if is_custom(name):
+            continue
         if isinstance(layer, nn.Embedding):
             # Vectors as different as possible, with the norm that a first layer with one-hot input
             # would give.

@@ -27,6 +27,23 @@ class Concatenating(nn.Module):
         return logits
 
 
+class Initialised(Concatenating):
+    """Draws its own weights, has a layer without biases and one named as a part of ours."""
+
+    def __init__(self, spec: EnvironmentSpec, network: NetworkSettings) -> None:
+        super().__init__(spec, network)
+        self.last = nn.Linear(network.hidden[0], spec.action_space.n_parameters, bias=False)
+        nn.init.eye_(self.first.weight)
+        nn.init.constant_(self.first.bias, 0.5)
+        self.norm = nn.Identity()
+        self.normaliser = nn.LayerNorm(network.hidden[0])
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        features = self.normaliser(self.first(torch.cat(inputs, dim=1)))
+        logits: Tensor = self.last(torch.relu(features))
+        return logits
+
+
 class Idle(Concatenating):
     """Has an unused layer."""
 

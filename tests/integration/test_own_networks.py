@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,20 @@ import numpy as np
 import pytest
 import torch
 
+from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.algorithm1 import algorithm1
 from udrl.behavior import initialise
+from udrl.checkpoint import decode_state, encode_optimizer
+from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
 from udrl.environments.making import make_environment
 from udrl.environments.specification import specify
 from udrl.errors import ConfigError
+from udrl.experience import Experience
 from udrl.graph import acting_graph, weight_shapes
 from udrl.inference import ActingFunction
-from udrl.training import weights_of
+from udrl.training import train, untrained, weights_of
+from udrl.weights import encode_weights
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_folder
 from udrl_proto.reports import Status
@@ -87,6 +93,26 @@ def test_initial_weights_are_a_function_of_the_seed() -> None:
     before = torch.random.get_rng_state()
     assert weights(1) == weights(1) != weights(2)
     assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_initial_weights_are_those_of_the_module_and_all_are_trained() -> None:
+    config = settings("Initialised", baseline="none", warm_up_hold_steps=1)
+    with closing(EpisodeGenerator(config, 1)) as generator:
+        spec, commands = generator.spec, CommandSampler(config, generator.spec).warm_up()
+        episodes = generate_episodes(generator, commands, None)
+    state = untrained(config, spec)
+    initial = state.weights
+    first = initial["custom.first.weight"]
+    np.testing.assert_array_equal(first, np.eye(*first.shape))
+    assert (initial["custom.first.bias"] == 0.5).all()
+    held = Experience(config, spec)
+    for episode in episodes:
+        held.add(episode)
+    train(state, held.by_rank([episode.command_id for episode in episodes]), config)
+    restored = decode_state(1, encode_weights(state.weights), encode_optimizer(state), config, spec)
+    for name, tensor in state.weights.items():
+        np.testing.assert_array_equal(restored.weights[name], tensor)
+        assert (tensor != initial[name]).any(), name
 
 
 @pytest.mark.parametrize(
