@@ -26,10 +26,15 @@ MAX_CATEGORIES = 2**20
 #: Maximum number of leaves of a record.
 MAX_LEAVES = 256
 
-#: Key of a dictionary, or index in a tuple.
-Key = Annotated[str, Meta(max_length=200)] | Annotated[int, Meta(ge=0, le=MAX_LEAVES)]
+#: Maximum length of a key that is a string.
+MAX_KEY_LENGTH = 200
+#: Maximum number of numbers in an array of one dimension.
+MAX_SIZE = 2**20
 
-Size = Annotated[int, Meta(ge=1, le=2**20)]
+#: Key of a dictionary, or index in a tuple.
+Key = Annotated[str, Meta(max_length=MAX_KEY_LENGTH)] | Annotated[int, Meta(ge=0, le=MAX_LEAVES)]
+
+Size = Annotated[int, Meta(ge=1, le=MAX_SIZE)]
 
 
 class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
@@ -285,9 +290,9 @@ def _nested(leaves: list[tuple[tuple[Key, ...], spaces.Space[Any]]]) -> spaces.S
     for (key, *path), space in leaves:
         inner.setdefault(key, []).append((tuple(path), space))
     parts = [(key, _nested(below)) for key, below in inner.items()]
-    if all(isinstance(key, int) for key in inner):
+    if list(inner) == list(range(len(inner))):
         return spaces.Tuple([space for _, space in parts])
-    return spaces.Dict([(str(key), space) for key, space in parts])
+    return spaces.Dict(parts)  # type: ignore[arg-type]  # Gymnasium accepts keys of all types
 
 
 ObservationSpace = LeafSpace | Record

@@ -261,6 +261,13 @@ def test_action_component_out_of_range_is_rejected() -> None:
         (spaces.Discrete(2**20 + 1), "1,048,577 states.*at most 1,048,576"),
         (spaces.MultiDiscrete([2**20, 2]), "1,048,578 values in all.*at most 1,048,576"),
         (spaces.Dict({}), "0 parts; supported are 1 to 256"),
+        (spaces.Box(-1, 1, (600, 600, 3)), "has 1,080,000 numbers, at most 1,048,576.*as uint8"),
+        (spaces.MultiBinary(2**20 + 1), "has 1,048,577 numbers, at most 1,048,576"),
+        (
+            spaces.Dict([(7, spaces.Discrete(2)), (1000, spaces.Discrete(2))]),  # type: ignore[list-item]
+            r"observation\[1000\] has the key 1000 .*expected a string.*from 0 to 256; rename",
+        ),
+        (spaces.Dict({"k" * 201: spaces.Discrete(2)}), "has the key 'k.*at most 200 characters"),
     ],
     ids=str,
 )
@@ -290,7 +297,7 @@ def test_unsupported_observation_space_is_rejected_by_name(space: AnySpace, mess
             None,
         ),
         (spaces.Dict({}), "has no parts", None),
-        (spaces.Box(-1, 1, (99,)), "99,000 outputs; at most 65,536", 1000),
+        (spaces.Box(-1, 1, (99,)), "99,000 outputs, at most 65,536.*lower action_bins", 1000),
     ],
     ids=str,
 )

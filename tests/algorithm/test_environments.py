@@ -278,6 +278,12 @@ def test_environment_without_step_limit_is_rejected_with_the_remedy(
         make(name)
 
 
+def test_step_limit_that_means_no_limit_is_rejected_with_the_remedy(register: Register) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=2**63 - 1)
+    with pytest.raises(UnsupportedEnvironment, match=r"at most 2,147,.*max_episode_steps=1000"):
+        make(name)
+
+
 def test_max_episode_steps_sets_or_replaces_the_limit(register: Register) -> None:
     endless = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=None)
     limited = register(lambda: Blank(VECTOR, spaces.Discrete(2)), max_steps=10)

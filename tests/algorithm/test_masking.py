@@ -14,12 +14,14 @@ from udrl.automatic_settings import with_offered_mask
 from udrl.commands import CommandSampler
 from udrl.config import Budget, Config, build
 from udrl.environments import make_environment
+from udrl.environments.specification import specify
 from udrl.episode import Episode, fault
 from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.graph import acting_graph
 from udrl.inference import ActingFunction
 from udrl.policy import Policy
 from udrl.rollout import Rollout
+from udrl.spaces import leaves_of
 
 
 class Doors(gym.Env[Any, Any]):
@@ -127,6 +129,16 @@ def test_automatic_mask_is_the_one_that_the_environment_offers(
     settings = config(None, given)
     assert with_offered_mask(settings, ["action_mask"]).actions.action_mask == chosen
     assert with_offered_mask(settings, ["hold_rate"]) == settings
+
+
+@pytest.mark.parametrize(
+    ("mask", "path"), [("info", ("action_mask",)), ("action_mask", ("observation", "action_mask"))]
+)
+def test_mask_is_the_one_that_is_asked_for(mask: str, path: tuple[str, ...]) -> None:
+    settings = config(mask, {"shows": "action_mask"}, observe_time=True)
+    spec = specify(make_environment(settings), settings)
+    assert spec.action_mask is not None
+    assert leaves_of(spec.observation_space)[spec.action_mask].path == path
 
 
 def test_run_with_an_automatic_mask_takes_allowed_actions_only() -> None:

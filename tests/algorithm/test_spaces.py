@@ -129,7 +129,10 @@ def test_vectors_are_finite(value: float) -> None:
     assert Vector(size=1).fault(np.array([[value]], np.float32), 1) == "not all finite numbers"
 
 
-@pytest.mark.parametrize("space", [*OBSERVATIONS, RECORD], ids=str)
+INTEGER_KEYS = Record(leaves=(Leaf((0,), Bits(size=2)), Leaf((3,), Vector(size=1))))
+
+
+@pytest.mark.parametrize("space", [*OBSERVATIONS, RECORD, INTEGER_KEYS], ids=str)
 def test_observation_space_round_trips_through_message_and_gymnasium(
     space: ObservationSpace,
 ) -> None:

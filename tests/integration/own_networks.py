@@ -27,16 +27,17 @@ class Concatenating(nn.Module):
         return logits
 
 
-class Initialised(Concatenating):
-    """Draws its own weights, has a layer without biases and one named as a part of ours."""
+class Initialised(nn.Module):
+    """Draws its own weights; has a layer without biases, and one with the name of one of ours."""
 
     def __init__(self, spec: EnvironmentSpec, network: NetworkSettings) -> None:
-        super().__init__(spec, network)
-        self.last = nn.Linear(network.hidden[0], spec.action_space.n_parameters, bias=False)
+        super().__init__()
+        width = network.hidden[0]
+        self.first = nn.Linear(spec.observation_space.shape[0] + 2, width)
+        self.normaliser = nn.LayerNorm(width)
+        self.last = nn.Linear(width, spec.action_space.n_parameters, bias=False)
         nn.init.eye_(self.first.weight)
         nn.init.constant_(self.first.bias, 0.5)
-        self.norm = nn.Identity()
-        self.normaliser = nn.LayerNorm(network.hidden[0])
 
     def forward(self, *inputs: Tensor) -> Tensor:
         features = self.normaliser(self.first(torch.cat(inputs, dim=1)))

@@ -146,8 +146,11 @@ def action_conversion(space: spaces.Space[Any], settings: ActionSettings) -> Con
         not problems
         and (n := sum(n for _, c in parts for n in c.plain.components)) > _MAX_PARAMETERS
     ):
-        problems.append(f"its actions are {space}, for which the network would have {n:,} outputs; "
-                        f"at most {_MAX_PARAMETERS:,} are supported")  # fmt: skip
+        problems.append(
+            f"its actions are {space}, for which the network would have {n:,} outputs, at most "
+            f"{_MAX_PARAMETERS:,} are supported; offer fewer actions with "
+            f"gymnasium.wrappers.TransformAction, or for Box actions lower action_bins"
+        )
     if problems:
         raise UnsupportedEnvironment("; also, ".join(problems))
     if [path for path, _ in leaves] == [()]:

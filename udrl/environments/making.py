@@ -20,7 +20,7 @@ from udrl.environments.creation_remedies import remedy, sentence
 from udrl.environments.masking import CheckMask, ObserveMask
 from udrl.environments.observation_conversions import observation_conversion
 from udrl.environments.previous import ObservePrevious
-from udrl.environments.step_limits import limit_steps, step_limit
+from udrl.environments.step_limits import MAX_STEP_LIMIT, limit_steps, step_limit
 from udrl.environments.time_left import ObserveTime
 from udrl.environments.wrapping import wrapped
 from udrl.errors import UnsupportedEnvironment
@@ -125,6 +125,11 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
         problems.append(
             "it has no step limit, so an episode might never end; set one, e.g. "
             "--set max_episode_steps=1000"
+        )
+    elif env.spec.max_episode_steps > MAX_STEP_LIMIT:
+        problems.append(
+            f"its step limit is {env.spec.max_episode_steps:,}, at most {MAX_STEP_LIMIT:,} is "
+            f"supported; set a lower one, e.g. --set max_episode_steps=1000"
         )
     if observations is None or actions is None or problems:
         close(env)

@@ -1,5 +1,6 @@
 """Conversion between an environment's observations and plain arrays (:mod:`udrl.spaces`)."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from udrl.environments.conversions import (
 from udrl.errors import InvalidData, UnsupportedEnvironment
 from udrl.spaces import (
     MAX_CATEGORIES,
+    MAX_KEY_LENGTH,
     MAX_LEAVES,
+    MAX_SIZE,
     Bits,
     Categories,
     Category,
@@ -51,12 +54,35 @@ def observation_conversion(space: spaces.Space[Any]) -> Conversion:
     for path, inner in leaves:
         name = "observation" + "".join(f"[{key!r}]" for key in path)
         try:
+            _check_keys(name, path)
             parts.append((path, _leaf_conversion(name, inner)))
         except UnsupportedEnvironment as error:
             problems.append(str(error))
     if problems:
         raise UnsupportedEnvironment("; also, ".join(problems))
     return _Records("observation", space, parts)
+
+
+def _check_keys(name: str, path: tuple[Any, ...]) -> None:
+    for key in path:
+        named = type(key) is str and len(key) <= MAX_KEY_LENGTH
+        if not named and not (type(key) is int and 0 <= key <= MAX_LEAVES):
+            raise UnsupportedEnvironment(
+                f"its {name} has the key {describe(key)}, expected a string of at most "
+                f"{MAX_KEY_LENGTH} characters or an integer from 0 to {MAX_LEAVES}; rename it with "
+                f"gymnasium.wrappers.TransformObservation"
+            )
+
+
+def _size(name: str, shape: tuple[int, ...]) -> int:
+    size = math.prod(shape)
+    if size > MAX_SIZE:
+        raise UnsupportedEnvironment(
+            f"its {name} has {size:,} numbers, at most {MAX_SIZE:,} are supported; make it "
+            f"smaller with gymnasium.wrappers.TransformObservation, or if it is an image, declare "
+            f"it as uint8 with bounds 0 and 255"
+        )
+    return size
 
 
 def _leaf_conversion(name: str, space: spaces.Space[Any]) -> Conversion:
@@ -70,12 +96,12 @@ def _leaf_conversion(name: str, space: spaces.Space[Any]) -> Conversion:
                 raise _too_many(f"its {name} has {total:,} values in all components together")
             return MultiIndexed(name, space, Categories(ns=tuple(space.nvec.reshape(-1).tolist())))
         case spaces.MultiBinary() if np.prod(space.shape) > 0:
-            return Boxed(name, space, Bits(size=int(np.prod(space.shape))))
+            return Boxed(name, space, Bits(size=_size(name, space.shape)))
         case spaces.Box() if is_image(space):
             if min(space.shape) > 0:
                 return _Images(name, space)
         case spaces.Box() if np.prod(space.shape) > 0:
-            return Boxed(name, space, Vector(size=int(np.prod(space.shape))))
+            return Boxed(name, space, Vector(size=_size(name, space.shape)))
     raise UnsupportedEnvironment(
         f"its {name} is {space}; supported are Box, Discrete, MultiDiscrete, MultiBinary, and Dict "
         f"and Tuple of these; {_remedy(name, space)}"

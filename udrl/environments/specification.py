@@ -11,7 +11,7 @@ from udrl.config import Config
 from udrl.environments.adapter import Environment
 from udrl.environments.conversions import describe
 from udrl.environments.masking import MASK, below_observation
-from udrl.environments.step_limits import step_limit
+from udrl.environments.step_limits import MAX_STEP_LIMIT, step_limit
 from udrl.errors import UnsupportedEnvironment
 from udrl.spaces import MAX_LEAVES, Bits, ObservationSpace, Vector, leaves_of
 
@@ -30,7 +30,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     observation_space: ObservationSpace
     action_space: ActionSpace
-    max_episode_steps: Annotated[int, Meta(ge=1, le=2**31)]
+    max_episode_steps: Annotated[int, Meta(ge=1, le=MAX_STEP_LIMIT)]
     max_return: float | None = None
     action_mask: Annotated[int, Meta(ge=0, le=MAX_LEAVES - 1)] | None = None
 
@@ -87,11 +87,13 @@ def _mask(config: Config, space: ObservationSpace, actions: ActionSpace) -> int 
     name = config.actions.action_mask
     if name is None:
         return None
-    key = MASK if name == "info" else name
     leaves = [leaf.path for leaf in leaves_of(space)]
-    found = [k for k, path in enumerate(leaves) if below_observation(path) == (key,)]
+    keys = [below_observation(path) for path in leaves]
+    if name == "info":  # the outermost wrapper has added it; another entry may have its name
+        found = [k for k, path in enumerate(leaves) if path == (MASK,)]
+    else:
+        found = [k for k, key in enumerate(keys) if key == (name,)]
     if not found:
-        keys = [below_observation(path) for path in leaves]
         entries = ", ".join(repr(k[0]) for k in keys if len(k) == 1 and isinstance(k[0], str))
         raise UnsupportedEnvironment(
             f"action_mask = {name!r}: environment {config.environment!r} has no such entry; "

@@ -8,6 +8,9 @@ from udrl.config import Config
 from udrl.environments.adapter import Environment
 from udrl.errors import UnsupportedEnvironment
 
+#: Maximum step limit.
+MAX_STEP_LIMIT = 2**31
+
 #: Attribute of wrappers that repeat actions, such as Gymnasium's ``RepeatAction``.
 _REPEATS = "num_repeats"
 #: Attribute of Gymnasium's ``TimeLimit``.
