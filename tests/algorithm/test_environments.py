@@ -1,3 +1,4 @@
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from functools import reduce
@@ -17,7 +18,7 @@ from udrl.config import Config, build
 from udrl.environments import Environment, limit_steps, make_environment, specify
 from udrl.environments.figure2 import A1, A2, A3, Figure2
 from udrl.environments.sparse import RewardAtEnd
-from udrl.errors import UnsupportedEnvironment
+from udrl.errors import EnvironmentFault, UnsupportedEnvironment
 from udrl.spaces import Category, Vector
 
 
@@ -323,6 +324,39 @@ def test_wrapped_time_limit_counts_its_own_steps(register: Register) -> None:
     assert play(env, 1, [0] * 100)[2] == [False, False, True]
 
 
+class HidesTruncation(gym.Wrapper[Any, Any, Any, Any]):
+    """Continues episodes that the step limit has ended."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, _, info = self.env.step(action)
+        return observation, reward, terminated, False, info
+
+
+class PassesByTheLimit(gym.Wrapper[Any, Any, Any, Any]):
+    """Steps the innermost environment."""
+
+    def step(self, action: Any) -> Any:
+        return self.unwrapped.step(action)
+
+
+@pytest.mark.parametrize("wrapper", [HidesTruncation, PassesByTheLimit])
+def test_episode_that_does_not_end_at_its_limit_is_a_fault(
+    register: Register, wrapper: type[gym.Wrapper[Any, Any, Any, Any]], importable_module: str
+) -> None:
+    name = register(lambda: Blank(VECTOR, spaces.Discrete(2)))
+    vars(importlib.import_module(importable_module))["Wrapper"] = wrapper
+    env = make(name, wrappers=(f"{importable_module}:Wrapper",))
+    for limit in (10, 4):
+        limit_steps(env, limit)
+        env.reset(seed=1)
+        for _ in range(limit - 1):
+            env.step(0)
+        with pytest.raises(
+            EnvironmentFault, match=f"not end the episode at its step limit of {limit};"
+        ):
+            env.step(0)
+
+
 def test_limit_steps_rejects_an_environment_without_a_limit() -> None:
     with pytest.raises(UnsupportedEnvironment, match="make it with make_environment"):
         limit_steps(Figure2(), 3)
@@ -407,6 +441,13 @@ def test_wrapper_that_cannot_be_applied_is_rejected_with_the_remedy(
         make("CartPole-v1", wrappers=[wrapper])
 
 
+def test_wrapper_that_is_no_wrapper_is_rejected_with_the_remedy() -> None:
+    with pytest.raises(
+        UnsupportedEnvironment, match=r"'builtins:id' returned \d+ \(int\), expected a .*; derive"
+    ):
+        make("CartPole-v1", wrappers=["builtins:id"])
+
+
 def exits_around(env: Environment) -> Environment:
     sys.exit("no licence")
 
@@ -431,6 +472,36 @@ def importable_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     yield name
     sys.modules.pop(name, None)
     gym.registry.pop("Patience-v0", None)
+
+
+def test_version_is_required_in_a_module_too(importable_module: str) -> None:
+    with pytest.raises(
+        UnsupportedEnvironment, match=f"did you mean '{importable_module}:Patience-v0'"
+    ):
+        make(f"{importable_module}:Patience")
+
+
+class Bare(gym.Env[Any, Any]):
+    """Has no spaces."""
+
+    def __init__(self, lacks: str, closed: list[str]) -> None:
+        self.lacks, self.closed = lacks, closed
+        for space in {"observation_space", "action_space"} - {lacks}:
+            setattr(self, space, spaces.Discrete(2))
+
+    def close(self) -> None:
+        self.closed.append(self.lacks)
+
+
+@pytest.mark.parametrize("lacks", ["observation_space", "action_space"])
+def test_environment_without_a_space_is_rejected_and_closed(register: Register, lacks: str) -> None:
+    closed: list[str] = []
+    name = register(lambda: Bare(lacks, closed))
+    with pytest.raises(
+        UnsupportedEnvironment, match=f"has no {lacks}; set self.{lacks} to a space"
+    ):
+        make(name, observe_time=True)
+    assert closed == [lacks]
 
 
 def test_importable_environment_is_imported(importable_module: str) -> None:

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from udrl.environments.conversions import Array, Conversion, describe
+from udrl.environments.step_limits import most_actions
 from udrl.errors import EnvironmentFault, InvalidData
 
 log = logging.getLogger("udrl")
@@ -44,6 +45,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         self.actions = actions
         self.observation_space = observations.plain.gymnasium
         self.action_space = actions.plain.gymnasium
+        self._actions_left = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -62,6 +64,7 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
         observation, info = returned
         if not isinstance(info, Mapping):
             raise _wrong("reset", f"{describe(info)} as info", "a dictionary")
+        self._actions_left = most_actions(self.env)
         return self._seen("reset", observation), dict(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -71,7 +74,8 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             action: a plain action.
 
         Raises:
-            EnvironmentFault: the environment returned an invalid value, or called ``sys.exit``.
+            EnvironmentFault: the environment returned an invalid value, did not end the episode at
+                its step limit, or called ``sys.exit``.
         """
         try:
             returned: Any = self.env.step(self.actions.back_one(action))
@@ -90,6 +94,12 @@ class Adapter(gym.Wrapper[Any, Any, Any, Any]):
             terminated = _flag("terminated", terminated)
         if type(truncated) is not bool:
             truncated = _flag("truncated", truncated)
+        self._actions_left -= 1
+        if self._actions_left <= 0 and not (terminated or truncated):
+            raise EnvironmentFault(
+                f"step() did not end the episode at its step limit of {most_actions(self.env)}; a "
+                f"wrapper hides truncated, or passes by gymnasium.wrappers.TimeLimit with unwrapped"
+            )
         return self._seen("step", observation), reward, terminated, truncated, info
 
     def close(self) -> None:
@@ -121,7 +131,7 @@ def raised(where: str, error: BaseException) -> str:
         error: the exception.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith(_INSTALLED)]
+    own = [f for f in frames if not any(map(Path(f.filename).is_relative_to, _INSTALLED))]
     found = (own or frames)[-1:]
     place = "".join(f" ({Path(f.filename).name}, line {f.lineno})" for f in found)
     return f"{where}() raised {type(error).__name__}: {error}{place}"

@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -56,45 +57,72 @@ def make_environment(config: Config) -> Adapter:
             unsupported spaces. The message lists all problems with limit and spaces.
     """
     name = config.environment
-    # Passed only if it is set: None would mean "no limit" to Gymnasium.
-    limit: dict[str, Any] = {}
-    if config.max_episode_steps is not None:
-        limit["max_episode_steps"] = config.max_episode_steps
-    if (latest := _latest_version(name)) != name:
-        raise UnsupportedEnvironment(
-            f"environment {name!r} has no version, and the latest one depends on what is "
-            f"installed; did you mean {latest!r}?"
-        )
     try:
-        with indexed(int(os.environ.get(INDEX, "0"))):
-            env: Environment = gym.make(
-                name, disable_env_checker=True, **(limit | config.environment_kwargs)
-            )
+        env = _created(config)
+    except UnsupportedEnvironment:
+        raise
     except (Exception, SystemExit) as error:
         raise UnsupportedEnvironment(
             f"environment {name!r} cannot be created: {type(error).__name__}: {sentence(error)}; "
             f"{remedy(error, config)}"
         ) from error
-    for wrapper in config.wrappers:
-        env = wrapped(env, wrapper)
-    longest = step_limit(env, config)
-    if longest is not None:
-        limit_steps(env, longest)
-        if config.observe_time:
-            env = ObserveTime(env, longest)
-    return adapt(ObservePrevious(env) if config.observe_previous else env, name, config.actions)
-
-
-def _latest_version(name: str) -> str:
-    """Return the latest version of a registered environment; any other name unchanged."""
-    if name in gym.registry or ":" in name:
-        return name
     try:
-        namespace, base, version = parse_env_id(name)
+        _check_spaces(env, name)
+        for wrapper in config.wrappers:
+            env = wrapped(env, wrapper)
+        longest = step_limit(env, config)
+        if longest is not None:
+            limit_steps(env, longest)
+            if config.observe_time:
+                env = ObserveTime(env, longest)
+        if config.observe_previous:
+            env = ObservePrevious(env)
+        return adapt(env, name, config.actions)
+    except Exception:
+        close(env)
+        raise
+
+
+def _created(config: Config) -> Environment:
+    """Return the environment as Gymnasium makes it."""
+    module, _, _ = config.environment.rpartition(":")
+    if module:
+        import_module(module)  # registers its environments
+    _check_version(config.environment)
+    # Passed only if it is set: None would mean "no limit" to Gymnasium.
+    limit: dict[str, Any] = {}
+    if config.max_episode_steps is not None:
+        limit["max_episode_steps"] = config.max_episode_steps
+    with indexed(int(os.environ.get(INDEX, "0"))):
+        env: Environment = gym.make(
+            config.environment, disable_env_checker=True, **(limit | config.environment_kwargs)
+        )
+    return env
+
+
+def _check_version(name: str) -> None:
+    """Require the version of a registered environment."""
+    module, colon, base = name.rpartition(":")
+    try:
+        namespace, family, version = parse_env_id(base)
     except gym.error.Error:
-        return name
-    latest = find_highest_version(namespace, base)
-    return get_env_id(namespace, base, latest) if version is None and latest is not None else name
+        return
+    latest = find_highest_version(namespace, family)
+    if base not in gym.registry and version is None and latest is not None:
+        versioned = module + colon + get_env_id(namespace, family, latest)
+        raise UnsupportedEnvironment(
+            f"environment {name!r} has no version, and the latest one depends on what is "
+            f"installed; did you mean {versioned!r}?"
+        )
+
+
+def _check_spaces(env: Environment, name: str) -> None:
+    for space in ("observation_space", "action_space"):
+        if not isinstance(getattr(env, space, None), gym.Space):
+            raise UnsupportedEnvironment(
+                f"environment {name!r} has no {space}; set self.{space} to a space of "
+                f"gymnasium.spaces when it is created"
+            )
 
 
 def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
@@ -107,7 +135,7 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
 
     Raises:
         UnsupportedEnvironment: it has no step limit, or unsupported spaces. The message lists all
-            problems, and the environment is closed.
+            problems.
     """
     observations = actions = None
     problems = []
@@ -132,7 +160,6 @@ def adapt(env: Environment, name: str, settings: ActionSettings) -> Adapter:
             f"supported; set a lower one, e.g. --set max_episode_steps=1000"
         )
     if observations is None or actions is None or problems:
-        close(env)
         raise UnsupportedEnvironment(f"environment {name!r}: {'; also, '.join(problems)}")
     return Adapter(env, observations, actions)
 

@@ -1,11 +1,12 @@
 """Step limits of episodes, in actions of the agent."""
 
+import sys
 from numbers import Integral
+from typing import Any
 
 import gymnasium as gym
 
 from udrl.config import Config
-from udrl.environments.adapter import Environment
 from udrl.errors import UnsupportedEnvironment
 
 #: Maximum step limit.
@@ -17,7 +18,7 @@ _REPEATS = "num_repeats"
 _LIMIT = "_max_episode_steps"
 
 
-def step_limit(env: Environment, config: Config) -> int | None:
+def step_limit(env: gym.Env[Any, Any], config: Config) -> int | None:
     """Return the step limit of an environment's episodes, in actions; None if it has none."""
     if env.spec is None or env.spec.max_episode_steps is None:
         return None
@@ -26,7 +27,7 @@ def step_limit(env: Environment, config: Config) -> int | None:
     return max(1, env.spec.max_episode_steps // _steps_per_action(env))
 
 
-def limit_steps(env: Environment, max_steps: int) -> None:
+def limit_steps(env: gym.Env[Any, Any], max_steps: int) -> None:
     """Set the step limit of the environment's next episodes, in actions.
 
     This changes Gymnasium's ``TimeLimit`` wrapper instead of counting steps outside, because the
@@ -43,7 +44,14 @@ def limit_steps(env: Environment, max_steps: int) -> None:
         )
 
 
-def _steps_per_action(env: Environment) -> int:
+def most_actions(env: gym.Env[Any, Any]) -> int:
+    """Return after how many actions Gymnasium's ``TimeLimit`` ends an episode at the latest."""
+    if not env.has_wrapper_attr(_LIMIT):
+        return sys.maxsize
+    return -(-int(env.get_wrapper_attr(_LIMIT)) // _steps_per_action(env))
+
+
+def _steps_per_action(env: gym.Env[Any, Any]) -> int:
     """Return how many steps of Gymnasium's ``TimeLimit`` an action takes."""
     steps = 1
     while isinstance(env, gym.Wrapper) and _LIMIT not in vars(env):

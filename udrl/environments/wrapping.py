@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from udrl.environments.adapter import Environment, close
+from udrl.environments.adapter import Environment
 from udrl.environments.conversions import describe
 from udrl.environments.creation_remedies import sentence
 from udrl.errors import UnsupportedEnvironment
@@ -16,7 +16,7 @@ def wrapped(env: Environment, name: str) -> Environment:
     """Return an environment in the wrapper that a setting names.
 
     Args:
-        env: the environment; it is closed if there is an error.
+        env: the environment.
         name: ``package.module:Wrapper``, or with keyword arguments,
             ``package.module:Wrapper(shape=(84, 84))``.
 
@@ -29,10 +29,7 @@ def wrapped(env: Environment, name: str) -> Environment:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
         attribute, arguments = _parsed(call)
         found: Any = getattr(import_module(module), attribute)(env, **arguments)
-        if not isinstance(found, gym.Env):
-            raise TypeError(f"it returned {describe(found)}, not an environment")  # noqa: TRY301
     except (Exception, SystemExit) as error:
-        close(env)
         remedy = (
             "name a wrapper that is importable here, as package.module:Wrapper or "
             "package.module:Wrapper(shape=(84, 84))"
@@ -43,8 +40,12 @@ def wrapped(env: Environment, name: str) -> Environment:
             f"wrapper {name!r} cannot be applied: {type(error).__name__}: {sentence(error)}; "
             f"{remedy}"
         ) from error
-    result: Environment = found
-    return result
+    if not isinstance(found, gym.Wrapper):
+        raise UnsupportedEnvironment(
+            f"wrapper {name!r} returned {describe(found)}, expected a gymnasium.Wrapper; derive "
+            f"its class from gymnasium.Wrapper, so that the step limit inside can be set"
+        )
+    return found
 
 
 def _parsed(call: str) -> tuple[str, dict[str, Any]]:
