@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from udrl.config import COMMANDS_PER_ITERATION, Config
+from udrl.config import COMMANDS_PER_ITERATION, Config, change
 from udrl.environments.specification import EnvironmentSpec
 from udrl.replay_buffer import ReplayBuffer
 from udrl.schedule import weights_version
@@ -137,6 +137,15 @@ def episodes_due(settings: CommandSettings, buffer: ReplayBuffer) -> int:
     return max(least, min(wanted, MAX_EPISODES))
 
 
+def strategy_of(config: Config, spec: EnvironmentSpec) -> CommandStrategy:
+    """Return a run's strategy; it sees the highest return that the environment declares.
+
+    Raises:
+        ConfigError: as :func:`~udrl.strategies.make_strategy`.
+    """
+    return make_strategy(change(config, max_return=spec.max_return))
+
+
 class CommandSampler:
     """Draws the commands of a run, iteration by iteration.
 
@@ -155,7 +164,8 @@ class CommandSampler:
 
     @cached_property
     def _strategy(self) -> CommandStrategy:
-        return make_strategy(self._config)  # on first use: evaluations do not need to import it
+        # On first use: evaluations do not need to import it.
+        return strategy_of(self._config, self._spec)
 
     def warm_up(self) -> list[Command]:
         """Return the commands of iteration 0: random actions (section 2.3.1)."""

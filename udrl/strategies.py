@@ -16,12 +16,15 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from udrl.config import Config
 from udrl.errors import ConfigError
 from udrl.replay_buffer import Entry
 
-#: Largest absolute value of a desired return or horizon.
+#: Largest absolute value of a desired horizon, and of a desired return that a user may enter.
 MAX_DESIRED = 10**9
+_MAX_RETURN = float(np.finfo(np.float32).max)
 
 
 class CommandStrategy(Protocol):
@@ -39,8 +42,8 @@ class CommandStrategy(Protocol):
             u: uniform in [0, 1), different for each command.
 
         Returns:
-            Desired return and desired horizon (in steps; values below 1 count as 1), both at most
-            1e9.
+            Desired return, which float32 can hold, and desired horizon in steps, at most 1e9;
+            values below 1 count as 1.
         """
         ...
 
@@ -112,14 +115,14 @@ class Maximum:
     number of steps. There, commands slightly above the best episodes make progress slow.
 
     Raises:
-        ConfigError: ``max_return`` is not set.
+        ConfigError: ``max_return`` is not set, and the environment does not declare it.
     """
 
     def __init__(self, config: Config) -> None:
         if config.max_return is None:
             raise ConfigError(
                 "command_strategy = 'maximum' commands the highest possible return, but max_return "
-                "is not set; set it, e.g. --set max_return=500"
+                "is neither set nor declared by the environment; set it, e.g. --set max_return=500"
             )
         self._max_return = config.max_return
 
@@ -176,9 +179,10 @@ def choose_command(strategy: CommandStrategy, best: Sequence[Entry], u: float) -
             f"command strategy {name} failed: {type(error).__name__}: {error}; expected a desired "
             f"return and a desired horizon"
         ) from error
-    if not abs(desired_return) <= MAX_DESIRED or abs(desired_horizon) > MAX_DESIRED:
+    if not abs(desired_return) <= _MAX_RETURN or abs(desired_horizon) > MAX_DESIRED:
         raise ConfigError(
             f"command strategy {name} commands a return of {desired_return} within "
-            f"{desired_horizon} steps; expected numbers up to {MAX_DESIRED:,}"
+            f"{desired_horizon} steps; expected a return that float32 can hold, and at most "
+            f"{MAX_DESIRED:,} steps"
         )
     return desired_return, max(1, desired_horizon)

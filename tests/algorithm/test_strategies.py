@@ -5,6 +5,7 @@ from math import floor, sqrt
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -64,8 +65,19 @@ def test_maximum_commands_the_greatest_return_with_the_mean_length(
     assert strategy("maximum")(best, u) == (500.0, strategy("uniform")(best, u)[1])
 
 
+def test_maximum_commands_what_the_environment_declares() -> None:
+    spec = msgspec.structs.replace(SPEC, max_return=8.0)
+    sampler = CommandSampler(config(command_strategy="maximum"), spec)
+    assert {c.desired_return for c in sampler.explore(1, buffer())} == {8.0}
+
+
+def test_large_returns_are_commanded() -> None:
+    best = [Entry(8e9, 1, 3)]
+    assert choose_command(strategy("uniform"), best, 0.5) == (8e9, 3)
+
+
 def test_maximum_requires_a_greatest_return() -> None:
-    with pytest.raises(ConfigError, match=r"max_return is not set; set it, e\.g\. --set"):
+    with pytest.raises(ConfigError, match=r"max_return is neither set nor declared .*; set it, e\.g\. --set"):
         make_strategy(config(command_strategy="maximum"))
 
 

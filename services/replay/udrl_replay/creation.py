@@ -14,6 +14,7 @@ import msgspec
 from udrl.acting import EpisodeGenerator
 from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
+from udrl.commands import strategy_of
 from udrl.config import UNSET, Budget, Config, flat
 from udrl.cost import slow_training_warning
 from udrl.datasets import resolve_dataset
@@ -22,7 +23,6 @@ from udrl.episode import Episode
 from udrl.errors import StoreError
 from udrl.graph import acting_graph
 from udrl.numerics import resolve_arithmetic
-from udrl.strategies import make_strategy
 from udrl.version import __version__
 from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
@@ -100,11 +100,11 @@ def no_empty_folder_left(run_dir: Path) -> Iterator[None]:
 def _create(
     run_dir: Path, config: Config, automatic: Collection[str], *, allow_inexact: bool
 ) -> Store:
-    make_strategy(config)
     if automatic:
         log.info("choosing settings from random episodes of %s", config.environment)
     config = resolve_arithmetic(resolve_automatic(config, automatic))
     with closing(EpisodeGenerator(config, 1)) as generator:
+        strategy_of(config, generator.spec)
         # First and in a fresh instance, as actors do.
         digest = repeated_digest(generator)
         config, offline = resolve_dataset(config, generator.spec)
