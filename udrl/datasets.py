@@ -64,13 +64,6 @@ def read_dataset(name: str, config: Config, spec: EnvironmentSpec) -> list[Episo
         ) from error
     if not episodes:
         raise ConfigError(f"dataset {name!r} has no episodes, expected at least 1; name another")
-    longest = max(e.length for e in episodes)
-    limit = min(spec.max_episode_steps, config.max_train_steps or spec.max_episode_steps)
-    if longest > limit:
-        raise ConfigError(
-            f"dataset {name!r} has an episode of {longest} steps, training episodes have at most "
-            f"{limit}; raise max_train_steps or max_episode_steps"
-        )
     return episodes
 
 
@@ -102,6 +95,8 @@ class _Reader:
     def __init__(self, name: str, dataset: Any, config: Config, spec: EnvironmentSpec) -> None:
         self._name = name
         self._spec = spec
+        longest = spec.max_episode_steps
+        self._max_steps = min(longest, config.max_train_steps or longest)
         self._adds_time = self._adds_previous = False
         observation_space, action_space = dataset.observation_space, dataset.action_space
         seen, taken = observation_space, action_space
@@ -147,7 +142,13 @@ class _Reader:
 
     def episode(self, number: int, data: Any) -> Episode:
         rewards = np.asarray(data.rewards, np.float32)
-        n, terminated = len(rewards), bool(data.terminations[-1])
+        n = len(rewards)
+        if not 1 <= n <= self._max_steps:
+            raise ConfigError(
+                f"dataset {self._name!r}, episode {number}: it has {n:,} steps, expected 1 to "
+                f"{self._max_steps:,}; leave it out, or raise max_train_steps or max_episode_steps"
+            )
+        terminated = bool(data.terminations[-1])
         try:
             episode = Episode(
                 command_id=number,
@@ -156,7 +157,7 @@ class _Reader:
                 actions=self._actions.convert(data.actions, (n,)),
                 rewards=rewards,
                 terminated=terminated,
-                truncated=not terminated,
+                truncated=bool(data.truncations[-1]) or not terminated,
             )
             found = fault(episode, self._spec)
         except InvalidData as error:

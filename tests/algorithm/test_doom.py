@@ -146,6 +146,7 @@ def test_size_colour_and_frame_skip(doom: Callable[..., Doom]) -> None:
 def test_other_scenarios_and_scenario_files(doom: Callable[..., Doom], tmp_path: Path) -> None:
     assert doom(scenario="basic").action_space == gym.spaces.Discrete(3)
     assert doom(scenario="basic").metadata["render_fps"] == 35
+    assert doom(scenario="basic", frame_skip=5).metadata["render_fps"] == 7
     with pytest.raises(
         ValueError, match=r"scenario 'nowhere': neither a file nor .* one of .*basic"
     ):

@@ -78,7 +78,9 @@ def test_images_within_other_spaces_are_downsampled_and_the_rest_is_not() -> Non
     ("space", "returned"),
     [
         (image(8, 10), np.zeros((9, 10), np.uint8)),
-        (image(8, 10), np.zeros((8, 10))),
+        (image(8, 10), np.full((8, 10), 0.5)),
+        (image(8, 10), np.full((8, 10), 256)),
+        (image(8, 10), [[1], [2, 3]]),
         (image(8, 10), None),
         (spaces.Dict(a=image(8, 10)), np.zeros((8, 10), np.uint8)),
         (spaces.Tuple([image(8, 10)]), ()),
@@ -89,6 +91,14 @@ def test_invalid_observations_are_returned_unchanged(
 ) -> None:
     env = Downsample(Camera(space), 4, 5)
     assert env.observation(returned) is returned
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.float32, list])
+def test_images_of_other_types_are_converted(kind: Any) -> None:
+    pixels = np.arange(80, dtype=np.uint8).reshape(8, 10)
+    env = Downsample(Camera(image(8, 10)), 4, 5)
+    given = pixels.tolist() if kind is list else pixels.astype(kind)
+    np.testing.assert_array_equal(env.observation(given), env.observation(pixels))
 
 
 def test_unknown_keys_are_kept() -> None:

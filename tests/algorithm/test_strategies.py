@@ -77,7 +77,7 @@ def test_large_returns_are_commanded() -> None:
 
 
 def test_maximum_requires_a_greatest_return() -> None:
-    with pytest.raises(ConfigError, match=r"max_return is neither set nor declared .*; set it, e\.g\. --set"):
+    with pytest.raises(ConfigError, match=r"is neither set nor declared .*; set it, e\.g\. --set"):
         make_strategy(config(command_strategy="maximum"))
 
 

@@ -61,8 +61,8 @@ def some_episodes(spec: EnvironmentSpec, lengths: tuple[int, ...] = (3, 9, 1)) -
             observations=observations(n),
             actions=rng.integers(0, spec.action_space.n_parameters, n).astype(np.uint8),
             rewards=rng.normal(size=n).astype(np.float32),
-            terminated=i % 2 == 0,
-            truncated=i % 2 == 1,
+            terminated=i % 3 != 1,
+            truncated=i % 3 != 0,
         )
         for i, n in enumerate(lengths)
     ]
@@ -140,7 +140,7 @@ def test_existing_or_unknown_name_is_rejected() -> None:
          r"has observations Box.* and actions .* environment has Vector\(size=5\)"),
         (replace(VECTOR, action_space=Categorical(n=1)),
          r"and actions Discrete\(2\), .* and Categorical\(n=1\)"),
-        (replace(VECTOR, max_episode_steps=8), "rewards are .* one dimension of 1 to 8 steps"),
+        (replace(VECTOR, max_episode_steps=8), r"has 9 steps, expected 1 to 8; .* max_train_steps"),
         (IMAGE, "name a dataset of the run's environment"),
     ],
 )  # fmt: skip

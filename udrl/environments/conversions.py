@@ -77,7 +77,6 @@ class Boxed(Conversion):
         super().__init__(name, declared, plain)
         assert declared.shape is not None
         self._shape, self._dtype = declared.shape, plain.dtype
-        self._is_whole = self._dtype.kind == "u"
         self._is_reshaped = self._shape != plain.shape
 
     def back(self, values: Array) -> Any:
@@ -90,10 +89,8 @@ class Boxed(Conversion):
         if array.shape != leading + self._shape:
             raise self._fault(value)
         if array.dtype != self._dtype:
-            if array.dtype.kind not in "biuf":
-                raise self._fault(value)
-            converted = array.astype(self._dtype)
-            if self._is_whole and not (converted == array).all():
+            converted = with_dtype(array, self._dtype)
+            if converted is None:
                 raise self._fault(value)
             array = converted
         return array.reshape(*leading, *self.plain.shape) if self._is_reshaped else array
@@ -202,6 +199,14 @@ def leaves_within(
         return
     for key, child in inner.items():
         yield from leaves_within(child, (*path, key))
+
+
+def with_dtype(array: Array, dtype: np.dtype[Any]) -> Array | None:
+    """Return numbers in another dtype; None: they are no numbers, or integers cannot hold them."""
+    if array.dtype.kind not in "biuf":
+        return None
+    converted = array.astype(dtype)
+    return None if dtype.kind == "u" and not (converted == array).all() else converted
 
 
 def as_array(name: str, value: Any) -> Array:

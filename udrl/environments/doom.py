@@ -22,6 +22,8 @@ _SCREEN = (120, 160)
 _starting = threading.Lock()
 #: Mark of this process's engines (:mod:`.engine_keeper`).
 _mark = uuid.uuid4().hex
+#: Tics in a second of the game.
+_TICS_PER_S = 35
 #: Write end of the keeper's standard input, which is only closed when this process ends.
 _keeper: int | None = None
 
@@ -36,7 +38,7 @@ class Doom(gym.Env[Pixels, np.int64]):
         scenario: a scenario of ViZDoom, e.g. ``take_cover``, or the path of a .cfg file.
         height, width: size of observations in pixels, at most 120 x 160, the engine's resolution.
         colour: observe red, green and blue instead of grey.
-        frame_skip: tics per step; a second has 35 tics.
+        frame_skip: tics per step; a second has 35.
         max_return: the highest possible return, if known (2.3.2).
         render_mode: ``rgb_array``, or None.
 
@@ -46,7 +48,7 @@ class Doom(gym.Env[Pixels, np.int64]):
         RuntimeError: the engine does not start with the scenario.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 35}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": _TICS_PER_S}
 
     def __init__(
         self,
@@ -67,6 +69,7 @@ class Doom(gym.Env[Pixels, np.int64]):
         self.render_mode = render_mode
         self.max_return = max_return
         self._frame_skip = _tics(frame_skip)
+        self.metadata = self.metadata | {"render_fps": _TICS_PER_S / self._frame_skip}
         self._shrink = AreaAverage(*_SCREEN, height, width)
         self._game, self._folder = _open(scenario, colour=colour)
         n = self._game.get_available_buttons_size()

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from udrl.environments.conversions import leaves_within
+from udrl.environments.conversions import as_array, leaves_within, with_dtype
 from udrl.environments.observation_conversions import channel_axis, is_image
-from udrl.errors import UnsupportedEnvironment
+from udrl.errors import InvalidData, UnsupportedEnvironment
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -90,16 +90,21 @@ class Downsample(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstruc
             case spaces.Tuple() if isinstance(value, tuple) and len(value) == len(space):
                 pairs = zip(space.spaces, value, strict=True)
                 return tuple(self._smaller(inner, part) for inner, part in pairs)
-            case spaces.Box() if is_image(space) and _is_element(value, space):
+            case spaces.Box() if is_image(space) and (pixels := _pixels(value, space)) is not None:
                 average = self._averages[space.shape]
                 if channel_axis(space) == 0:
-                    return np.moveaxis(average(np.moveaxis(value, 0, -1)), -1, 0)
-                return average(value)
+                    return np.moveaxis(average(np.moveaxis(pixels, 0, -1)), -1, 0)
+                return average(pixels)
         return value
 
 
-def _is_element(value: Any, space: spaces.Box) -> bool:
-    return isinstance(value, np.ndarray) and space.contains(value)
+def _pixels(value: Any, space: spaces.Box) -> Pixels | None:
+    """Return a value as an image of the space, as without this wrapper; None: it is none."""
+    try:
+        array = as_array("observation", value)
+    except InvalidData:
+        return None
+    return with_dtype(array, np.dtype(np.uint8)) if array.shape == space.shape else None
 
 
 class AreaAverage:
