@@ -242,12 +242,9 @@ class EpisodeGenerator:
 
 
 def _failure(where: str, command: Command, error: Exception) -> Failure:
-    what = str(error)
-    if not isinstance(error, EnvironmentFault):
-        what = raised(where, error)
     wrapped = EnvironmentFault(
         f"the environment failed under command {command.id} (seed {command.environment_seed}): "
-        f"{what}"
+        f"{raised(where, error)}"
     )
     wrapped.__cause__ = error
     return Failure(command, wrapped)

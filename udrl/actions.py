@@ -89,19 +89,6 @@ class Categorical(Indices, frozen=True, tag="categorical"):
         shares: Numbers = weights / weights.sum()
         return shares
 
-    def choose(self, logits: Numbers, temperature: float, uniform: float) -> int:
-        """Choose one action, as in Algorithm 2.
-
-        Args:
-            logits: logits of P(a | s, c), float64 [n].
-            temperature: divisor of the logits; 0 = the most likely action.
-            uniform: random number in [0, 1).
-        """
-        if temperature == 0:
-            return int(self.mode(logits[None])[0])
-        divisor = np.array([[temperature]])
-        return int(self.sample(logits[None], divisor, np.array([uniform]))[0])
-
 
 class Product(IndexVectors, frozen=True, tag="product"):
     """Several indices, component i one of ``ns[i]``, each with its own categorical distribution.
@@ -177,19 +164,6 @@ class Product(IndexVectors, frozen=True, tag="product"):
         ]
         return np.concatenate(shares)
 
-    def choose(self, logits: Numbers, temperature: float, uniform: Numbers) -> Actions:
-        """Choose one action, int64 [components], as in Algorithm 2.
-
-        Args:
-            logits: logits of P(a | s, c), float64 [n_parameters].
-            temperature: divisor of the logits; 0 = the most likely action.
-            uniform: random numbers in [0, 1), float64 [components].
-        """
-        row, divisor = logits[None], np.array([[temperature]])
-        chosen = self.sample(row, divisor, uniform[None]) if temperature else self.mode(row)
-        action: Actions = chosen[0]
-        return action
-
     @property
     def ends(self) -> tuple[int, ...]:
         """End of each component's logits, exclusive."""
@@ -220,6 +194,20 @@ def _places(ns: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.
 
 
 ActionSpace = Categorical | Product
+
+
+def choose(space: ActionSpace, logits: Numbers, temperature: float, uniforms: Numbers) -> Actions:
+    """Choose an action for each row, int64 [rows, *shape], as in Algorithm 2.
+
+    Args:
+        space: the action space.
+        logits: logits of P(a | s, c), float64 [rows, n_parameters].
+        temperature: divisor of the logits; 0 = the most likely action.
+        uniforms: random numbers in [0, 1), float64 [rows, *shape].
+    """
+    if temperature == 0:
+        return space.mode(logits)
+    return space.sample(logits, np.full((len(logits), 1), temperature), uniforms)
 
 
 def random_actions(space: ActionSpace, mask: npt.NDArray[Any] | None, uniforms: Numbers) -> Actions:

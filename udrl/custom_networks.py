@@ -52,7 +52,7 @@ def make_custom(network: NetworkSettings, spec: EnvironmentSpec) -> nn.Module:
         if not colon:
             raise ValueError("there is no colon")  # noqa: TRY301 - one message for all faults
         made = getattr(import_module(module), attribute)(spec, network)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(
             f"behavior {name!r} cannot be created: {type(error).__name__}: {error}; name a class "
             f"that is importable here, as package.module:Class, and takes a specification and "

@@ -102,7 +102,5 @@ def _called(where: str, method: Callable[..., Result], *args: Any, **kwargs: Any
     """Call a method of the environment; turn its exceptions into :class:`EnvironmentFault`."""
     try:
         return method(*args, **kwargs)
-    except EnvironmentFault:
-        raise
     except Exception as error:
         raise EnvironmentFault(raised(where, error)) from error

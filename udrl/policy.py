@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from udrl.actions import choose
 from udrl.config import Config
 from udrl.environments.adapter import Environment
 from udrl.environments.conversions import nested
@@ -221,14 +222,11 @@ class Policy:
         temperature = 0.0 if deterministic else temperature
         logits, after = self.advance(observation, desired_return, desired_horizon, self._state)
         self._state = after if after.shape[1] else None  # without a memory, batches may change size
-        space = self.spec.action_space
-        if logits.ndim == 1:
-            uniform: Any = self._rng.random(space.shape)
-            return space.choose(logits, temperature, uniform)
-        uniforms = self._rng.random((len(logits), *space.shape))
-        if temperature == 0:
-            return space.mode(logits)
-        return space.sample(logits, np.full((len(logits), 1), temperature), uniforms)
+        space, rows = self.spec.action_space, np.atleast_2d(logits)
+        actions = choose(space, rows, temperature, self._rng.random((len(rows), *space.shape)))
+        if logits.ndim == 2:
+            return actions
+        return actions[0] if space.shape else int(actions[0])
 
 
 def _check_temperature(temperature: float) -> None:

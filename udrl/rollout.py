@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from udrl.actions import random_actions
+from udrl.actions import choose, random_actions
 from udrl.commands import Command
 from udrl.environments.adapter import Environment, raised
 from udrl.environments.step_limits import limit_steps
@@ -111,10 +111,10 @@ class Rollout:
         if is_random:
             k = self._policy.spec.action_mask
             mask = None if k is None else parts_of(self._recent[-1][None])[k]
-            action: Any = random_actions(space, mask, number[None])[0]
+            actions = random_actions(space, mask, number[None])
         else:
-            action = space.choose(logits, self.temperature, number)
-        self.action = action = np.asarray(action).tolist()
+            actions = choose(space, logits[None], self.temperature, number[None])
+        self.action = action = actions[0].tolist()
         observation, reward, self.terminated, self.truncated, _ = self._guarded(
             "step", lambda: self._env.step(action)
         )
@@ -177,10 +177,7 @@ class Rollout:
         try:
             return call()
         except (Exception, SystemExit) as error:
-            what = str(error)
-            if not isinstance(error, EnvironmentFault):
-                what = raised(where, error)
             raise EnvironmentFault(
                 f"the environment failed, {self.steps} steps into the episode of seed "
-                f"{self.command.environment_seed}: {what}"
+                f"{self.command.environment_seed}: {raised(where, error)}"
             ) from error

@@ -156,7 +156,7 @@ def make_strategy(config: Config) -> CommandStrategy:
     try:
         kind = getattr(import_module(module), attribute)
         strategy: CommandStrategy = kind(config)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(
             f"command_strategy {name!r} cannot be created: {type(error).__name__}: {error}; name a "
             f"class that is importable here (PYTHONPATH) and takes a udrl.config.Config"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
-from udrl.actions import Categorical
+from udrl.actions import Categorical, choose
 from udrl.config import Config, build
 from udrl.environments import EnvironmentSpec, make_environment, specify
 from udrl.errors import InvalidData
@@ -135,8 +135,8 @@ def test_stacked_observations_may_have_their_own_dimension() -> None:
 def test_actions_are_sampled_by_inverse_cdf(uniform: float) -> None:
     logits, space = np.log([0.2, 0.3, 0.5]), Categorical(n=3)
     expected = next(a for a, edge in enumerate([0.2, 0.5, 1.0]) if uniform < edge)
-    assert space.choose(logits, 1.0, uniform) == expected
-    assert space.choose(logits, 0.0, uniform) == 2
+    for temperature, action in (1.0, expected), (0.0, 2):
+        assert choose(space, logits[None], temperature, np.array([uniform])).tolist() == [action]
     assert space.probabilities(logits, 1.0) == pytest.approx([0.2, 0.3, 0.5])
 
 

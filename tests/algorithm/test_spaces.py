@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.actions import ActionSpace, Categorical, Product
+from udrl.actions import ActionSpace, Categorical, Product, choose
 from udrl.environments.action_conversions import action_conversion
 from udrl.environments.observation_conversions import observation_conversion
 from udrl.setting_groups import ActionSettings
@@ -172,7 +172,8 @@ def test_actions_are_sampled_by_inverse_cdf(rows: list[list[float]], data: st.Da
     for k in range(n):
         cumulative = np.cumsum(np.exp((logits[k] - logits[k].max()) / temperature[k]))
         expected = next(a for a in range(3) if u[k] * cumulative[-1] < cumulative[a])
-        assert chosen[k] == expected == space.choose(logits[k], temperature[k], u[k])
+        alone = choose(space, logits[k : k + 1], temperature[k], np.array(u[k : k + 1]))
+        assert chosen[k] == expected == alone[0]
     assert space.mode(logits).tolist() == [row.index(max(row)) for row in rows]
 
 

@@ -124,12 +124,15 @@ def close(env: Environment) -> None:
 def raised(where: str, error: BaseException) -> str:
     """Describe an exception of an environment's method, with the line of the environment's code.
 
-    That is the innermost line outside of installed packages, or the innermost one of all.
+    That is the innermost line outside of installed packages, or the innermost one of all. An
+    :class:`EnvironmentFault` describes itself.
 
     Args:
         where: name of the method.
         error: the exception.
     """
+    if isinstance(error, EnvironmentFault):
+        return str(error)
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if not any(map(Path(f.filename).is_relative_to, _INSTALLED))]
     found = (own or frames)[-1:]
