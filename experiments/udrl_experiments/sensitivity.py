@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from udrl.errors import StoreError
 from udrl.obedience_statistics import correlation
@@ -19,16 +20,23 @@ from udrl_inspect.inspection import read_status
 EPISODES = 100
 
 
-def sensitivity_study(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EPISODES) -> Study:
+def sensitivity_study(
+    plan: StudyPlan,
+    tasks: Sequence[Task],
+    participant: Literal["UDRL", "UDRL-paper"] = "UDRL",
+    episodes: int = EPISODES,
+) -> Study:
     """Return the study ``sensitivity``, which uses the agents of Figures 4 and 5.
 
     Args:
         plan: seeds and steps.
         tasks: tasks of the agents.
+        participant: which agents.
         episodes: episodes per desired return.
     """
     jobs = {
-        task: [job(task, plan, "UDRL", seed) for seed in plan.seeds_of_runs()] for task in tasks
+        task: [job(task, plan, participant, seed) for seed in plan.seeds_of_runs()]
+        for task in tasks
     }
 
     def report(folders: StudyFolders) -> str:
@@ -39,11 +47,12 @@ def sensitivity_study(plan: StudyPlan, tasks: Sequence[Task], episodes: int = EP
                 row for run in runs for row in _evaluate_agent(run, folders.root, task, episodes)
             ]
             write(table, Obtained, rows)
-            draw_sensitivity(table, task.title)
+            draw_sensitivity(table, f"{task.title}, {participant}")
             lines += _summary(task, rows)
         return "\n".join(lines)
 
-    return Study("sensitivity", [run for runs in jobs.values() for run in runs], report)
+    name = "sensitivity" + participant.removeprefix("UDRL")
+    return Study(name, [run for runs in jobs.values() for run in runs], report)
 
 
 def _summary(task: Task, rows: Sequence[Obtained]) -> list[str]:

@@ -5,7 +5,7 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import click
 from click.shell_completion import CompletionItem
@@ -203,14 +203,29 @@ def sparse(participants: Participants, **options: Any) -> int:
 @study.command()
 @_options
 @_tasks(*TASKS)
+@click.option(
+    "--algorithm",
+    "participant",
+    type=click.Choice(["UDRL", "UDRL-paper"]),
+    default="UDRL",
+    show_default=True,
+    help="Agents of the preset ENV, or with UDRL-paper of ENV-paper.",
+)
 @click.option("--episodes", type=click.IntRange(1, 100_000), default=EPISODES, show_default=True,
               metavar="N", help="Episodes per desired return.")  # fmt: skip
-def sensitivity(names: tuple[str, ...], episodes: int, **options: Any) -> int:
+def sensitivity(
+    names: tuple[str, ...],
+    participant: Literal["UDRL", "UDRL-paper"],
+    episodes: int,
+    **options: Any,
+) -> int:
     """Figure 6: desired and obtained returns of trained agents.
 
     Example: udrl study sensitivity --task lander --task sparse
     """
-    return _run(lambda plan: sensitivity_study(plan, tasks(names), episodes), **options)
+    return _run(
+        lambda plan: sensitivity_study(plan, tasks(names), participant, episodes), **options
+    )
 
 
 @study.command()
