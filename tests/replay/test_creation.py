@@ -3,17 +3,19 @@
 import re
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udrl.acting import EpisodeGenerator
+from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.actions import Categorical
-from udrl.config import Budget, Config, build, flat, read_toml
+from udrl.commands import CommandSampler
+from udrl.config import Budget, Config, build, change, flat, read_toml
 from udrl.determinism import environment_digest
 from udrl.environments import EnvironmentSpec
+from udrl.episode import Episode
 from udrl.errors import OtherConfiguration, StoreError, UnsupportedEnvironment
 from udrl.graph import acting_graph
 from udrl.spaces import Category
@@ -21,9 +23,11 @@ from udrl.version import __version__
 from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.messages import Hello
 from udrl_replay import creation
+from udrl_replay.arrival import Arrival
 from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.resuming import resume
+from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
 TOY = Config(environment="Figure2-v0", max_return=2.0)
@@ -111,6 +115,47 @@ def test_other_configuration_is_rejected_with_both_values(created: Store, tmp_pa
         resume(tmp_path, other)
     # The failed attempt has released the lock.
     resume(tmp_path, TOY).close()
+
+
+@pytest.fixture
+def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupts the creation of a run from a dataset of three episodes, after the first."""
+
+    def dataset(config: Config, spec: EnvironmentSpec) -> tuple[Config, list[Episode]]:
+        config = change(config, n_warm_up_episodes=3, dataset="toy/ours-v0")
+        with closing(EpisodeGenerator(config, 1)) as generator:
+            commands = CommandSampler(config, spec).warm_up()
+            return config, generate_episodes(generator, commands, None)
+
+    def accept(run: StoredRun, arrival: Arrival, now: float) -> Literal["accepted", "duplicate"]:
+        if arrival.entry.id == 1:
+            raise KeyboardInterrupt
+        return real(run, arrival, now)
+
+    real = StoredRun.accept
+    monkeypatch.setattr(creation, "resolve_dataset", dataset)
+    monkeypatch.setattr(StoredRun, "accept", accept)
+
+
+@pytest.mark.usefixtures("_interrupted")
+def test_run_that_cannot_store_its_dataset_is_not_created(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        creation.create_run(tmp_path / "run", TOY)
+    assert not creation.exists(tmp_path / "run")
+    with closing(Store.create(tmp_path / "run", progress=RunProgress())) as store:
+        assert store.commands(cancelled=False) == []
+
+
+@pytest.mark.usefixtures("_interrupted")
+def test_run_without_its_dataset_is_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Store, "delete", Store.close)  # a killed process deletes nothing
+    with pytest.raises(KeyboardInterrupt):
+        creation.create_run(tmp_path, TOY)
+    expected = r"does not have all episodes of its dataset.*remove it and start the run again"
+    with pytest.raises(StoreError, match=expected):
+        resume(tmp_path, TOY)
 
 
 def test_resuming_without_a_run_is_rejected(tmp_path: Path) -> None:

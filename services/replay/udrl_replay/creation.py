@@ -31,7 +31,6 @@ from udrl_replay.arrival import inspect_episode
 from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.remedies import remedy
-from udrl_replay.resuming import closed_on_error
 from udrl_replay.run import StoredRun
 from udrl_replay.store import Store
 
@@ -130,8 +129,11 @@ def _create(
     )
     store = Store.create(run_dir, hello=hello, progress=progress)
     if offline is not None:
-        with closed_on_error(store):
+        try:
             _begin_with(store, offline)
+        except BaseException:
+            store.delete()
+            raise
     return store
 
 

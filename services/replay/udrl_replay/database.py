@@ -171,6 +171,14 @@ class Database:
         if self._lock is not None:
             self._lock.close()
 
+    def delete(self) -> None:
+        """Delete the file, and close it: for a run that cannot be created completely."""
+        self._db.close()
+        # The file itself last: a log of changes without it would be applied to the next one.
+        for end in ("-wal", "-shm", ""):
+            self._path.with_name(f"{STORE_FILE}{end}").unlink(missing_ok=True)
+        self.close()
+
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Make all changes in the block durable, or none of them.

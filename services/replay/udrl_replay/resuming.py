@@ -13,7 +13,7 @@ from udrl.commands import Command, CommandSampler
 from udrl.config import COMMANDS_PER_ITERATION, Config, flat
 from udrl.determinism import difference, environment_digest
 from udrl.episode import Episode
-from udrl.errors import EnvironmentFault, OtherConfiguration
+from udrl.errors import EnvironmentFault, OtherConfiguration, StoreError
 from udrl.numerics import resolve_as
 from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
@@ -39,13 +39,18 @@ def resume(
         check_environment: repeat some stored episodes to check the environment.
 
     Raises:
-        StoreError: there is no run, it is in use, its configuration differs, or its environment
-            behaves differently than before.
+        StoreError: there is no run, it is in use, its creation was interrupted, its configuration
+            differs, or its environment behaves differently than before.
         EnvironmentFault: the environment fails in its first steps.
     """
     store = Store(run_dir)
     with closed_on_error(store):
-        hello = store.fact("hello", Hello)
+        hello, progress = store.fact("hello", Hello), store.fact("progress", RunProgress)
+        if hello.config.commands.dataset is not None and progress.iteration < 0:
+            raise StoreError(
+                f"{run_dir} does not have all episodes of its dataset, because creating the run "
+                f"was interrupted; remove it and start the run again"
+            )
         held, given = flat(hello.config), flat(resolve_as(hello.config, config))
         different = [f"{k} = {held[k]!r}, not {given[k]!r}" for k in held if held[k] != given[k]]
         if different:
@@ -57,7 +62,6 @@ def resume(
             hello = msgspec.structs.replace(hello, allow_inexact=True)
             with store.transaction():
                 store.set_fact("hello", hello)
-        progress = store.fact("progress", RunProgress)
         # The episodes of a run with a false episode are not the environment's.
         if check_environment and progress.exact and not progress.deceived:
             _check_environment(store, hello, allow_inexact=allow_inexact)
