@@ -640,6 +640,22 @@ def test_failed_final_evaluation_is_retried(make_run: MakeRun, reopened: MakeRun
     assert result(run) == reference(0, 20)
 
 
+def test_final_evaluation_that_another_actor_completes_after_a_failure_ends_the_run(
+    make_run: MakeRun, reopened: MakeRun
+) -> None:
+    run = make_run(max_env_steps=20)
+    work_until_final_evaluation(run)
+    commands = outstanding(run)
+    for actors in ("ab", "a"):
+        fail(run, commands[0].id, *actors)
+    for command in commands:
+        deliver(run, command)
+    assert run.progress.state == "failed"
+    run = reopened(run)
+    assert run.progress.state == "ended"
+    assert result(run) == reference(0, 20)
+
+
 def vanish(run: StoredRun, *actors: str) -> set[int]:
     """Let actors get commands and vanish, one after the other; return the last one's commands."""
     for name in actors:

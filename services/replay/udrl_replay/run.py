@@ -64,6 +64,8 @@ class StoredRun(RunState):
                 self._reopen()
             self.progress.ended_because = "" if self.progress.state == "running" else why
             self._advance()
+            if self._final_commands():
+                self._end_if_evaluated()  # the command that failed may be done since
             if budget.keep_versions is not None:  # it may be fewer than before
                 self._keep_needed_weights()
             self.save()
