@@ -139,6 +139,19 @@ def test_published_weights_are_not_requested(
     assert replay.requests(verbs.WEIGHTS) == []
 
 
+def test_invalid_published_weights_are_ignored(
+    replay: Scripted, start: Callable[..., CommandFetcher]
+) -> None:
+    fetcher = start()
+    fetcher.take(1, 0, wait_s=0.0)
+    wait_for(lambda: replay.requests(verbs.COMMANDS), "a request", DEADLINE_S)
+    replay.publish(key_expressions.NEW_WEIGHTS, WeightsMessage(version=3, weights=b"damaged"))
+    replay.answers(verbs.COMMANDS, Assigns(CommandsReply(commands=(command(1, version=3),))))
+    (assignment,) = take(fetcher, 1)
+    assert assignment.behavior is not None
+    assert encode_weights(assignment.behavior.weights) == WEIGHTS
+
+
 def test_actor_joins_a_restarted_service_again(
     replay: Scripted, start: Callable[..., CommandFetcher]
 ) -> None:

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 
-from udrl.errors import InvalidMessage
+from udrl.errors import InvalidData
 from udrl.inference import ActingFunction
 from udrl.weights import decode_behavior
 from udrl_proto import verbs
@@ -57,7 +57,7 @@ class Behaviors:
             return
         try:
             self._decode(decode(payload, WeightsMessage, LARGEST))
-        except InvalidMessage as error:
+        except InvalidData as error:
             log.warning("an announcement of weights was ignored: %s", error)
 
     def of(self, version: int) -> ActingFunction | None:
