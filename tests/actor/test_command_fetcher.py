@@ -30,6 +30,7 @@ from udrl_proto.messages import (
     WeightsMessage,
 )
 from udrl_proto.replay_client import ReplayClient
+from udrl_proto.transport import Declaration
 from whole_run import wait_for
 
 CONFIG = build(Config, {"environment": "Synthetic-v0", "hidden": [4, 4]})
@@ -195,6 +196,18 @@ def test_refusal_is_raised_in_the_acting_loop(
     wait_for(lambda: fetcher.error, "the error", DEADLINE_S)
     assert isinstance(fetcher.error, Refused)
     assert fetcher.error.code == "quarantined"
+
+
+def test_failed_subscription_is_raised_in_the_acting_loop(
+    replay: Scripted, start: Callable[..., CommandFetcher], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def subscribe(key: str, receive: Callable[[bytes], None]) -> Declaration:
+        raise RuntimeError("the session is closed")
+
+    monkeypatch.setattr(replay.transport, "subscribe", subscribe)
+    fetcher = start()
+    fetcher.join(DEADLINE_S)
+    assert str(fetcher.error) == "the session is closed"
 
 
 def test_error_of_the_outbox_ends_the_fetcher(start: Callable[..., CommandFetcher]) -> None:

@@ -118,13 +118,15 @@ class CommandFetcher(threading.Thread):
     def run(self) -> None:
         """Fetch until the run ends, ``stop`` is set, or the replay service refuses."""
         key = key_expressions.key(self._hello.run_id, key_expressions.NEW_WEIGHTS)
-        subscriber = self._transport.subscribe(key, self._behaviors.note)
         try:
-            self._work()
+            subscriber = self._transport.subscribe(key, self._behaviors.note)
+            try:
+                self._work()
+            finally:
+                subscriber.undeclare()
         except Exception as error:  # noqa: BLE001 - raised by the loop that steps environments
             self.fail(error)
         finally:
-            subscriber.undeclare()
             with self._changed:
                 self._changed.notify_all()
 
