@@ -91,6 +91,7 @@ class ActorService:
                 environment=generator.spec,
                 environment_digest=environment_digest(generator),
             )
+            self._disarm()  # requests have a deadline of their own
             client.request(verbs.JOIN, join)
             log.info(
                 "%s joined run %s (%s) with %d environments",
@@ -144,6 +145,7 @@ class ActorService:
             if self._hang_s is not None and now - armed > self._hang_s * _REARM_PART:
                 self._arm()
                 armed = now
+        self._disarm()
         fetcher.join(timeout=5.0)
 
     def _make(self, config: Config) -> Environment:
