@@ -138,6 +138,11 @@ def test_running_command_that_is_not_outstanding_is_ignored(dispatcher: Dispatch
     assert ask(dispatcher, "a", running=[*ids(99), 3]) == ids(0, 1, 2)
 
 
+def test_listed_commands_are_not_kept_with_the_request(dispatcher: Dispatcher) -> None:
+    ask(dispatcher, "a", wanted=1, running=list(range(65_536)))
+    assert dispatcher.actors["a"].request == CommandsRequest(actor="a", wanted=1)
+
+
 def test_reruns_and_failures_are_counted_by_actor(dispatcher: Dispatcher) -> None:
     ask(dispatcher, "a")
     dispatcher.note_failure(command(0).id, "a")
