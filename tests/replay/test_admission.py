@@ -7,9 +7,10 @@ from msgspec.structs import replace
 
 from tests.replay.synthetic import SPEC, join
 from udrl.errors import Refused
-from udrl_proto.messages import Hello, JoinRequest, Role
+from udrl_proto.messages import CommandsRequest, Hello, JoinRequest, Role
 from udrl_replay import admission
 from udrl_replay.admission import Admission
+from udrl_replay.dispatching import SUSPICIOUS
 from udrl_replay.run import StoredRun
 
 MakeRun = Callable[..., StoredRun]
@@ -81,6 +82,28 @@ def test_commands_of_a_refused_actor_go_to_others(make_run: MakeRun) -> None:
     assert refusal(lambda: one.check("actor", "b")) == "other_numerics"
     again = run.dispatcher.assign(replace(run.dispatcher.actors["a"].request, wanted=9), 0, 0.0)
     assert held[0] in again
+
+
+def test_refused_and_quarantined_actors_have_not_vanished_with_their_commands(
+    make_run: MakeRun,
+) -> None:
+    run = make_run()
+    one = Admission(run)
+    one.join(request("actor", "a"), 0.0)
+    with run.store.transaction():
+        one.note_accepted("actor", "a")
+        for number in range(2 * SUSPICIOUS):
+            name = f"b{number}"
+            run.dispatcher.join(request("actor", name, "other"), 0.0)
+            held = run.assign(CommandsRequest(actor=name, wanted=1), 0.0)
+            assert held, "the commands of the one before must be assigned again"
+            if number % 2:
+                run.enforcement.quarantine(name, "a false episode")
+            else:
+                with pytest.raises(Refused, match="numerics class"):
+                    one.check("actor", name)
+    assert list(run.dispatcher.actors) == ["a"]
+    assert all(not item.vanished for item in run.dispatcher.outstanding.values())
 
 
 def test_run_becomes_inexact_with_the_first_delivery_of_another_class_if_allowed(

@@ -75,7 +75,7 @@ class Admission:
         try:
             self._compare(role, numerics_class)
         except Refused:
-            self.remove_service(role, name)
+            self.remove_service(role, name, vanished=False)
             raise
 
     def note_accepted(self, role: Role, name: str) -> None:
@@ -88,10 +88,10 @@ class Admission:
         elif known != numerics_class:
             run.mark_inexact(f"{role} {name} is of another numerics class")
 
-    def remove_service(self, role: str, name: str) -> None:
-        """Remove a service; an actor's commands are assigned again."""
+    def remove_service(self, role: str, name: str, *, vanished: bool = True) -> None:
+        """Remove a service that has vanished or was refused; its commands are assigned again."""
         if role == "actor":
-            self._run.remove_actor(name)
+            self._run.remove_actor(name, vanished=vanished)
         elif role == "learner":
             self._learners.pop(name, None)
 

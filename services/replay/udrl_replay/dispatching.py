@@ -130,14 +130,20 @@ class Dispatcher:
         nothing = CommandsRequest(actor=request.id, wanted=0)
         self.actors[request.id] = Actor(request, now, nothing)
 
-    def remove_actor(self, name: str) -> list[Outstanding]:
-        """Remove an actor and return the commands that it held, which are assigned again."""
+    def remove_actor(self, name: str, *, vanished: bool = True) -> list[Outstanding]:
+        """Remove an actor, whose commands are assigned again; return those that it vanished with.
+
+        Args:
+            name: the actor.
+            vanished: whether a command may be the cause. False: the actor was refused.
+        """
         actor = self.actors.pop(name, None)
         held = [] if actor is None else [self.outstanding[i] for i in sorted(actor.holds)]
         for item in held:
-            item.vanished[name] = len(held) == 1 and item.is_suspect
+            if vanished:
+                item.vanished[name] = len(held) == 1 and item.is_suspect
             self._put_back(item.command.id, name)
-        return held
+        return held if vanished else []
 
     def silent_actors(self, here: Container[str], now: float) -> list[str]:
         """Return the actors that have been silent for too long, except those that are ``here``."""

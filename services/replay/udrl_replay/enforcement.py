@@ -21,7 +21,7 @@ class Enforcement:
 
     Args:
         run: the run with its auditor and quarantine.
-        remove_actor: removes an actor, whose commands are assigned again.
+        remove_actor: removes an actor that has not vanished; its commands are assigned again.
     """
 
     def __init__(self, run: RunState, remove_actor: Callable[[str], None]) -> None:

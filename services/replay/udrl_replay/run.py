@@ -7,6 +7,7 @@ the rest is derived from it, or sent again by the services.
 
 import logging
 import math
+from functools import partial
 from heapq import nlargest
 from shlex import quote
 from typing import Literal
@@ -46,7 +47,7 @@ class StoredRun(RunState):
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
         super().__init__(store, budget, audit)
         self.sampler = CommandSampler(self.config, self.hello.environment)
-        self.enforcement = Enforcement(self, self.remove_actor)
+        self.enforcement = Enforcement(self, partial(self.remove_actor, vanished=False))
         self._evaluated = {
             weights_version(e.iteration, self.config.lead)
             for e in store.evaluations(-1, self.progress.iteration)
@@ -171,10 +172,10 @@ class StoredRun(RunState):
         if self.dispatcher.is_hopeless(failure.command_id):
             self._give_up(self.dispatcher.outstanding[failure.command_id], error)
 
-    def remove_actor(self, actor: str) -> None:
-        """Remove an actor that is gone; a command that it held may be the cause."""
+    def remove_actor(self, actor: str, *, vanished: bool = True) -> None:
+        """Remove an actor that has vanished or was refused; its commands are assigned again."""
         self.auditor.remove_actor(actor)
-        for item in self.dispatcher.remove_actor(actor):
+        for item in self.dispatcher.remove_actor(actor, vanished=vanished):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:
                 log.warning(
