@@ -60,6 +60,30 @@ def test_first_delivery_sets_the_numerics_class(role: Role, field: str, make_run
     assert run.progress.exact
 
 
+@pytest.mark.parametrize("role", ["actor", "learner"])
+def test_removed_and_refused_services_do_not_wait(role: Role, make_run: MakeRun) -> None:
+    run = make_run()
+    one = Admission(run)
+    for name in ("a", "b", "c"):
+        one.join(request(role, name, f"of {name}"), 0.0)
+        run.waits.begin(f"{role} {name}", "learner", "weights version 1", 0.0)
+    with run.store.transaction():
+        one.note_accepted(role, "a")
+    one.remove_service(role, "c")
+    with pytest.raises(Refused, match="numerics class"):
+        one.check(role, "b")
+    assert [wait.who for wait in run.waits.list(1.0)] == [f"{role} a"]
+
+
+def test_quarantined_actor_does_not_wait(make_run: MakeRun) -> None:
+    run = make_run()
+    run.dispatcher.join(join("a"), 0.0)
+    run.waits.begin("actor a", "learner", "weights version 1", 0.0)
+    with run.store.transaction():
+        run.enforcement.quarantine("a", "a false episode")
+    assert run.waits.list(1.0) == ()
+
+
 def test_actors_and_learners_have_separate_numerics_classes(make_run: MakeRun) -> None:
     run = make_run()
     one = Admission(run)

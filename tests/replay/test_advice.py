@@ -12,7 +12,7 @@ from udrl.setting_groups import NetworkSettings
 from udrl_launch.training_run import Adviser
 from udrl_proto.reports import IterationStatus
 from udrl_replay.advice import advice, cause
-from udrl_replay.reporting import Throughput, Waits, status
+from udrl_replay.reporting import Throughput, status
 from udrl_replay.run import StoredRun
 
 WARM_UP = IterationStatus(
@@ -37,7 +37,7 @@ def test_advice_is_given_after_a_third_of_the_budget_without_learning(run: Store
         "the run does not learn: its best evaluation is -1.0, the warm-up's mean"
     )
     assert text.endswith("See 'Signs of trouble' on the documentation's page on metrics")
-    assert status(run, Throughput(), Waits(), 0.0, 0.0).advice == text
+    assert status(run, Throughput(), 0.0, 0.0).advice == text
     run.budget = Budget(max_env_steps=3 * run.progress.env_steps + 1)
     assert advice(run) == ""
 
@@ -106,7 +106,7 @@ def test_advice_for_a_run_with_a_dataset_does_not_name_the_warm_up(
 def test_advice_is_logged_once(run: StoredRun, caplog: pytest.LogCaptureFixture) -> None:
     adviser = Adviser()
     for _ in range(3):
-        adviser.show(status(run, Throughput(), Waits(), 0.0, 0.0))
+        adviser.show(status(run, Throughput(), 0.0, 0.0))
     assert [(r.levelname, r.message) for r in caplog.records if "learn" in r.message] == [
         ("WARNING", advice(run))
     ]

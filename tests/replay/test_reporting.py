@@ -16,13 +16,12 @@ from udrl.schedule import weights_version
 from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import CommandsRequest
-from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status, Waiting
+from udrl_proto.reports import Contents, EvaluationStatus, History, IterationStatus, Status
 from udrl_replay import reporting
 from udrl_replay.dispatching import MOST_ACTORS
 from udrl_replay.reporting import (
     MetricsFile,
     Throughput,
-    Waits,
     contents,
     history,
     status,
@@ -34,7 +33,7 @@ MakeRun = Callable[..., StoredRun]
 
 
 def shown(run: StoredRun, now: float = 0.0) -> Status:
-    return status(run, Throughput(), Waits(), 0.0, now)
+    return status(run, Throughput(), 0.0, now)
 
 
 # Status.
@@ -108,7 +107,7 @@ def test_status_counts_duplicates_and_rejected_episodes(make_run: MakeRun) -> No
 def test_largest_status_is_within_its_limit(
     make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, waits = make_run(), Waits()
+    run = make_run()
     wide = "\U00020000"  # four bytes in UTF-8
     for number in range(MOST_ACTORS):
         name = f"{number:-<100}"
@@ -119,11 +118,13 @@ def test_largest_status_is_within_its_limit(
             actor=name, wanted=0, env_steps_per_s=1e300, weights_version=large
         )
         actor.reruns = actor.failures = large
-        waits.begin(f"learner {name}", "actors", f"iteration {large}: no actor is connected", 0.0)
+        run.waits.begin(
+            f"learner {name}", "actors", f"iteration {large}: no actor is connected", 0.0
+        )
     run.quarantined.reasons = {f"{number:-<100}": wide * 1000 for number in range(1000)}
     run.progress.problem = run.progress.inexact_reason = wide * 5000
     monkeypatch.setattr(run.store, "versions_kept", lambda: range(2**40, 2**40 + 100_000))
-    seen = status(run, Throughput(), waits, 0.0, 1e-3)
+    seen = status(run, Throughput(), 0.0, 1e-3)
     data = encode(seen)
     assert len(data) < verbs.STATUS.reply_limit
     assert decode(data, Status, verbs.STATUS.reply_limit) == seen
@@ -171,35 +172,6 @@ def test_unobserved_throughput_forgets_old_episodes() -> None:
         throughput.add(float(second), 100)
     assert len(throughput._arrivals) == 11
     assert throughput.per_second(999.0) == pytest.approx(110.0)
-
-
-# Waits.
-
-
-def test_wait_for_the_same_reason_continues() -> None:
-    waits = Waits()
-    waits.begin("actor a", "learner", "weights version 3", 10.0)
-    waits.begin("actor a", "learner", "weights version 3", 12.0)
-    assert waits.list(15.0) == (
-        Waiting(who="actor a", on="learner", why="weights version 3", seconds=5.0),
-    )
-
-
-def test_wait_for_another_reason_starts_again() -> None:
-    waits = Waits()
-    waits.begin("actor a", "learner", "weights version 3", 10.0)
-    waits.begin("actor a", "learner", "weights version 4", 12.0)
-    assert [w.seconds for w in waits.list(15.0)] == [3.0]
-
-
-def test_ended_wait_is_not_listed() -> None:
-    waits = Waits()
-    for who in ("b", "a"):
-        waits.begin(who, "learner", "", 0.0)
-    assert [w.who for w in waits.list(0.0)] == ["a", "b"]
-    waits.end("a")
-    waits.end("stranger")
-    assert [w.who for w in waits.list(0.0)] == ["b"]
 
 
 # metrics.csv.
@@ -261,13 +233,6 @@ def test_metrics_of_a_resumed_run_equal_those_of_an_uninterrupted_one(
     after = lines(tmp_path)
     assert after[: len(before)] == before
     assert len(after) == run.progress.iteration + 1
-
-
-def test_waits_are_bounded() -> None:
-    waits = Waits()
-    for i in range(20_000):
-        waits.begin(f"learner {i}", "actors", "iteration 1", 0.0)
-    assert len(waits.list(1.0)) == 10_000
 
 
 # History and contents, for plots.

@@ -43,7 +43,7 @@ from udrl_proto.messages import CommandsRequest, FailureMessage
 from udrl_proto.reports import Status
 from udrl_replay.arrival import Arrival
 from udrl_replay.progress import KILLED, STOPPED, RunProgress
-from udrl_replay.reporting import Throughput, Waits, status
+from udrl_replay.reporting import Throughput, status
 from udrl_replay.run import StoredRun
 from udrl_replay.run_state import RunState
 from udrl_replay.store import Store, Version
@@ -255,7 +255,7 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def ledgers_balance(self) -> None:
-        shown = status(self.run, Throughput(), Waits(), 0.0, self.now)
+        shown = status(self.run, Throughput(), 0.0, self.now)
         assert_conserved(shown)
         assert shown.episodes.accepted >= len(self.accepted)
         assert shown.commands.outstanding == len(self.run.store.commands(cancelled=False)) - len(
@@ -604,7 +604,7 @@ def test_long_error_leaves_room_for_the_remedy(make_run: MakeRun) -> None:
         request = CommandsRequest(actor=name, wanted=0, running=(2,))
         run.dispatcher.assign(request, 0, 0.0)
         run.fail(FailureMessage(actor=name, command_id=2, error=4000 * "\n"))
-    seen = status(run, Throughput(), Waits(), 0.0, 0.0)
+    seen = status(run, Throughput(), 0.0, 0.0)
     assert seen.problem.endswith(f"; reproduce it with: udrl reproduce {run.store.run_dir} 2")
     assert decode(encode(seen), Status) == seen
 

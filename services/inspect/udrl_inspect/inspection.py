@@ -16,7 +16,7 @@ from udrl_proto.messages import Hello
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
 from udrl_replay.progress import RunProgress
-from udrl_replay.reporting import Throughput, Waits, status
+from udrl_replay.reporting import Throughput, status
 from udrl_replay.run_state import RunState
 from udrl_replay.store import Store
 
@@ -81,7 +81,7 @@ def read_status(run_dir: Path) -> Status:
     """
     with closing(Store(run_dir, read_only=True)) as store:
         run = read_run(run_dir, store)
-        found = status(run, Throughput(), Waits(), 0.0, 0.0)
+        found = status(run, Throughput(), 0.0, 0.0)
     if found.state in ("running", "finishing") and served_at(run_dir) is None:
         return msgspec.structs.replace(
             found, state="stopped", time_left_s=None, ended_because=run.progress.why_stopped()

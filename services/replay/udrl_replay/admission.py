@@ -49,7 +49,7 @@ class Admission:
             self._learners.pop(request.id, None)
             self._learners[request.id] = request.numerics_class
             if len(self._learners) > _MOST_LEARNERS:
-                del self._learners[next(iter(self._learners))]
+                self.remove_service("learner", next(iter(self._learners)))
             return
         if request.id in run.quarantined:
             raise run.quarantined.refusal(request.id)
@@ -94,6 +94,7 @@ class Admission:
             self._run.remove_actor(name, vanished=vanished)
         elif role == "learner":
             self._learners.pop(name, None)
+            self._run.waits.end(f"learner {name}")
 
     def _class_of(self, role: Role, name: str) -> str | None:
         if role == "learner":

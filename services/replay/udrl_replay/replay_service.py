@@ -59,7 +59,6 @@ from udrl_replay.arrival import Arrival, Malformed, inspect_episode
 from udrl_replay.reporting import (
     MetricsFile,
     Throughput,
-    Waits,
     contents,
     history,
     status,
@@ -116,7 +115,6 @@ class ReplayService:
         self._metrics.update(self.run.progress.iteration)
         self._inbox: Inbox[ReceivedRequest | Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
-        self._waits = Waits()
         self._here: set[tuple[str, str]] = set()  # role and name of the connected services
         # To measure the lag from the delivery of a version to the first command with it.
         self._version_at = 0.0
@@ -230,7 +228,6 @@ class ReplayService:
             snapshot = msgspec.json.encode(run.progress)
             for name in silent:
                 run.remove_actor(name)
-                self._waits.end(f"actor {name}")
             for item in group:
                 if isinstance(item, Presence):
                     self._note_presence(item, now)
@@ -274,13 +271,12 @@ class ReplayService:
             log.info("%s connected", printable(f"{role} {name}"))
         else:
             self._here.discard(peer)
-            self._waits.end(f"{role} {name}")
             self._admission.remove_service(role, name)
             log.info("%s disconnected", printable(f"{role} {name}"))
 
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
         """Note that a service waits, and return the part of its reply that says so."""
-        self._waits.begin(who, on, why, now)
+        self.run.waits.begin(who, on, why, now)
         return Wait(on=f"{on}: {why}", retry_after_s=self.run.dispatcher.retry_after_s())
 
     # One method per verb. Each returns the reply, or raises Refused.
@@ -303,13 +299,13 @@ class ReplayService:
         self._admission.check("actor", request.actor)
         commands = run.assign(request, now)
         if commands:
-            self._waits.end(who)
+            run.waits.end(who)
             newest = max(c.weights_version for c in commands)
             if newest > self._acting_with:
                 self._acting_with, self._lag_s = newest, now - self._version_at
             return CommandsReply(commands=tuple(commands))
         if request.running:
-            self._waits.end(who)
+            run.waits.end(who)
             return CommandsReply(
                 wait=Wait(on="nothing: it has work", retry_after_s=run.dispatcher.retry_after_s())
             )
@@ -359,7 +355,7 @@ class ReplayService:
             if run.progress.state == "finishing":
                 why = "the final evaluation"
             return ChangesReply(wait=self._wait(who, "actors", why, now))
-        self._waits.end(who)
+        run.waits.end(who)
         iteration = request.version - 1
         if iteration == run.progress.iteration:
             return ChangesReply(ids=tuple(e.id for e in run.buffer))
@@ -405,7 +401,7 @@ class ReplayService:
         return WeightsMessage(version=version.version, weights=version.weights)
 
     def _status(self, request: StatusRequest, now: float) -> Message:
-        return status(self.run, self._throughput, self._waits, self._lag_s, now)
+        return status(self.run, self._throughput, self._lag_s, now)
 
     def _history(self, request: HistoryRequest, now: float) -> Message:
         return history(self._store, request.after)

@@ -26,7 +26,6 @@ from udrl_proto.reports import (
     History,
     Quarantined,
     Status,
-    Waiting,
 )
 from udrl_replay.advice import advice
 from udrl_replay.remedies import unwritable
@@ -37,8 +36,6 @@ log = logging.getLogger("udrl")
 
 #: Period over which the throughput is averaged, in seconds.
 _WINDOW_S = 10.0
-#: Maximum number of waits to remember; services that wait need not have joined.
-_MOST_WAITS = 10_000
 #: Maximum number of characters of an actor's host name in the status. Actors choose this name, and
 #: a status with many long ones would be larger than observers accept.
 _MAX_HOST = 100
@@ -127,33 +124,7 @@ class Throughput:
             self._arrivals.popleft()
 
 
-class Waits:
-    """The services that wait: for what, why, and since when."""
-
-    def __init__(self) -> None:
-        self._waits: dict[str, tuple[str, str, float]] = {}
-
-    def begin(self, who: str, on: str, why: str, now: float) -> None:
-        """Note that a service waits; its wait continues if it is for the same reason."""
-        held = self._waits.get(who)
-        if held is None or held[:2] != (on, why):
-            self._waits[who] = on, why, now
-            if len(self._waits) > _MOST_WAITS:
-                del self._waits[next(iter(self._waits))]
-
-    def end(self, who: str) -> None:
-        """Note that a service no longer waits."""
-        self._waits.pop(who, None)
-
-    def list(self, now: float) -> tuple[Waiting, ...]:
-        """Return all waits."""
-        return tuple(
-            Waiting(who=who, on=on, why=why, seconds=round(now - since, 3))
-            for who, (on, why, since) in sorted(self._waits.items())
-        )
-
-
-def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, now: float) -> Status:
+def status(run: RunState, throughput: Throughput, lag_s: float, now: float) -> Status:
     """Return the status of a run."""
     progress = run.progress
     latest = run.store.version(progress.latest_version)
@@ -199,7 +170,7 @@ def status(run: RunState, throughput: Throughput, waits: Waits, lag_s: float, no
         useful_concurrency=episodes_due(run.config.commands, run.buffer) * (run.config.lead + 1),
         env_failures=progress.env_failures,
         actors=actors,
-        waiting=waits.list(now),
+        waiting=run.waits.list(now),
         problem=progress.problem[:MAX_TEXT],
         ended_because=progress.why_ended(),
         advice=advice(run),

@@ -175,6 +175,7 @@ class StoredRun(RunState):
     def remove_actor(self, actor: str, *, vanished: bool = True) -> None:
         """Remove an actor that has vanished or was refused; its commands are assigned again."""
         self.auditor.remove_actor(actor)
+        self.waits.end(f"actor {actor}")
         for item in self.dispatcher.remove_actor(actor, vanished=vanished):
             command_id = item.command.id
             if len(item.vanished) == SUSPICIOUS:

@@ -12,6 +12,7 @@ from udrl_replay.dispatching import Dispatcher
 from udrl_replay.progress import RunProgress
 from udrl_replay.quarantine import Quarantine
 from udrl_replay.store import Store
+from udrl_replay.waits import Waits
 
 log = logging.getLogger("udrl")
 
@@ -32,6 +33,7 @@ class RunState:
         dispatcher: the outstanding commands and the actors.
         auditor: the open audits.
         quarantined: the quarantined actors.
+        waits: the services that wait.
     """
 
     def __init__(self, store: Store, budget: Budget, audit: float = 0.0) -> None:
@@ -43,6 +45,7 @@ class RunState:
         self.dispatcher = Dispatcher()
         self.auditor = Auditor(audit)
         self.quarantined = Quarantine(store)
+        self.waits = Waits()
         held = store.buffer(self.progress.iteration)
         self.buffer = ReplayBuffer(self.config.buffer, (p.entry for p in held))
         self.digests = {p.entry.id: p.digest for p in held}
