@@ -277,7 +277,11 @@ class ReplayService:
     def _wait(self, who: str, on: str, why: str, now: float) -> Wait:
         """Note that a service waits, and return the part of its reply that says so."""
         self.run.waits.begin(who, on, why, now)
-        return Wait(on=f"{on}: {why}", retry_after_s=self.run.dispatcher.retry_after_s())
+        return self._pause(f"{on}: {why}")
+
+    def _pause(self, on: str) -> Wait:
+        """Return the part of a reply that says what to wait for, and when to ask again."""
+        return Wait(on=on, retry_after_s=self.run.dispatcher.retry_after_s())
 
     # One method per verb. Each returns the reply, or raises Refused.
 
@@ -306,9 +310,7 @@ class ReplayService:
             return CommandsReply(commands=tuple(commands))
         if request.running:
             run.waits.end(who)
-            return CommandsReply(
-                wait=Wait(on="nothing: it has work", retry_after_s=run.dispatcher.retry_after_s())
-            )
+            return CommandsReply(wait=self._pause("nothing: it has work"))
         return CommandsReply(wait=self._wait(who, *self._what_actors_wait_for(), now))
 
     def _what_actors_wait_for(self) -> tuple[str, str]:
@@ -348,8 +350,7 @@ class ReplayService:
             )
         if not run.is_trainable(request.version):
             if request.version > following:  # prefetched: the version before is not delivered
-                retry_after_s = run.dispatcher.retry_after_s()
-                return ChangesReply(wait=Wait(on="nothing", retry_after_s=retry_after_s))
+                return ChangesReply(wait=self._pause("nothing"))
             here = [n for r, n in self._here if r == "actor"]
             why = f"iteration {request.version - 1}" + ("" if here else ": no actor is connected")
             if run.progress.state == "finishing":
