@@ -322,6 +322,8 @@ class ReplayService:
             return "learner", f"weights version {version}" + (
                 "" if trains else ": no learner is connected"
             )
+        if run.progress.state == "finishing":
+            return "actors", "the final evaluation"
         return "actors", f"other actors' episodes of iteration {run.progress.iteration + 1}"
 
     def _episode(self, arrival: Arrival, now: float) -> EpisodeReply:
