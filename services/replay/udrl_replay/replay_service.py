@@ -116,9 +116,8 @@ class ReplayService:
         self._inbox: Inbox[ReceivedRequest | Presence] = Inbox(_INBOX, _INBOX_BYTES)
         self._throughput = Throughput()
         self._here: set[tuple[str, str]] = set()  # role and name of the connected services
-        # To measure the lag from the delivery of a version to the first command with it.
-        self._version_at = 0.0
-        self._acting_with = self.run.progress.latest_version
+        # When the versions were accepted that no actor has a command for; to measure the lag.
+        self._accepted_at: dict[int, float] = {}
         self._lag_s = 0.0
         self._handlers: dict[str, Callable[[Any, float], Message]] = {
             verbs.HELLO.name: self._hello,
@@ -304,14 +303,18 @@ class ReplayService:
         commands = run.assign(request, now)
         if commands:
             run.waits.end(who)
-            newest = max(c.weights_version for c in commands)
-            if newest > self._acting_with:
-                self._acting_with, self._lag_s = newest, now - self._version_at
+            self._note_versions_in_use(max(c.weights_version for c in commands), now)
             return CommandsReply(commands=tuple(commands))
         if request.running:
             run.waits.end(who)
             return CommandsReply(wait=self._pause("nothing: it has work"))
         return CommandsReply(wait=self._wait(who, *self._what_actors_wait_for(), now))
+
+    def _note_versions_in_use(self, newest: int, now: float) -> None:
+        """Measure the lag of the newest version in use if this is its first command."""
+        if newest in self._accepted_at:
+            self._lag_s = now - self._accepted_at[newest]
+            self._accepted_at = {v: at for v, at in self._accepted_at.items() if v > newest}
 
     def _what_actors_wait_for(self) -> tuple[str, str]:
         """Return which services idle actors wait for, and why."""
@@ -379,7 +382,7 @@ class ReplayService:
         result = self.run.add_version(delivery.version, delivery.message.train_s)
         if result == "accepted":
             self._admission.note_accepted("learner", learner)
-            self._version_at = now
+            self._accepted_at[delivery.version.version] = now
         return VersionReply(result=result)
 
     def _state(self, request: StateRequest, now: float) -> StateReply:
