@@ -541,6 +541,9 @@ def test_best_version_is_kept(make_run: MakeRun) -> None:
             best.setdefault(last.iteration, last.evaluation.mean)
     expected = min(best, key=lambda version: (-best[version], version))
     assert 0 < run.progress.best_version == expected < run.progress.latest_version
+    assert run.progress.version_named("best") == expected
+    assert run.progress.version_named("latest") == run.progress.latest_version
+    assert run.progress.version_named(3) == 3
     version = run.store.version(expected)
     assert version is not None
     assert version.weights

@@ -79,10 +79,10 @@ def load_agent(run_dir: Path, version: int | Literal["latest", "best"] = "latest
     with closing(Store(run_dir, read_only=True)) as store:
         hello = store.fact("hello", Hello)
         progress = store.fact("progress", RunProgress)
-        named = {"latest": progress.latest_version, "best": progress.best_version}
-        if version not in named and not (isinstance(version, int) and abs(version) <= MAX_NUMBER):
+        is_number = isinstance(version, int) and abs(version) <= MAX_NUMBER
+        if not is_number and version not in ("latest", "best"):
             raise ConfigError(f"weights {version!r}: expected latest, best or a version number")
-        wanted = version if isinstance(version, int) else named[version]
+        wanted = progress.version_named(version)
         found = store.version(wanted)
         if progress.latest_version == 0:
             raise StoreError(

@@ -63,6 +63,12 @@ class RunProgress(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     audit: float = 0.0
     agreed: int = 0
 
+    def version_named(self, wanted: int | Literal["latest", "best"]) -> int:
+        """Return a weights version by its name or number; 0: there is none yet."""
+        if isinstance(wanted, int):
+            return wanted
+        return self.latest_version if wanted == "latest" else self.best_version
+
     def why_ended(self) -> str:
         """Return why the run ended; empty: it has not."""
         if self.state == "failed":

@@ -394,9 +394,7 @@ class ReplayService:
         )
 
     def _weights(self, request: WeightsRequest, now: float) -> WeightsMessage:
-        progress = self.run.progress
-        named = {"latest": progress.latest_version, "best": progress.best_version}
-        wanted = request.version if isinstance(request.version, int) else named[request.version]
+        wanted = self.run.progress.version_named(request.version)
         version = self._store.version(wanted)
         if version is None or not version.weights:
             kept = self._store.versions_kept()
