@@ -260,7 +260,7 @@ def find_run(
         stop: ends the wait.
 
     Raises:
-        Unreachable: no such run replies.
+        Unreachable: no such run replies, or ``run_id`` is None and another run does not reply.
         ConfigError: there are several runs and ``run_id`` is None, or the run has another protocol.
         Interrupted: ``stop`` was set.
     """
@@ -268,15 +268,15 @@ def find_run(
     stop = stop or threading.Event()
     pause = 0.05
     while True:
-        found = _hellos(session)
+        found, is_complete = _hellos(session)
         if run_id is not None:
-            found = {name: hello for name, hello in found.items() if name == run_id}
+            found, is_complete = {n: hello for n, hello in found.items() if n == run_id}, True
         if len(found) > 1:
             raise ConfigError(
                 f"found several runs: {printable(', '.join(sorted(found)))}; choose one with "
                 f"--run RUN_ID"
             )
-        if found:
+        if found and is_complete:
             ((protocol, payload),) = found.values()
             if protocol != str(PROTOCOL):
                 raise ConfigError(
@@ -285,6 +285,11 @@ def find_run(
                 )
             return decode(payload, Hello)
         if time.monotonic() >= deadline:
+            if found:
+                raise Unreachable(
+                    f"besides {printable(', '.join(found))} there is a run that did not reply in "
+                    f"{patience_s:.0f} s; choose one with --run RUN_ID"
+                )
             named, otherwise = ("", "") if run_id is None else (f" {run_id!r}", ", or check --run")
             raise Unreachable(
                 f"no run{named} replied in {patience_s:.0f} s; start `udrl replay ENV`{otherwise}"
@@ -294,16 +299,18 @@ def find_run(
         pause = min(2 * pause, 1.0)
 
 
-def _hellos(session: zenoh.Session) -> dict[str, tuple[str, bytes]]:
-    """Return protocol and payload of every run's reply, by run id."""
-    found = {}
+def _hellos(session: zenoh.Session) -> tuple[dict[str, tuple[str, bytes]], bool]:
+    """Return protocol and payload of every run's reply, by run id, and whether all replied."""
+    found, is_complete = {}, True
     for reply in session.get(
         key_expressions.every_hello(),
         payload=encode(HelloRequest()),
         timeout=1.0,
         consolidation=zenoh.ConsolidationMode.NONE,
     ):
-        if reply.ok is not None:
+        if reply.ok is None:  # a run is busy, and Zenoh does not say which
+            is_complete = False
+        else:
             protocol, run_id, _ = key_expressions.parse(str(reply.ok.key_expr))
             found[run_id] = protocol, reply.ok.payload.to_bytes()
-    return found
+    return found, is_complete

@@ -4,6 +4,7 @@ import logging
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
@@ -203,6 +204,38 @@ def test_several_runs_are_listed_if_no_name_is_given(
     serve(served, "two", encode(hello("two")))
     with pytest.raises(ConfigError, match=r"one, two; choose one.*--run"):
         sessions.find_run(client, None, patience_s=5.0)
+
+
+@pytest.fixture
+def unanswered(router: zenoh.Session) -> Iterator[list[zenoh.Query]]:
+    """The requests that a busy run, ``two``, has received and not answered."""
+    queries: list[zenoh.Query] = []
+    key = f"udrl/{PROTOCOL}/two/{verbs.HELLO.name}"
+    router.declare_queryable(key, queries.append, complete=True)
+    yield queries
+    for query in queries:
+        query.drop()
+
+
+def test_run_is_not_taken_for_the_only_one_while_another_is_busy(
+    served: zenoh.Session, client: zenoh.Session, unanswered: list[zenoh.Query]
+) -> None:
+    with pytest.raises(Unreachable, match=r"besides one there is a run that did not .*; .*--run"):
+        sessions.find_run(client, None, patience_s=0.1)
+    assert unanswered
+    assert sessions.find_run(client, "one", patience_s=0.1) == hello("one")
+
+
+def test_several_runs_are_listed_once_the_busy_one_replies(
+    served: zenoh.Session, client: zenoh.Session, unanswered: list[zenoh.Query]
+) -> None:
+    class FirstPause(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            serve(served, "two", encode(hello("two")))
+            return False
+
+    with pytest.raises(ConfigError, match=r"one, two; choose one.*--run"):
+        sessions.find_run(client, None, patience_s=60.0, stop=FirstPause())
 
 
 @pytest.mark.parametrize(
