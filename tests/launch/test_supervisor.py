@@ -1,7 +1,10 @@
 """The supervisor restarts children that die, unless the error would repeat."""
 
+import errno
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -9,9 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from udrl.errors import RunFailed
+from udrl.config import Config
+from udrl.errors import RunFailed, StoreError
 from udrl_launch import supervisor as module
+from udrl_launch.local import Processes
+from udrl_launch.settings import gather
 from udrl_launch.supervisor import Supervisor
+from udrl_replay.creation import create_run
 
 WAIT = "import time; time.sleep(100)"
 
@@ -97,7 +104,66 @@ def test_removed_log_is_tolerated(supervisor: Supervisor) -> None:
     (log_file,) = (child.log_file for child in supervisor.children)
     log_file.unlink()
     supervisor.check()
-    assert supervisor.children[0].log_tail() == f"{log_file} is missing"
+    tail = supervisor.children[0].log_tail()
+    assert tail == f"{log_file} cannot be read: No such file or directory"
+
+
+def test_log_that_cannot_be_shortened_is_tolerated(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_LONGEST_LOG", -1)
+    start(supervisor, "child", WAIT)
+    log_file = supervisor.children[0].log_file
+    log_file.unlink()
+    log_file.mkdir()
+    supervisor.check()
+
+
+def test_child_whose_log_folder_was_removed_is_restarted(supervisor: Supervisor) -> None:
+    start(supervisor, "child", WAIT)
+    first = pid(supervisor)
+    shutil.rmtree(supervisor.children[0].log_file.parent)
+    os.kill(first, signal.SIGKILL)
+    check_until(supervisor, lambda: pid(supervisor) != first)
+
+
+def test_log_folder_that_is_a_file_is_reported_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "logs").touch()
+    supervisor = Supervisor(tmp_path / "logs")
+    with pytest.raises(StoreError, match=r"child\.log cannot be written: .*; .* --resume"):
+        start(supervisor, "child", WAIT)
+
+
+class KilledProcess:
+    """A process that was killed; a third one cannot be started."""
+
+    started = 0
+
+    def __init__(self, *_: object, **__: object) -> None:
+        KilledProcess.started += 1
+        if KilledProcess.started > 2:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    def poll(self) -> int:
+        return -signal.SIGKILL
+
+    def wait(self, timeout: float) -> int:
+        return self.poll()
+
+
+def test_service_that_cannot_be_restarted_is_a_failure_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = create_run(tmp_path / "run", Config(environment="Figure2-v0"))
+    settings = gather("Figure2-v0", preset_name="none", options={"actors": 0})
+    monkeypatch.setattr(subprocess, "Popen", KilledProcess)
+    services = Processes(
+        tmp_path / "run", store, settings, "tcp/127.0.0.1:1", insecure=False, keys=None
+    )
+    expected = "cannot start replay: Resource temporarily unavailable; free memory, processes or"
+    assert str(services.failure()).startswith(expected)
+    assert services.failure() is services.failure()
+    services.end()
 
 
 def test_long_log_is_shortened(supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from udrl.errors import RunFailed, UdrlError
+from udrl.errors import UdrlError
 from udrl_inspect.address import Address, from_this_machine
 from udrl_launch import roles
 from udrl_launch.process import switch_threads_soon
@@ -61,18 +61,15 @@ class Processes:
         fleet, environment = settings.fleet, settings.config.environment
         store.close()
         self._supervisor = Supervisor(run_dir / "logs")
-        self._failure: RunFailed | None = None
+        self._failure: UdrlError | None = None
         secured = ("--keys", str(keys)) if keys else ()
 
         def start(name: str, *arguments: str) -> None:
             try:
                 self._supervisor.start(name, *arguments, *secured)
-            except OSError as error:
+            except UdrlError:
                 self._supervisor.end()
-                raise UdrlError(
-                    f"cannot start {name}: {error.strerror}; free memory, processes or open files, "
-                    f"or raise their limits"
-                ) from error
+                raise
 
         start(
             "replay", "replay", environment, "--run-dir", str(run_dir), "--resume",
@@ -99,7 +96,7 @@ class Processes:
         if self._failure is None:
             try:
                 self._supervisor.check()
-            except RunFailed as failure:
+            except UdrlError as failure:
                 self._failure = failure
         return self._failure
 

@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from udrl.errors import RunFailed
+from udrl.errors import RunFailed, UdrlError
 from udrl_launch.paths import STARTED_IN, child_environment_variables
+from udrl_replay.remedies import unwritable
 
 log = logging.getLogger("udrl")
 
@@ -57,43 +59,61 @@ class Child:
     done_at: float = 0.0
 
     def start(self) -> None:
-        """Start the process."""
+        """Start the process.
+
+        Raises:
+            StoreError: its log cannot be written.
+            UdrlError: the process cannot be started.
+        """
         self.starts += 1
-        with self.log_file.open("ab") as output:
-            self.process = subprocess.Popen(  # noqa: S603 - our own program
-                [
-                    *self.prefix,
-                    sys.executable,
-                    "-P",  # the user's files must not shadow Python's modules
-                    "-m",
-                    "udrl_launch",
-                    *self.arguments,
-                    "--parent",
-                    str(os.getpid()),
-                ],
-                cwd=STARTED_IN,
-                env=child_environment_variables(),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                process_group=0,  # the parent handles Ctrl-C in the terminal
-            )
+        try:
+            self.log_file.parent.mkdir(parents=True, exist_ok=True)
+            output = self.log_file.open("ab")
+        except OSError as error:
+            raise unwritable(self.log_file, error) from error
+        with output:
+            try:
+                self.process = subprocess.Popen(  # noqa: S603 - our own program
+                    [
+                        *self.prefix,
+                        sys.executable,
+                        "-P",  # the user's files must not shadow Python's modules
+                        "-m",
+                        "udrl_launch",
+                        *self.arguments,
+                        "--parent",
+                        str(os.getpid()),
+                    ],
+                    cwd=STARTED_IN,
+                    env=child_environment_variables(),
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    process_group=0,  # the parent handles Ctrl-C in the terminal
+                )
+            except OSError as error:
+                raise UdrlError(
+                    f"cannot start {self.name}: {error.strerror}; free memory, processes or open "
+                    f"files, or raise their limits"
+                ) from error
 
     def log_tail(self) -> str:
-        """Return the last lines of the log, or a message if it was removed."""
-        if not self.log_file.exists():
-            return f"{self.log_file} is missing"
-        return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
+        """Return the last lines of the log, or why it cannot be read."""
+        try:
+            return "\n".join(_end_of(self.log_file, 10_000).splitlines()[-5:])
+        except OSError as error:
+            return f"{self.log_file} cannot be read: {error.strerror}"
 
     def shorten_log(self) -> None:
-        """Shorten a long log: environments may print without limit."""
-        if self.log_file.exists() and self.log_file.stat().st_size > _LONGEST_LOG:
-            end = _end_of(self.log_file, _LONGEST_LOG // 4)
-            # The child continues to append. What it writes before the file is truncated is lost;
-            # what it writes afterwards follows, because its file is in append mode.
-            with self.log_file.open("r+", encoding="utf-8") as log_file:
-                log_file.write(f"... earlier output was removed\n{end}")
-                log_file.truncate()
+        """Shorten a long log, if it can be written: environments may print without limit."""
+        with suppress(OSError):
+            if self.log_file.stat().st_size > _LONGEST_LOG:
+                end = _end_of(self.log_file, _LONGEST_LOG // 4)
+                # The child continues to append. What it writes before the file is truncated is
+                # lost; what it writes afterwards follows, because its file is in append mode.
+                with self.log_file.open("r+", encoding="utf-8") as log_file:
+                    log_file.write(f"... earlier output was removed\n{end}")
+                    log_file.truncate()
 
 
 def _end_of(file: Path, size: int) -> str:
@@ -136,7 +156,7 @@ class Supervisor:
     after a while: code of an environment can end its process with any code.
 
     Args:
-        log_dir: folder for the logs, one file per child.
+        log_dir: folder for the logs, one file per child; it is created if it is missing.
 
     Attributes:
         work: progress of the children of each role (``actor``: episodes, ``learner``: versions).
@@ -144,14 +164,17 @@ class Supervisor:
     """
 
     def __init__(self, log_dir: Path) -> None:
-        log_dir.mkdir(parents=True, exist_ok=True)
         self._log_dir = log_dir
         self.children: list[Child] = []
         self.work: dict[str, int] = {}
         self._first_done: float | None = None
 
     def start(self, name: str, *arguments: str, prefix: tuple[str, ...] = ()) -> None:
-        """Start ``PREFIX udrl ARGUMENTS`` as a child."""
+        """Start ``PREFIX udrl ARGUMENTS`` as a child.
+
+        Raises:
+            UdrlError: it cannot be started.
+        """
         child = Child(name, list(arguments), self._log_dir / f"{name}.log", prefix)
         child.start()
         self.children.append(child)
@@ -162,6 +185,7 @@ class Supervisor:
         Raises:
             RunFailed: a child ended with an error that a restart would only repeat, or died too
                 often without progress.
+            UdrlError: a child cannot be started again.
         """
         for child in self.children:
             assert child.process is not None
