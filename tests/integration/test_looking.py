@@ -1,5 +1,6 @@
 """Commands that read runs: play, runs, plot, completion."""
 
+import csv
 import json
 import os
 import shlex
@@ -268,6 +269,24 @@ def test_several_runs_are_plotted_in_one_figure(ended_run: Path, tmp_path: Path)
         compare([ended_run], tmp_path / "picture.bmp")
     with pytest.raises(StoreError, match="give the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")
+
+
+def test_old_final_evaluation_of_an_extended_run_keeps_its_wall_time(
+    ended_run: Path, tmp_path: Path
+) -> None:
+    extended = tmp_path / "run"
+    shutil.copytree(ended_run, extended)
+    before = curve.read_curve(ended_run)
+    names, *_, last = csv.reader((extended / "metrics.csv").read_text().splitlines())
+    row = dict(zip(names, last, strict=True))
+    row |= {"iteration": str(int(row["iteration"]) + 1), "wall_s": "6000"}
+    with (extended / "metrics.csv").open("a") as file:
+        file.write(",".join(row.values()) + "\n")
+    assert curve.read_curve(extended).rows[-1]["wall_s"] == 6000
+    final = curve._final([curve.read_curve(extended)], "wall_s")
+    assert final == curve._final([before], "wall_s")
+    assert final is not None
+    assert final.at == before.rows[-1]["wall_s"] / 60
 
 
 def test_folder_of_runs_is_plotted_as_means_over_seeds(ended_run: Path, tmp_path: Path) -> None:

@@ -38,8 +38,8 @@ X = Literal["env_steps", "wall_s"]
 
 _METRICS = "metrics.csv"
 _COLUMNS = (
-    "env_steps", "wall_s", "return_mean", "explored_return", "eval_at_env_steps", "eval_mean",
-    "eval_ci95_low", "eval_ci95_high",
+    "iteration", "env_steps", "wall_s", "return_mean", "explored_return", "eval_at_env_steps",
+    "eval_mean", "eval_ci95_low", "eval_ci95_high",
 )  # fmt: skip
 
 #: Label and divisor of the x-axis.
@@ -291,8 +291,10 @@ def _final(line: Line, x: X) -> LinePoint | None:
     for curve in line:
         if curve.final is None or not curve.rows:
             return None
-        at = curve.final.env_steps if x == "env_steps" else curve.rows[-1][x] / _X[x][1]
-        found.append((at, curve.final.evaluation))
+        # An extended run has iterations after its old final evaluation.
+        after = (r for r in curve.rows if r["iteration"] >= curve.final.iteration)
+        at = curve.final.env_steps if x == "env_steps" else next(after, curve.rows[-1])[x]
+        found.append((at / _X[x][1], curve.final.evaluation))
     if len(found) == 1:
         ((at, one),) = found
         return LinePoint(at, one.mean, one.ci95_low, one.ci95_high)
