@@ -107,6 +107,18 @@ def test_resuming_an_ended_run_returns_at_once(cli: Callable[..., Cli], tmp_path
     assert "starting a new one" not in error
 
 
+def test_training_that_ended_succeeds_without_its_metrics(
+    cli: Callable[..., Cli], tmp_path: Path
+) -> None:
+    given = arguments(TOY, 100, tmp_path / "run")
+    ended = cli(*given, "--in-process").status()
+    (tmp_path / "run" / "metrics.csv").unlink()
+    code, out, error = cli(*given, "--resume").finish(timeout=20)
+    assert code == 0, error
+    assert json.loads(out)["weights_sha256"] == ended.weights_sha256
+    assert re.search(r"learning curve: .*metrics\.csv: No such file", error)
+
+
 def test_status_of_a_live_run_by_its_endpoint(cli: Callable[..., Cli], tmp_path: Path) -> None:
     endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
     cli(*arguments(TOY, 10_000_000, run_dir), "--listen", endpoint, "--actors", "1")

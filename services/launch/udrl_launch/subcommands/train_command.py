@@ -183,7 +183,7 @@ def _finish(run_dir: Path, status: Status, run_logs: Sequence[RunLog]) -> None:
     lines.append(("metrics", shown(run_dir / "metrics.csv")))
     try:
         curve = shown(draw_curve(run_dir, status.environment))
-    except ConfigError as error:
+    except UdrlError as error:
         curve = str(error)
     lines.append(("learning curve", curve))
     for run_log in run_logs:
