@@ -19,6 +19,7 @@ from udrl_launch.subcommands.options import (
     RUN_DIR,
     TEMPERATURE,
     WEIGHTS,
+    FiniteRange,
     chosen_temperature,
     version,
 )
@@ -37,7 +38,7 @@ _NAME = Path(reports.FILE)
 @click.option("--desired-returns", type=RETURNS, metavar="LOW:HIGH",
               help="Range of desired returns. Default: that of the replay buffer, without the "
               "lowest 5 %.")  # fmt: skip
-@click.option("--tolerance", type=click.FloatRange(0, 1e9), metavar="NUMBER",
+@click.option("--tolerance", type=FiniteRange(0, 1e9), metavar="NUMBER",
               help="Largest difference between desired and mean obtained return that counts as "
               "obeyed. Default: 10 % of the default range of desired returns.")  # fmt: skip
 @TEMPERATURE

@@ -27,6 +27,19 @@ class _AbsolutePath(click.Path):
         return Path(os.fsdecode(super().convert(value, param, ctx))).absolute()
 
 
+class FiniteRange(click.FloatRange):
+    """A range of numbers, without the ``nan`` and ``inf`` that click accepts."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the number."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r}: expected a finite number", param, ctx)
+        return number
+
+
 FILE = _AbsolutePath(path_type=Path, dir_okay=False)
 FOLDER = _AbsolutePath(path_type=Path, file_okay=False)
 RUN_DIR = FOLDER
@@ -45,7 +58,7 @@ ALLOW_INEXACT = click.option(
     help="Accept machines that round differently, and give up exact reproducibility.",
 )  # fmt: skip
 PARENT = click.option("--parent", type=int, hidden=True)
-PATIENCE = click.option("--patience", type=click.FloatRange(0), default=3.0, show_default=True,
+PATIENCE = click.option("--patience", type=FiniteRange(0), default=3.0, show_default=True,
                          metavar="SECONDS", help="How long to look for the run.")  # fmt: skip
 KEYS = click.option(
     "--keys", type=FOLDER, metavar="DIR",
@@ -53,7 +66,7 @@ KEYS = click.option(
     "tls/HOST:PORT.",
 )  # fmt: skip
 AUDIT = click.option(
-    "--audit", type=click.FloatRange(0, 1), default=0.0, metavar="RATE",
+    "--audit", type=FiniteRange(0, 1), default=0.0, metavar="RATE",
     help="Share of episodes that a second actor repeats, to detect actors that deliver false ones.",
 )  # fmt: skip
 RUN = click.option(
@@ -96,7 +109,7 @@ WEIGHTS = click.option(
 
 
 TEMPERATURE = click.option(
-    "--temperature", type=click.FloatRange(0, 1000), metavar="NUMBER",
+    "--temperature", type=FiniteRange(0, 1000), metavar="NUMBER",
     help="Sampling temperature; 0 = most likely action. Default: as in the run's evaluations.",
 )  # fmt: skip
 GREEDY = click.option(

@@ -32,6 +32,7 @@ from udrl_launch.subcommands.options import (
     RESUME,
     RUN,
     RUN_DIR_OPTION,
+    FiniteRange,
 )
 from udrl_launch.subcommands.settings_options import gather_settings, settings_options
 from udrl_proto.access import REPLAY
@@ -130,7 +131,7 @@ def learner(
               help="Environments to step at once.")  # fmt: skip
 @click.option("--nice", type=click.IntRange(0, 19), default=0, show_default=True, metavar="N",
               help="Niceness of the process, to yield to others.")  # fmt: skip
-@click.option("--hang-timeout", type=click.FloatRange(1), default=60.0, show_default=True,
+@click.option("--hang-timeout", type=FiniteRange(1), default=60.0, show_default=True,
               metavar="SECONDS",
               help="Exit if one round of environment steps takes longer than this.")  # fmt: skip
 @click.option("--first-index", type=click.IntRange(0), default=0, show_default=True, metavar="N",

@@ -24,6 +24,7 @@ from udrl_launch.subcommands.options import (
     METRICS_HOST,
     RESUME,
     RUN_DIR_OPTION,
+    FiniteRange,
 )
 from udrl_launch.subcommands.settings_options import gather_settings, settings_options
 from udrl_launch.training_run import Adviser, Watchers, run_training
@@ -52,7 +53,7 @@ _NOT_STORED = {
 @click.option("--actors", type=int, metavar="N", help="Actor processes on this machine.")
 @click.option("--envs-per-actor", type=int, metavar="N",
               help="Environments that each actor steps at once.")  # fmt: skip
-@click.option("--hang-timeout", type=click.FloatRange(1), metavar="SECONDS",
+@click.option("--hang-timeout", type=FiniteRange(1), metavar="SECONDS",
               help="Restart an actor if one round of environment steps takes longer than this. "
               "Default: 60.")  # fmt: skip
 @RUN_DIR_OPTION
