@@ -71,8 +71,7 @@ async function update() {
   if (known.contents && (news.contents || isMeasured)) stage.update(known);
   showObeyed();
   setText($("about"), `udrl ${news.software}`);
-  const why = news.status?.problem.replace("RUN_DIR", commands(known).run_dir);
-  showProblem([news.problem, why, news.status?.advice].filter(Boolean).join(" "));
+  showProblem([news.problem, news.status?.problem, news.status?.advice].filter(Boolean).join(" "));
 }
 
 function showProblem(text) {
