@@ -6,7 +6,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,6 +27,7 @@ from udrl_inspect.obedience_text import summary
 from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
+from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
 from whole_run import (
     LANDER,
@@ -107,6 +108,14 @@ def board(cli: Callable[..., Cli]) -> Callable[..., str]:
         return line.split()[1]
 
     return start
+
+
+@contextmanager
+def edited_progress(run_dir: Path) -> Iterator[RunProgress]:
+    """Write a run's progress again after the block."""
+    with closing(Store(run_dir)) as store, store.transaction():
+        yield (progress := store.fact("progress", RunProgress))
+        store.set_fact("progress", progress)
 
 
 #: Slow enough that an episode is not over before a click arrives.
@@ -432,6 +441,39 @@ def test_stopped_run_shows_how_to_resume(
         f"udrl train CartPole-v1 --run-dir {run_dir} --resume"
     )
     expect(page.get_by_role("alert")).to_be_hidden()
+
+
+@pytest.mark.parametrize(
+    ("why", "limit"),
+    [
+        ("reached return 50", "--stop-return"),
+        ("spent its budget of 3,000 env steps", "--max-env-steps"),
+    ],
+)
+def test_ended_run_shows_the_limit_that_continues_it(
+    why: str, limit: str, board: Callable[..., str], pages: Callable[..., Page], ended_run: Path,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    run_dir = tmp_path / "run"
+    shutil.copytree(ended_run, run_dir)
+    with edited_progress(run_dir) as progress:
+        progress.ended_because = why
+    page = pages(board(run_dir))
+    again = f"udrl train CartPole-v1 --run-dir {run_dir} --resume {limit} MORE"
+    expect(page.locator("#next")).to_have_text(f"Continue training: {again}", timeout=SOON)
+
+
+def test_run_with_a_false_episode_does_not_suggest_to_resume_it(
+    board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(ended_run, run_dir)
+    problem = "actor a delivered a false episode; start a new run without it, in another --run-dir"
+    with edited_progress(run_dir) as progress:
+        progress.state, progress.deceived, progress.problem = "failed", True, problem
+    page = pages(board(run_dir))
+    expect(page.get_by_role("alert")).to_contain_text(problem, timeout=SOON)
+    expect(page.locator("#next")).to_be_hidden()
 
 
 def test_several_runs_are_compared(
