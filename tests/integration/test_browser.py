@@ -20,7 +20,7 @@ from test_spaces import SETTINGS
 from test_take_cover import TAKE_COVER
 from udrl.config import Budget, Config, build
 from udrl.errors import RunFailed
-from udrl_inspect.agents import load_agent
+from udrl_inspect.agents import evaluate, evaluation_commands, load_agent
 from udrl_inspect.inspection import read_status
 from udrl_inspect.obedience_report import measure, plan_commands, save_report
 from udrl_inspect.obedience_text import summary
@@ -29,6 +29,7 @@ from udrl_launch.training_run import run_training
 from udrl_proto.reports import Status
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
+from udrl_show.playing import with_seeds
 from whole_run import (
     LANDER,
     OBEDIENT,
@@ -218,6 +219,24 @@ def test_given_command_is_obeyed(
         )
         expect(page.locator("#obeyed circle")).to_have_count(number)
     expect(page.locator("#no-picture")).to_contain_text("cannot be rendered")
+
+
+@pytest.mark.parametrize("temperature", [0.0, 0.01])
+def test_episode_is_that_of_play_with_the_temperature_of_evaluations(
+    temperature: float, board: Callable[..., str], pages: Callable[..., Page],
+    run: Callable[..., Status], tmp_path: Path,
+) -> None:  # fmt: skip
+    run(small(eval_temperature=temperature), 2000, run_dir=tmp_path / "run")
+    agent = load_agent(tmp_path / "run")
+    commands = evaluation_commands(agent, episodes=1, desired_return=60, desired_horizon=60)
+    (played,) = evaluate(agent, with_seeds(commands, 10)).returns
+    page = pages(board(tmp_path / "run"))
+    expect(page.get_by_label("Desired return", exact=True)).not_to_be_empty(timeout=SOON)
+    assert page.get_by_label("Greedy").is_checked() == (temperature == 0)
+    page.get_by_label("Speed", exact=True).select_option("16")
+    start(page, 60, 60, seed=10)
+    expect(rows(page)).to_have_count(1, timeout=SOON)
+    assert rows(page).first.locator("td").all_text_contents()[1] == f"{played:g}"
 
 
 def test_keyboard_operation(

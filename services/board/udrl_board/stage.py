@@ -1,8 +1,8 @@
 """A stage: runs an agent for one viewer, who gives it commands.
 
 A stage is a thread that runs one episode at a time (:class:`udrl.rollout.Rollout`), at a multiple
-of the environment's own speed, and handles requests between frames. With the same seed, command and
-weights, the episode is that of ``udrl play --seed``.
+of the environment's own speed, and handles requests between frames. With the same seed, command,
+temperature and weights, the episode is that of ``udrl play --seed``.
 """
 
 import contextlib

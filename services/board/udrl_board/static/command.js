@@ -42,6 +42,9 @@ export class CommandForm {
     this.showPresets(presets(contents, status?.environment ?? ""));
     this.similar = new Similar(contents, xs, ys);
     this.showMap(contents, obeyed, xs, ys);
+    // At first as in the run's evaluations.
+    this.sampling = hello.config.eval_temperature || 1;
+    if (isFirst) $("greedy").checked = hello.config.eval_temperature === 0;
     if (isFirst) this.fill(contents.desired_return, contents.desired_horizon);
     else this.choose();
   }
@@ -100,7 +103,7 @@ export class CommandForm {
   }
 
   get temperature() {
-    return $("greedy").checked ? 0 : 1;
+    return $("greedy").checked ? 0 : this.sampling;
   }
 
   // Show the chosen command on the map, and whether the buffer has similar episodes.
