@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,17 +23,19 @@ from test_spaces import SETTINGS
 from udrl.config import Config, build
 from udrl.errors import ConfigError, StoreError, Unreachable
 from udrl_board import app as board
-from udrl_board import source
+from udrl_board import source, stage
 from udrl_board.app import make_app
 from udrl_board.board_command import board as command
 from udrl_board.feed import Feed
 from udrl_board.source import Directory, Served, Stored
+from udrl_board.stage import Stage
 from udrl_inspect.address import ENDPOINT_FILE, Address
 from udrl_inspect.agents import load_agent
 from udrl_inspect.inspection import read_status
 from udrl_inspect.obedience_report import measure, plan_commands, save_report
 from udrl_inspect.obedience_text import summary
 from udrl_launch.cli import cli as command_line
+from udrl_proto.messages import Hello
 from udrl_proto.reports import Status
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 
@@ -451,6 +454,44 @@ def test_number_of_stages_is_limited(client: TestClient, monkeypatch: pytest.Mon
         next(moments(first))
         with client.websocket_connect("/stage") as second:
             assert "try again later" in second.receive_json()["problem"]
+    with client.websocket_connect("/stage") as third:
+        third.send_json(start(paused=True))
+        assert next(moments(third))["step"] == 0
+
+
+def test_stage_counts_while_it_creates_an_environment_for_a_viewer_that_left(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board, "MOST_STAGES", 1)
+    creating, left, created = threading.Event(), threading.Event(), threading.Event()
+    make, close = stage._make, Stage.close
+
+    def make_slowly(hello: Hello) -> Any:
+        creating.set()
+        assert created.wait(60)
+        return make(hello)
+
+    def note_closing(one: Stage) -> None:
+        close(one)
+        left.set()
+
+    monkeypatch.setattr(stage, "_make", make_slowly)
+    monkeypatch.setattr(Stage, "close", note_closing)
+
+    def visit() -> None:
+        with client.websocket_connect("/stage") as socket:
+            socket.send_json(start())
+            assert creating.wait(60)
+
+    viewer = threading.Thread(target=visit)
+    viewer.start()
+    assert left.wait(60)
+    with client.websocket_connect("/stage") as second:
+        second.send_json({"do": "nothing"})
+        problem = second.receive_json()["problem"]
+        created.set()
+    viewer.join()
+    assert "try again later" in problem
     with client.websocket_connect("/stage") as third:
         third.send_json(start(paused=True))
         assert next(moments(third))["step"] == 0

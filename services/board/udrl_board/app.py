@@ -177,7 +177,7 @@ class _Board:
 
     def __init__(self, feeds: Sequence[Feed]) -> None:
         self._feeds = feeds
-        self._stages = 0
+        self._stages: list[Stage] = []
 
     def _feed(self, connection: HTTPConnection) -> Feed:
         """Return the feed of the run that a page shows; the first if there is no such run."""
@@ -202,19 +202,20 @@ class _Board:
     async def stage(self, socket: WebSocket) -> None:
         """Receive a viewer's requests and show the episodes."""
         await socket.accept()
-        if self._stages >= MOST_STAGES:
+        # A stage counts until its thread has ended: it may still be creating an environment.
+        self._stages = [stage for stage in self._stages if stage.is_alive()]
+        if len(self._stages) >= MOST_STAGES:
             problem = f"all {MOST_STAGES} stages are in use; try again later"
             await socket.send_text(as_json(StageProblem(problem=problem)).decode())
             await socket.close(1013)
             return
-        self._stages += 1
         stage = Stage(self._feed(socket).source, _sender(socket, asyncio.get_running_loop()))
         stage.start()
+        self._stages.append(stage)
         try:
             await _listen(socket, stage)
         finally:
             stage.close()
-            self._stages -= 1  # before the wait, which the server may cancel
             await run_in_threadpool(stage.join)
 
 
