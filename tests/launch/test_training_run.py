@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 
 from udrl.errors import Interrupted
+from udrl_inspect.inspection import read_status
 from udrl_launch import training_run
 from udrl_launch.settings import gather
+from udrl_replay.progress import STOPPED
 from udrl_replay.store import Store
 
 TOY = {"n_warm_up_episodes": 5, "max_return": 2.0}
@@ -43,6 +45,22 @@ def test_stop_while_connecting_prints_how_to_resume(
     with pytest.raises(Interrupted, match=f"^stopped; resume with: {command}$"):
         training_run.run_training(settings, tmp_path / "run", stop, in_process=True)
     assert UnresponsiveServices.ended
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_run_whose_services_are_starting_is_not_reported_as_killed(
+    resume: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_run, "Threads", UnresponsiveServices)
+    settings, stop = gather("Figure2-v0", preset_name="none", options=TOY), threading.Event()
+    stop.set()
+    for again in (False, True)[: 1 + resume]:
+        with pytest.raises(Interrupted):
+            training_run.run_training(
+                settings, tmp_path / "run", stop, resume=again, in_process=True
+            )
+    status = read_status(tmp_path / "run")
+    assert (status.state, status.ended_because) == ("stopped", STOPPED)
 
 
 def test_torch_is_loaded_in_the_calling_thread_before_there_is_a_run(

@@ -138,10 +138,12 @@ def run_training(
     settings = settings._replace(config=config_of(store), automatic=frozenset())
     with ExitStack() as closing_store:
         closing_store.callback(store.close)
-        progress = StoredRun(store, settings.budget).progress
-        if progress.state == "ended":
-            write_weights(run_dir, store, progress.latest_version)
+        run = StoredRun(store, settings.budget)
+        if run.progress.state == "ended":
+            write_weights(run_dir, store, run.progress.latest_version)
             return read_status(run_dir)
+        with store.transaction():  # until its replay service has started
+            run.stop()
         closing_store.pop_all()  # the services take over the store
     kind = Threads if in_process else Processes
     services: Local = kind(
