@@ -15,6 +15,7 @@ from udrl_proto import verbs
 from udrl_proto.messages import Hello
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
+from udrl_replay.creation import exists
 from udrl_replay.progress import RunProgress
 from udrl_replay.reporting import Throughput, status
 from udrl_replay.run_state import RunState
@@ -119,3 +120,8 @@ def settings_of(run_dir: Path) -> dict[str, Any]:
     with closing(Store(run_dir, read_only=True)) as store:
         config = store.fact("hello", Hello).config
     return flat(config) | flat(budget_of(run_dir))
+
+
+def settings_to_resume(run_dir: Path | None) -> dict[str, Any] | None:
+    """Return the settings of a run to resume; None: there is none in ``run_dir`` yet."""
+    return settings_of(run_dir) if run_dir is not None and exists(run_dir) else None

@@ -22,12 +22,12 @@ import numpy as np
 from udrl.errors import ConfigError, Interrupted, RunFailed, UdrlError
 from udrl.policy import Policy
 from udrl_inspect.agents import load_agent
-from udrl_inspect.inspection import last_iteration, read_status, settings_of
+from udrl_inspect.inspection import last_iteration, read_status, settings_to_resume
 from udrl_launch.paths import new_run_dir
 from udrl_launch.settings import gather
 from udrl_launch.training_run import run_training
 from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
-from udrl_replay.creation import directory_name, exists
+from udrl_replay.creation import directory_name
 from udrl_replay.store import EVALUATION_COLUMNS
 from udrl_show.metrics_file import MetricsReader
 from udrl_show.run_logs import opened
@@ -109,16 +109,11 @@ def train(
     events = {"on_iteration": on_iteration, "on_evaluation": on_evaluation, "on_end": on_end}
     _require_functions(**{name: [one] for name, one in events.items() if one is not None})
     chosen = None if run_dir is None else Path(run_dir).absolute()
-    is_resumed = resume and chosen is not None and exists(chosen)
-    gathered = gather(
-        environment,
-        preset_name=preset,
-        stored=settings_of(chosen) if is_resumed and chosen is not None else None,
-        options=settings,
-    )
+    stored = settings_to_resume(chosen if resume else None)
+    gathered = gather(environment, preset_name=preset, stored=stored, options=settings)
     folder = chosen or new_run_dir(directory_name(gathered.config))
     stop = threading.Event()
-    after = last_iteration(folder) if is_resumed else -1
+    after = -1 if stored is None else last_iteration(folder)
     watcher = _Callbacks(folder, after, gathered.config.evaluation.eval_episodes, stop)
     watcher.on_status += to_call
     watcher.on_iteration, watcher.on_evaluation = on_iteration, on_evaluation

@@ -7,11 +7,10 @@ from typing import Any, TypeVar
 import click
 
 from udrl.config import preset_names
-from udrl_inspect import inspection
+from udrl_inspect.inspection import settings_to_resume
 from udrl_launch import completions
 from udrl_launch.settings import Settings, gather
 from udrl_launch.subcommands.options import FILE, STEPS
-from udrl_replay.creation import exists
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
@@ -61,13 +60,12 @@ def gather_settings(
     env: str, given: dict[str, Any], run_dir: Path | None, *, resume: bool
 ) -> Settings:
     """Return the settings of a command from its options."""
-    is_resumed = resume and run_dir is not None and exists(run_dir)
     return gather(
         env,
         preset_name=given.pop("preset_name"),
         file=given.pop("file"),
         # As when the run was created, even if the presets have changed since.
-        stored=inspection.settings_of(run_dir) if is_resumed and run_dir is not None else None,
+        stored=settings_to_resume(run_dir if resume else None),
         assignments=given.pop("assignments"),
         options=given,
     )
