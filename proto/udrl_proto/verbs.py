@@ -91,8 +91,6 @@ VERBS: tuple[AnyVerb, ...] = (
     HISTORY, CONTENTS,
 )  # fmt: skip
 
-BY_NAME = {verb.name: verb for verb in VERBS}
-
 
 def sent_by(role: str) -> Iterable[str]:
     """Return the names of the verbs that a role may send."""

@@ -75,14 +75,19 @@ def by_type(inputs: int, seed: int) -> None:
     import hypothesis
     from hypothesis import strategies as st
 
-    from tests.fuzz.world import NAMES, Target, decode_as_every_message, valid_requests
+    from tests.fuzz.world import (
+        BY_NAME,
+        NAMES,
+        Target,
+        decode_as_every_message,
+        valid_requests,
+    )
     from tests.proto.strategies import messages
-    from udrl_proto import verbs
     from udrl_proto.codec import encode
 
     target = Target(valid_requests())
     drawn = st.sampled_from(NAMES).flatmap(
-        lambda verb: messages(verbs.BY_NAME[verb].request).map(
+        lambda verb: messages(BY_NAME[verb].request).map(
             lambda message: bytes([NAMES.index(verb)]) + encode(message)
         )
     )

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 import udrl_replay.admission
-from tests.fuzz.world import Target, World, valid_requests
+from tests.fuzz.world import NAMES, Target, World, valid_requests
 from udrl_proto import verbs
 from udrl_proto.codec import decode, encode
 from udrl_proto.messages import JoinRequest, Problem
@@ -65,7 +65,7 @@ def target(requests: list[tuple[str, bytes]]) -> Iterator[Target]:
 def test_valid_requests_reach_every_verb_and_are_accepted(
     requests: list[tuple[str, bytes]],
 ) -> None:
-    assert {verb for verb, _ in requests} == set(verbs.BY_NAME)
+    assert {verb for verb, _ in requests} == set(NAMES)
     world = World()
     for verb, data in requests:
         answer = world.send_raw(verb, data)

@@ -55,7 +55,8 @@ CONFIG = build(
     },
 )  # fmt: skip
 
-NAMES = list(verbs.BY_NAME)
+BY_NAME = {verb.name: verb for verb in verbs.VERBS}
+NAMES = list(BY_NAME)
 
 #: A file system that syncs at once.
 _MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
@@ -118,7 +119,7 @@ class World:
             return decode(sent.data, Problem)
         if self.service.run.progress.accepted > accepted:
             self._check_accepted(data)
-        reply: type[Message] = verbs.BY_NAME[verb].reply
+        reply: type[Message] = BY_NAME[verb].reply
         return decode(sent.data, reply, 1 << 30)
 
     def _check_ledgers(self) -> None:

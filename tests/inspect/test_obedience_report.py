@@ -19,7 +19,7 @@ from udrl_inspect.obedience_report import (
     load_report,
     save_report,
 )
-from udrl_inspect.obedience_text import Row, answer, best, horizons, markdown, rows, rule, table
+from udrl_inspect.obedience_text import COLUMNS, answer, best, horizons, markdown, rows, rule, table
 from udrl_launch.subcommands.options import RETURNS
 from udrl_show.obedience_picture import draw_obedience
 
@@ -131,9 +131,10 @@ def test_card_begins_with_the_summary_and_has_the_table() -> None:
 
 def test_csv_file_has_every_point(tmp_path: Path) -> None:
     example = report(obeyed=(30.0, 80.0))
-    csv_tables.write(tmp_path / "obedience.csv", Row, rows(example))
+    csv_tables.write_cells(tmp_path / "obedience.csv", COLUMNS, rows(example))
     with (tmp_path / "obedience.csv").open(newline="") as file:
         found = list(csv.DictReader(file))
+    assert list(found[0]) == list(COLUMNS)
     assert [row["sweep"] for row in found] == ["return"] * 4 + ["horizon"] * 2
     assert [row["obeyed"] for row in found] == ["False", "True", "True", "False"] + ["False"] * 2
     shared = [f.name for f in msgspec.structs.fields(ObediencePoint)]

@@ -50,8 +50,8 @@ class Replay:
         self.hosts_router = hosts_router
         self.received: list[str] = []
         self.tokens: queue.Queue[str] = queue.Queue()
-        for verb in verbs.BY_NAME:
-            key = key_expressions.key("run", verb)
+        for verb in verbs.VERBS:
+            key = key_expressions.key("run", verb.name)
             self.session.declare_queryable(key, partial(self._answer, key), complete=True)
         self.heard = RecordingSubscriber(session, "**")
         self.session.liveliness().declare_subscriber(
@@ -221,9 +221,10 @@ def test_role_gets_replies_to_its_own_verbs_only(
     role: str, replay: Replay, connect: Connect
 ) -> None:
     client = connect(role)
-    assert {verb for verb in verbs.BY_NAME if ask(client, verb)} == MAY_ASK[role]
+    names = [verb.name for verb in verbs.VERBS]
+    assert {name for name in names if ask(client, name)} == MAY_ASK[role]
     assert replay.received == [
-        key_expressions.key("run", verb) for verb in verbs.BY_NAME if verb in MAY_ASK[role]
+        key_expressions.key("run", name) for name in names if name in MAY_ASK[role]
     ]
 
 
@@ -402,7 +403,8 @@ def test_table_of_rights_is_documented() -> None:
 
 
 def test_every_verb_belongs_to_a_role() -> None:
-    assert {verb for role in RIGHTS for verb in verbs.sent_by(role)} == set(verbs.BY_NAME)
+    sent = {name for role in RIGHTS for name in verbs.sent_by(role)}
+    assert sent == {verb.name for verb in verbs.VERBS}
     assert set(ROLES) == set(MAY_ASK)
 
 

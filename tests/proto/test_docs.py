@@ -135,9 +135,9 @@ def size(n: int) -> str:
 
 def test_every_verb_is_described_with_its_roles_messages_and_limits() -> None:
     rows = {row[0].strip("`"): row[1:] for row in rows_below(PAGE, "### Verbs")}
-    assert list(rows) == list(verbs.BY_NAME)
-    for name, verb in verbs.BY_NAME.items():
-        senders, request, reply, limit = rows[name]
+    assert list(rows) == [verb.name for verb in verbs.VERBS]
+    for verb in verbs.VERBS:
+        senders, request, reply, limit = rows[verb.name]
         assert senders.split(", ") == list(verb.senders)
         assert request == f"[{verb.request.__name__}](#{verb.request.__name__.lower()})"
         assert reply == f"[{verb.reply.__name__}](#{verb.reply.__name__.lower()})"

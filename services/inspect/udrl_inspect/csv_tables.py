@@ -21,10 +21,19 @@ def write(path: Path, kind: type[AnyRow], rows: Iterable[AnyRow]) -> None:
     Raises:
         OSError: the file cannot be written; an existing file is unchanged.
     """
+    write_cells(path, kind.__struct_fields__, map(msgspec.structs.astuple, rows))
+
+
+def write_cells(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write rows below a header; the file is written atomically.
+
+    Raises:
+        OSError: the file cannot be written; an existing file is unchanged.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(kind.__struct_fields__)
-    writer.writerows(msgspec.structs.astuple(row) for row in rows)
+    writer.writerow(columns)
+    writer.writerows(rows)
     write_atomically(path, text.getvalue().encode())
 
 

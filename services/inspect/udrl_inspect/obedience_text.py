@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
 
 import msgspec
 
@@ -14,41 +13,15 @@ _FOLLOWS = 0.8
 
 _HEAD = "desired return", "desired horizon", "mean return", "95 % interval", "mean length", ""
 
-
-class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """A row of the CSV file; its other attributes are those of :class:`ObediencePoint`.
-
-    Attributes:
-        sweep: which part of the command is varied.
-        obeyed: whether the command is in the range in which the agent obeys.
-    """
-
-    sweep: Literal["return", "horizon"]
-    desired_return: float
-    desired_horizon: int
-    episodes: int
-    return_mean: float
-    return_std: float
-    return_ci95_low: float
-    return_ci95_high: float
-    length_mean: float
-    length_std: float
-    length_ci95_low: float
-    length_ci95_high: float
-    obeyed: bool
+#: Columns of the CSV file: the varied part of the command, its results, whether it is obeyed.
+COLUMNS = ("sweep", *ObediencePoint.__struct_fields__, "obeyed")
 
 
-def rows(report: ObedienceReport) -> Iterator[Row]:
+def rows(report: ObedienceReport) -> Iterator[tuple[object, ...]]:
     """Yield the rows of the CSV file: commanded returns, then commanded horizons."""
-    for point in report.by_return:
-        yield Row(sweep="return", obeyed=is_obeyed(report, point), **_fields(point))
-    for point in report.by_horizon:
-        yield Row(sweep="horizon", obeyed=is_obeyed(report, point), **_fields(point))
-
-
-def _fields(point: ObediencePoint) -> dict[str, Any]:
-    fields: dict[str, Any] = msgspec.structs.asdict(point)
-    return fields
+    for sweep, points in (("return", report.by_return), ("horizon", report.by_horizon)):
+        for point in points:
+            yield sweep, *msgspec.structs.astuple(point), is_obeyed(report, point)
 
 
 def is_obeyed(report: ObedienceReport, point: ObediencePoint) -> bool:

@@ -99,9 +99,8 @@ def _write_files(run_dir: Path, report: reports.ObedienceReport, *, draws: bool)
     """Write the files in the run's directory, and return what went wrong."""
     try:
         reports.save_report(run_dir, report)
-        csv_tables.write(
-            run_dir / _NAME.with_suffix(".csv"), obedience_text.Row, obedience_text.rows(report)
-        )
+        columns, rows = obedience_text.COLUMNS, obedience_text.rows(report)
+        csv_tables.write_cells(run_dir / _NAME.with_suffix(".csv"), columns, rows)
     except (OSError, StoreError) as error:
         return [f"the report cannot be written to {run_dir}: {error}"]
     try:
