@@ -17,7 +17,7 @@ from udrl.atomic_files import write_atomically
 from udrl.config import Budget
 from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
-from udrl_experiments.jobs import ERROR_PREFIX, Job, read_job
+from udrl_experiments.jobs import ERROR_PREFIX, Job, has_state, read_job
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
 from udrl_inspect.csv_tables import read, write
@@ -72,7 +72,7 @@ def run_job(job: Job, folder: Path, stop: threading.Event) -> None:
 
 
 def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
-    if not (folder / "run").exists() and not (folder / "state.safetensors").exists():
+    if not has_state(folder):
         # Only the records of a shorter run were kept. It cannot be extended, so it starts again.
         (folder / "done.json").unlink(missing_ok=True)
     if job.algorithm == "UDRL":
@@ -81,10 +81,10 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
         if status.problem:
             raise RunFailed(status.problem)
         table = folder / "evaluations.csv"
-        # The final evaluation before an extension is only in the table, and is kept.
-        rows = {row.env_steps: row for row in _evaluations(job, folder / "run", status)}
-        if (folder / "done.json").exists():
-            rows |= {row.env_steps: row for row in read(table, EvaluationRecord)}
+        # The final evaluation before an extension is only in the table. It is kept unless there is
+        # now another one after as many env steps.
+        kept = read(table, EvaluationRecord) if (folder / "done.json").exists() else []
+        rows = {row.env_steps: row for row in (*kept, *_evaluations(job, folder / "run", status))}
         write(table, EvaluationRecord, (rows[steps] for steps in sorted(rows)))
     else:
         baselines.train_baseline(

@@ -87,14 +87,14 @@ class Job(Configured, msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         return root / "runs" / self.name
 
     def done(self, root: Path) -> bool:
-        """Return whether the run is finished, with at least ``max_env_steps``."""
-        folder, done = self.folder(root), self._done(root)
+        """Return whether the run is finished, with at least ``max_env_steps`` and an evaluation."""
+        done = self._done(root)
         try:
             return (
                 done is not None
                 and done.max_env_steps >= self.max_env_steps
-                and read_job(folder).config == self.config
-                and bool(read(folder / "evaluations.csv", EvaluationRecord))
+                and read_job(self.folder(root)).config == self.config
+                and bool(self.evaluations(root))
             )
         except InvalidData:
             return False
@@ -133,6 +133,11 @@ class _DoneRecord(msgspec.Struct, frozen=True):
 
     max_env_steps: int
     machine: Machine | None = None
+
+
+def has_state(folder: Path) -> bool:
+    """Return whether a run's folder has the state to continue it, not only its records."""
+    return (folder / "run").exists() or (folder / "state.safetensors").exists()
 
 
 def read_job(folder: Path) -> Job:
@@ -191,8 +196,8 @@ def run_jobs(
                 if not jobs_by_name[name].done(root):
                     raise RunFailed(
                         f"the run in {root / 'runs' / name} ended without an evaluation within "
-                        f"{jobs_by_name[name].max_env_steps:,} env steps; raise --max-env-steps or "
-                        f"lower eval_every (--set eval_every=STEPS)"
+                        f"{jobs_by_name[name].max_env_steps:,} env steps; raise --max-env-steps, "
+                        f"or lower eval_every or n_warm_up_episodes (--set NAME=VALUE)"
                     )
     finally:
         _terminate(running.values())
@@ -208,6 +213,20 @@ def merge_jobs(jobs: Iterable[Job]) -> Sequence[Job]:
     return list(merged.values())
 
 
+def require_runs(sources: Iterable[Path]) -> None:
+    """Require folders of studies, which contain the folder ``runs``.
+
+    Raises:
+        ConfigError: one is not such a folder.
+    """
+    for source in sources:
+        if not (source / "runs").is_dir():
+            raise ConfigError(
+                f"--runs-from {source}: expected a folder of studies, which contains the folder "
+                f"runs; name the --folder of another study"
+            )
+
+
 def copy_finished(
     jobs: Iterable[Job], root: Path, sources: Sequence[Path], echo: Callable[[str], None]
 ) -> None:
@@ -218,19 +237,11 @@ def copy_finished(
         root: folder of the folder ``runs``.
         sources: the other folders. The first with the finished run is used.
         echo: called with a line for each copied run.
-
-    Raises:
-        ConfigError: a source has no folder ``runs``.
     """
-    for source in sources:
-        if not (source / "runs").is_dir():
-            raise ConfigError(
-                f"--runs-from {source}: expected a folder of studies, which contains the folder "
-                f"runs; name the --folder of another study"
-            )
     for job in merge_jobs(jobs):
         finished = next((source for source in sources if job.done(source)), None)
-        if finished is None or job.done(root):
+        # A run with a state of its own is continued: the records would not be of this state.
+        if finished is None or job.done(root) or has_state(job.folder(root)):
             continue
         echo(f"copied from {finished}: {job.described}")
         job.folder(root).mkdir(parents=True, exist_ok=True)

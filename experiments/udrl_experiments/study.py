@@ -12,7 +12,7 @@ from udrl.atomic_files import write_atomically
 from udrl.errors import ConfigError, InvalidData
 from udrl.file_remedies import file_remedy
 from udrl.strategies import make_strategy
-from udrl_experiments.jobs import Job, copy_finished, run_jobs
+from udrl_experiments.jobs import Job, copy_finished, require_runs, run_jobs
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
 
@@ -88,9 +88,10 @@ def run_study(
     folders = StudyFolders(root if study.shares_runs else folder, folder)
     try:
         sources = [one if study.shares_runs else one / study.name for one in runs_from]
+        require_runs(sources)
+        _write_plan(study, folders, resume=resume)
         for jobs in (study.jobs, study.possible):
             copy_finished(jobs, folders.root, sources, echo)
-        _write_plan(study, folders, resume=resume)
         study.run_jobs(study.jobs, folders.root, side_by_side, stop, echo)
         summary = study.report(folders)
     except OSError as error:

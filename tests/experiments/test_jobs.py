@@ -3,6 +3,7 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -14,9 +15,17 @@ from udrl.errors import ConfigError, Interrupted, InvalidData, RunFailed, RunInU
 from udrl_experiments import job as job_module
 from udrl_experiments import jobs
 from udrl_experiments.job import run_job
-from udrl_experiments.jobs import RECORDS, Job, copy_finished, merge_jobs, read_job, run_jobs
+from udrl_experiments.jobs import (
+    RECORDS,
+    Job,
+    copy_finished,
+    merge_jobs,
+    read_job,
+    require_runs,
+    run_jobs,
+)
 from udrl_experiments.records import EvaluationRecord
-from udrl_inspect.csv_tables import write
+from udrl_inspect.csv_tables import read, write
 
 CONFIG = build(Config, {"environment": "CartPole-v1", "eval_every": 100})
 
@@ -61,7 +70,7 @@ def test_names_do_not_depend_on_defaults() -> None:
 
 
 def test_a_finished_run_with_other_defaults_is_another_run(tmp_path: Path) -> None:
-    one = job(50)
+    one = job(100)
     finish(tmp_path, one)
     assert one.done(tmp_path)
     stored = msgspec.structs.replace(one, settings=one.settings | {"memory_size": 65})
@@ -99,6 +108,8 @@ def test_run_is_done_if_it_reached_its_budget(tmp_path: Path, text: str, *, done
     (folder / "job.json").write_bytes(msgspec.json.encode(job()))
     (folder / "done.json").write_text(text, encoding="utf-8")
     assert not job().done(tmp_path), "without evaluations it is not done"
+    write(folder / "evaluations.csv", EvaluationRecord, [evaluated(2000)])
+    assert not job().done(tmp_path), "nor with evaluations that are too late"
     write(folder / "evaluations.csv", EvaluationRecord, [evaluated(105)])
     assert job().done(tmp_path) is done
 
@@ -193,7 +204,38 @@ def test_folder_without_runs_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"--runs-from .*runs: expected a folder of studies.*--folder"
     ):
-        copy_finished([job()], tmp_path, [tmp_path / "runs"], ignore)
+        require_runs([tmp_path / "runs"])
+
+
+@pytest.mark.parametrize("state", ["run", "state.safetensors"])
+def test_records_are_not_copied_over_a_run_that_can_be_continued(
+    tmp_path: Path, program: Callable[[str], None], state: str
+) -> None:
+    program(FINISH)
+    other, here = tmp_path / "other", tmp_path / "here"
+    run_jobs([job(2000)], other, 1, threading.Event(), ignore)
+    run_jobs([job()], here, 1, threading.Event(), ignore)
+    (job().folder(here) / state).touch()
+    copy_finished([job(2000)], here, [other], ignore)
+    assert job().done(here)
+    assert not job(2000).done(here)
+
+
+def test_evaluations_of_an_extended_run_are_those_of_a_long_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    final, kept, later = (
+        msgspec.structs.replace(evaluated(n), mean=mean)
+        for n, mean in ((100, 1.0), (150, 2.0), (100, 3.0))
+    )
+    tables = iter([[final, kept], [later, evaluated(200)]])
+    monkeypatch.setattr(job_module, "run_training", lambda *_, **__: SimpleNamespace(problem=""))
+    monkeypatch.setattr(job_module, "_evaluations", lambda *_: next(tables))
+    (tmp_path / "run").mkdir()
+    for _ in range(2):
+        run_job(job(), tmp_path, threading.Event())
+    rows = read(tmp_path / "evaluations.csv", EvaluationRecord)
+    assert rows == [later, kept, evaluated(200)]
 
 
 @pytest.mark.parametrize(
