@@ -1,7 +1,7 @@
 """Algorithms of Stable-Baselines3 under UDRL's protocol (section 3.2).
 
-Networks, reset seeds and evaluations are the same as UDRL's. An evaluation is Algorithm 2 with
-commands that the policy ignores.
+Networks and evaluations are the same as UDRL's, with reset seeds from the same ranges. An
+evaluation is Algorithm 2 with commands that the policy ignores.
 """
 
 import contextlib
@@ -190,7 +190,7 @@ def _learn(model: "Model", env_steps: int, stop: threading.Event) -> None:
 def _evaluate(
     baseline: Baseline, generator: EpisodeGenerator, policy: Acting, number: int
 ) -> Evaluation:
-    """Evaluate a policy with the seeds of UDRL's evaluation in iteration ``number``."""
+    """Evaluate a policy as UDRL is evaluated in an iteration ``number``."""
     config = baseline.config
     if baseline.algorithm == "DQN":
         config = change(config, eval_temperature=0.0)

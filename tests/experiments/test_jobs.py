@@ -70,7 +70,7 @@ def test_names_do_not_depend_on_defaults() -> None:
 
 
 def test_a_finished_run_with_other_defaults_is_another_run(tmp_path: Path) -> None:
-    one = job(100)
+    one = job(100_000)
     finish(tmp_path, one)
     assert one.done(tmp_path)
     stored = msgspec.structs.replace(one, settings=one.settings | {"memory_size": 65})

@@ -503,6 +503,7 @@ def test_several_runs_are_compared(
     expect(runs).to_have_count(2, timeout=SOON)
     assert runs.nth(1).locator("td").all_text_contents()[1:3] == ["Obedience-v0", "Ended"]
     expect(page.locator("#all canvas")).to_be_visible()
+    expect(page.locator("#all-legend [stroke-dasharray]")).to_have_count(0)
     expect(page.locator("#title")).to_have_text("CartPole-v1")
     runs.nth(1).get_by_role("link").click()
     expect(page.locator("#title")).to_have_text("Obedience-v0", timeout=SOON)
@@ -524,6 +525,19 @@ def test_numbers_round_to_zero_without_a_sign(
         }"""
     )
     assert shown == ["0.0", "-0.1", "0", "0.0 ± 1.5"]
+
+
+def test_labels_of_an_axis_differ(
+    obedient: Path, board: Callable[..., str], pages: Callable[..., Page]
+) -> None:
+    page = pages(board(obedient))
+    shown = page.evaluate(
+        """async () => {
+            const { labels } = await import("./format.js");
+            return [labels([0, 1e-5, 2e-5]), labels([0, 0.5, 1]), labels([0, 1e6, 2.5e6])];
+        }"""
+    )
+    assert shown == [["0", "0.00001", "0.00002"], ["0", "0.5", "1.0"], ["0", "1.0M", "2.5M"]]
 
 
 def test_quarantined_actors_are_listed(

@@ -36,6 +36,7 @@ export function time(s) {
 // Numbers of an axis in the largest unit that fits, with enough digits to distinguish them.
 export function labels(values) {
   const most = Math.max(...values.map(Math.abs));
+  if (most > 0 && most < 1e-3) return values.map((v) => String(Number(v.toPrecision(6))));
   const [unit, suffix] = most >= 1e6 ? [1e6, "M"] : most >= 1e4 ? [1e3, "K"] : [1, ""];
   const whole = (x, digits) => Math.abs(x * 10 ** digits - Math.round(x * 10 ** digits)) < 1e-6;
   const digits = [0, 1, 2, 3].find((d) => values.every((v) => whole(v / unit, d))) ?? 4;

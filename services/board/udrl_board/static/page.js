@@ -44,12 +44,14 @@ const SHAPES = {
 
 export const mark = (shape, x, y, r, name) => svg("path", { class: `mark ${name}`, d: SHAPES[shape](x, y, r) });
 
-// entries: [[label, shape, class]].
+// entries: [[label, shape, class, dash?]].
 export function legend(list, entries) {
   list.replaceChildren(
-    ...entries.map(([label, shape, name]) => {
+    ...entries.map(([label, shape, name, dash]) => {
       const item = made("li"), picture = svg("svg", { width: 22, height: 14, "aria-hidden": "true" });
-      picture.append(mark(shape, 11, 7, { line: 11, band: 9, dot: 4 }[shape] ?? 5, name));
+      const drawn = mark(shape, 11, 7, { line: 11, band: 9, dot: 4 }[shape] ?? 5, name);
+      if (dash) drawn.setAttribute("stroke-dasharray", dash.join(" "));
+      picture.append(drawn);
       item.append(picture, label);
       return item;
     }),

@@ -29,7 +29,7 @@ function showTable(runs) {
 function showChart(chart, runs) {
   const made = runs.map(({ status, evaluations }) => (status?.final_evaluation ? [...evaluations, status.final_evaluation] : evaluations));
   const { xs, column } = merge(...made.map((all, k) => [all, "env_steps", { [k]: (e) => e.mean }]));
-  legend($("all-legend"), runs.map((run, k) => [nameOf(run), "line", COLOURS[k % COLOURS.length]]));
+  legend($("all-legend"), runs.map((run, k) => [nameOf(run), "line", COLOURS[k % COLOURS.length], dash(k)]));
   chart.show(xs, runs.map((_, k) => column(k)), "The last point of a run that has ended is its final evaluation.", (i) =>
     runs.map((run, k) => [nameOf(run), made[k].findLast((e) => e.env_steps <= xs[i])]).filter(([, e]) => e)
       .map(([name, e]) => `${name}: ${evaluated(e)} after ${number(e.env_steps)}`).join("; ") + ".");
