@@ -131,7 +131,7 @@ def learner(
               help="Environments to step at once.")  # fmt: skip
 @click.option("--nice", type=click.IntRange(0, 19), default=0, show_default=True, metavar="N",
               help="Niceness of the process, to yield to others.")  # fmt: skip
-@click.option("--hang-timeout", type=FiniteRange(1), default=60.0, show_default=True,
+@click.option("--hang-timeout", type=FiniteRange(1, 86_400), default=60.0, show_default=True,
               metavar="SECONDS",
               help="Exit if one round of environment steps takes longer than this.")  # fmt: skip
 @click.option("--first-index", type=click.IntRange(0), default=0, show_default=True, metavar="N",
