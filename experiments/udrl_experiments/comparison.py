@@ -18,7 +18,7 @@ from udrl_experiments.protocol import (
 from udrl_experiments.records import PAPER, EvaluationRecord, agent_name
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Study, StudyFolders
-from udrl_experiments.tuned import tuned
+from udrl_experiments.tuned import DqnHyperparameters, complete, tuned
 from udrl_inspect.csv_tables import read, write
 
 #: File names, without suffix, of the table and the figure for each x axis.
@@ -84,12 +84,13 @@ def baseline(
         max_env_steps: length of the run. DQN's exploration depends on it.
         variant: as in :class:`~udrl_experiments.jobs.Job`.
     """
-    exploration = float(hyperparameters.get("exploration_fraction", 0.0))
+    chosen = complete(algorithm, hyperparameters)
+    explored = chosen.exploration_fraction if isinstance(chosen, DqnHyperparameters) else 0.0
     return Job(
         algorithm=algorithm,
         settings=flat(config),
         hyperparameters=hyperparameters,
-        exploration_steps=round(exploration * max_env_steps),
+        exploration_steps=round(explored * max_env_steps),
         max_env_steps=max_env_steps,
         variant=variant,
     )

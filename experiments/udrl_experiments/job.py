@@ -94,7 +94,7 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
             job.max_env_steps,
             folder,
             stop=stop,
-            exploration_steps=job.exploration_steps or None,
+            exploration_steps=job.exploration_steps,
         )
     done = {"max_env_steps": job.max_env_steps, **provenance()}
     write_atomically(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")

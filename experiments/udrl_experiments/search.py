@@ -218,6 +218,13 @@ def _study(
         for number in range(_configurations(plan, subject.space, configurations))
     }
 
+    longest = max((run.max_env_steps for runs in jobs.values() for run in runs), default=0)
+    if final is not None and final.max_env_steps <= longest:
+        raise ConfigError(
+            f"--final-env-steps {final.max_env_steps}: expected more than the {longest:,} of each "
+            f"configuration before; raise it, or lower --max-env-steps"
+        )
+
     def in_final(environment: str, algorithm: Algorithm, number: int) -> list[Job]:
         if final is None:
             return []

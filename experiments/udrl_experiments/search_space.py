@@ -18,6 +18,9 @@ from udrl.setting_groups import PositiveInt
 from udrl.streams import Stream
 from udrl_experiments.protocol import NETWORKS, Algorithm
 
+#: Settings that a space must not draw: scores would not be comparable.
+_SAME_FOR_ALL = ("seed", "eval_seeds", "eval_every", "eval_episodes")
+
 
 class SearchSpace(NamedTuple):
     """Values from which the configurations of an environment are drawn.
@@ -137,6 +140,12 @@ def _space(environment: str, values: Mapping[str, Any], source: str) -> SearchSp
                 f"{source}: [{algorithm}] environment: the environment is the argument ENV, "
                 f"{environment!r}; leave it out"
             )
+        for setting in _SAME_FOR_ALL:
+            if setting in settings:
+                raise ConfigError(
+                    f"{source}: [{algorithm}] {setting}: the search sets it, so that "
+                    f"configurations can be compared; leave it out"
+                )
     networks = _expanded(file.networks, f"{source}: [networks]")
     return SearchSpace(source, environment, file.configurations, file.seeds, networks, lists)
 

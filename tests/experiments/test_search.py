@@ -129,6 +129,13 @@ def test_finalists_run_longer_and_the_best_one_becomes_a_preset(
     assert [row.final_score for row in found] == [None, 4.5, None, 6.0]
 
 
+@pytest.mark.parametrize("steps", [50_000, 100_000])
+def test_finalists_have_more_steps_than_the_search(steps: int) -> None:
+    plan = StudyPlan(seeds=(1,), max_env_steps=100_000)
+    with pytest.raises(ConfigError, match=rf"--final-env-steps {steps}: .* more than the 100,000"):
+        search_tasks(plan, [TASKS["lander"]], ["UDRL"], 4, Final(2, steps))
+
+
 def test_no_preset_is_written_without_a_score(tmp_path: Path) -> None:
     study = search_tasks(StudyPlan(), [TASKS["lander"]], ["A2C"], 2)
     (tmp_path / "search").mkdir()

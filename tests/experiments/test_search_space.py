@@ -57,3 +57,11 @@ def test_space_belongs_to_one_environment(tmp_path: Path) -> None:
     file.write_text('[UDRL]\nenvironment = ["CartPole-v1"]\n', encoding="utf-8")
     with pytest.raises(ConfigError, match=r"\[UDRL\] environment: .*ENV, 'Acrobot-v1'"):
         read_space("Acrobot-v1", file)
+
+
+@pytest.mark.parametrize("setting", ["seed", "eval_seeds", "eval_every", "eval_episodes"])
+def test_seeds_and_evaluations_are_not_drawn(setting: str, tmp_path: Path) -> None:
+    file = tmp_path / "space.toml"
+    file.write_text(f"[UDRL]\n{setting} = [1, 2]\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=rf"\[UDRL\] {setting}: .*leave it out"):
+        read_space("Acrobot-v1", file)
