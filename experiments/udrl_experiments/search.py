@@ -9,7 +9,7 @@ from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -17,7 +17,7 @@ from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
 from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
-from udrl.config import AUTOMATIC, Config, build, change, flat, preset
+from udrl.config import AUTOMATIC, Config, build, change, flat
 from udrl.errors import ConfigError
 from udrl.spaces import Image, Vector
 from udrl_experiments.comparison import baseline
@@ -86,13 +86,11 @@ class Subject(NamedTuple):
         space: the search space.
         algorithms: algorithms whose configurations are drawn.
         config: settings of a UDRL run, before a seed and drawn settings are set.
-        preset: settings that are written with UDRL's best configuration.
     """
 
     space: SearchSpace
     algorithms: tuple[Algorithm, ...]
     config: Config
-    preset: dict[str, Any]
 
 
 def search_tasks(
@@ -120,7 +118,7 @@ def search_tasks(
         chosen = _chosen(space, algorithms)
         plan.assigned(_drawn_settings(space, chosen))
         config = plan.config(task, 1, paper=True, eval_seeds="search")
-        subjects.append(Subject(space, chosen, config, preset(f"{task.environment}-paper")))
+        subjects.append(Subject(space, chosen, config))
     return _study("search", plan, subjects, configurations, final)
 
 
@@ -153,7 +151,7 @@ def search_environment(
     """
     space = read_space(environment, file)
     chosen = _chosen(space, algorithms)
-    assigned = plan.assigned(_drawn_settings(space, chosen))
+    plan.assigned(_drawn_settings(space, chosen))
     own = {"seed": 1, "eval_seeds": "search", "eval_every": EVAL_EVERY}
     # A drawn setting must not be `auto`. Any of its values will do here.
     drawn = {
@@ -174,8 +172,7 @@ def search_environment(
             f"{environment} with {', '.join(others)}: expected discrete actions and one vector or "
             f"image as observation; search with --algorithm UDRL"
         )
-    written = {name: flat(config)[name] for name in (*sorted(settings.automatic), *assigned)}
-    subject = Subject(space, chosen, config, {"environment": environment} | written)
+    subject = Subject(space, chosen, config)
     return _study(f"search-{_file_name(environment)}", plan, [subject], configurations, final)
 
 
@@ -327,7 +324,8 @@ def _write_preset(
 ) -> str:
     """Write the best configuration to a TOML file, and return its text.
 
-    UDRL's can be passed to ``udrl train --config``.
+    UDRL's can be passed to ``udrl train --config``. It has all settings but the seeds, because the
+    environment's preset may differ from the one of the search.
     """
     environment = subject.space.environment
     kind = (environment, algorithm)
@@ -340,7 +338,8 @@ def _write_preset(
     value, best = max(scored, key=lambda pair: pair[0])
     drawn = json.loads(best.settings)
     if algorithm == "UDRL":
-        values = subject.preset | drawn
+        settings = flat(change(subject.config, **drawn))
+        values = {name: v for name, v in settings.items() if name not in ("seed", "eval_seeds")}
     else:
         values = {"environment": environment, **drawn}
     text = f"# Configuration {best.configuration}: score {value:.1f}, seeds: {best.seeds}.\n"
