@@ -1,7 +1,8 @@
 """Replying to queries: the replay service's side of the contract.
 
 Queries arrive on Zenoh's threads, are decoded there, and wait in a bounded inbox for the single
-thread that owns the run. If the inbox is full, a query gets no reply, and its sender retries.
+thread that owns the run. If the inbox is full, a query gets no reply, and its sender retries. Only
+``hello`` is refused: a client must know of every run on its router.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -15,7 +16,7 @@ from udrl_proto.codec import decode, encode
 from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Message, Problem
 from udrl_proto.transport import Declaration, EncodedReply, Query, Transport
-from udrl_proto.verbs import VERBS, AnyVerb
+from udrl_proto.verbs import HELLO, VERBS, AnyVerb
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ def serve(
             request: Any
             data = query.data
             if not inbox.has_room(len(data), bulk=verb.is_bulk):  # before decoding it
-                query.drop()
+                _turn_away(verb, query)
                 return
             try:
                 request = prepared(decode(data, verb.request, verb.limit))
             except InvalidData as error:
                 request = error
             if not inbox.put(ReceivedRequest(verb, request, query), len(data), bulk=verb.is_bulk):
-                query.drop()
+                _turn_away(verb, query)
 
         return receive
 
@@ -77,3 +78,12 @@ def serve(
         transport.declare_queryable(key_expressions.key(run_id, verb.name), receiver(verb))
         for verb in verbs
     ]
+
+
+def _turn_away(verb: AnyVerb, query: Query) -> None:
+    """End a query for which the inbox has no room."""
+    if verb.name == HELLO.name:
+        busy = Problem(code="busy", message="too many requests are waiting; send this one again")
+        query.reply(EncodedReply(encode(busy), is_problem=True))
+    else:
+        query.drop()

@@ -175,7 +175,7 @@ def test_every_key_expression_is_described() -> None:
 def codes_in_source() -> set[str]:
     """Return the codes of all refusals and problems in the source."""
     found = set()
-    for path in ROOT.glob("services/*/*/*.py"):
+    for path in [*ROOT.glob("services/*/*/*.py"), *ROOT.glob("proto/*/*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 given: list[ast.expr] = []

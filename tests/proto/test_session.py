@@ -18,7 +18,11 @@ from udrl.spaces import Vector
 from udrl_proto import PROTOCOL, verbs
 from udrl_proto import session as sessions
 from udrl_proto.codec import encode
+from udrl_proto.inbox import Inbox
 from udrl_proto.messages import Hello
+from udrl_proto.serving import ReceivedRequest
+from udrl_proto.serving import serve as serve_verbs
+from udrl_proto.zenoh_transport import ZenohTransport
 
 
 @pytest.mark.parametrize(
@@ -224,6 +228,15 @@ def test_run_is_not_taken_for_the_only_one_while_another_is_busy(
         sessions.find_run(client, None, patience_s=0.1)
     assert unanswered
     assert sessions.find_run(client, "one", patience_s=0.1) == hello("one")
+
+
+def test_run_with_a_full_inbox_is_not_overlooked(
+    served: zenoh.Session, client: zenoh.Session
+) -> None:
+    full: Inbox[ReceivedRequest] = Inbox(max_items=0, max_bytes=0)
+    serve_verbs(ZenohTransport(served), "two", full, [verbs.HELLO])
+    with pytest.raises(Unreachable, match=r"besides one there is a run that did not .*; .*--run"):
+        sessions.find_run(client, None, patience_s=0.1)
 
 
 def test_several_runs_are_listed_once_the_busy_one_replies(
