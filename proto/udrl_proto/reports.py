@@ -12,6 +12,9 @@ HISTORY_PAGE = 2000
 #: Maximum number of episodes and of commands in one :class:`Contents`.
 MOST_SHOWN = 2000
 
+#: A setting of the budget that ends a run.
+Limit = Literal["max_env_steps", "stop_return"]
+
 
 class StatusRequest(Message, frozen=True, kw_only=True):
     """Request for the :class:`Status` of the run."""
@@ -101,6 +104,12 @@ class Status(Message, frozen=True, kw_only=True):
 
     ``stopped`` is never reported by a replay service, only when the file of a run is read that no
     process is running.
+
+    Attributes:
+        limit_reached: the setting that is raised to continue the run after its end; None: it has
+            not reached a limit.
+        deceived: whether the run failed because it learned from a false episode; it cannot be
+            resumed.
     """
 
     run_id: Name
@@ -133,7 +142,9 @@ class Status(Message, frozen=True, kw_only=True):
     actors: tuple[ActorStatus, ...]
     waiting: tuple[Waiting, ...]
     problem: Text
+    deceived: bool
     ended_because: Text
+    limit_reached: Limit | None
     advice: Text
     audit: AuditStatus
     quarantined: tuple[Quarantined, ...]

@@ -463,20 +463,21 @@ def test_stopped_run_shows_how_to_resume(
 
 
 @pytest.mark.parametrize(
-    ("why", "limit"),
-    [
-        ("reached return 50", "--stop-return"),
-        ("spent its budget of 3,000 env steps", "--max-env-steps"),
-    ],
+    ("stop_return", "limit"), [("0.0", "--stop-return"), ('"unset"', "--max-env-steps")]
 )
 def test_ended_run_shows_the_limit_that_continues_it(
-    why: str, limit: str, board: Callable[..., str], pages: Callable[..., Page], ended_run: Path,
-    tmp_path: Path,
+    stop_return: str, limit: str, board: Callable[..., str], pages: Callable[..., Page],
+    ended_run: Path, tmp_path: Path,
 ) -> None:  # fmt: skip
     run_dir = tmp_path / "run"
     shutil.copytree(ended_run, run_dir)
-    with edited_progress(run_dir) as progress:
-        progress.ended_because = why
+    with closing(Store(run_dir)) as store, store.transaction():
+        final = store.last_evaluation(is_final=True)
+        assert final is not None
+        store.add_evaluation(final._replace(is_final=False))
+    config = run_dir / "config.toml"
+    lines = [s for s in config.read_text().splitlines() if not s.startswith("stop_return")]
+    config.write_text("\n".join([*lines, f"stop_return = {stop_return}"]))
     page = pages(board(run_dir))
     again = f"udrl train CartPole-v1 --run-dir {run_dir} --resume {limit} MORE"
     expect(page.locator("#next")).to_have_text(f"Continue training: {again}", timeout=SOON)
@@ -487,7 +488,7 @@ def test_run_with_a_false_episode_does_not_suggest_to_resume_it(
 ) -> None:
     run_dir = tmp_path / "run"
     shutil.copytree(ended_run, run_dir)
-    problem = "actor a delivered a false episode; start a new run without it, in another --run-dir"
+    problem = "actor a delivered a false episode"
     with edited_progress(run_dir) as progress:
         progress.state, progress.deceived, progress.problem = "failed", True, problem
     page = pages(board(run_dir))

@@ -500,10 +500,13 @@ def test_run_has_the_reason_of_its_end(
     assert run.progress.why_ended() == ""
     finish(run)
     assert run.progress.why_ended() == "reached return 0"
+    assert run.limit_reached() == "stop_return"
     steps = run.progress.env_steps
     run = reopened(run, Budget(max_env_steps=steps + 20))
     assert (run.progress.state, run.progress.why_ended()) == ("running", "")
+    assert run.limit_reached() is None
     finish(run)
+    assert run.limit_reached() == "max_env_steps"
     assert run.progress.why_ended() == f"spent its budget of {steps + 20} env steps"
     assert read_status(tmp_path).ended_because == run.progress.why_ended()
 

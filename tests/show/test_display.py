@@ -34,7 +34,7 @@ STATUS = Status(
     ),
     final_evaluation=None, exact=True, inexact_reason="", useful_concurrency=60, env_failures=0,
     actors=(), waiting=(Waiting(who="learner l", on="actors", why="iteration 7", seconds=2.5),),
-    problem="", ended_because="", advice="",
+    problem="", deceived=False, ended_because="", limit_reached=None, advice="",
     audit=AuditStatus(rate=0.0, agreed=0, open=0, disputed=0), quarantined=(),
 )  # fmt: skip
 

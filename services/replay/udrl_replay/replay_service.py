@@ -145,9 +145,9 @@ class ReplayService:
         declared = self.open()
         log.info("serving run %s", run_id)
         if self.run.progress.state == "ended":
-            why = self.run.progress.ended_because
-            limit = "--stop-return" if why.startswith("reached return") else "--max-env-steps"
-            log.info("the run has ended: it %s; raise %s to continue it", why, limit)
+            why, limit = self.run.progress.ended_because, self.run.limit_reached()
+            option = f"--{limit}".replace("_", "-")
+            log.info("the run has ended: it %s; raise %s to continue it", why, option)
         try:
             self._reply_until_ended(stop)
             # Not after an error: then memory may be ahead of the disk.

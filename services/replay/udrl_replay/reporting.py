@@ -172,7 +172,9 @@ def status(run: RunState, throughput: Throughput, lag_s: float, now: float) -> S
         actors=actors,
         waiting=run.waits.list(now),
         problem=progress.problem[:MAX_TEXT],
+        deceived=progress.deceived,
         ended_because=progress.why_ended(),
+        limit_reached=run.limit_reached(),
         advice=advice(run),
         audit=AuditStatus(
             rate=progress.audit,

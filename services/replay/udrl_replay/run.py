@@ -311,18 +311,12 @@ class StoredRun(RunState):
     # The end, and resuming after it.
 
     def _spent(self) -> str:
-        """Return which limit of the budget is reached; empty: none."""
-        most, wanted = self.budget.max_env_steps, self.budget.stop_return
-        last = self.store.last_evaluation(is_final=False)
-        if (
-            wanted is not None
-            and last is not None
-            and last.iteration == self.progress.iteration
-            and last.evaluation.mean >= wanted
-        ):
-            return f"reached return {wanted:.10g}"
-        if self.progress.env_steps >= most:
-            return f"spent its budget of {most:,} env steps"
+        """Return that a limit of the budget is reached, for ``ended_because``; empty: none is."""
+        match self.limit_reached():
+            case "stop_return":
+                return f"reached return {self.budget.stop_return:.10g}"
+            case "max_env_steps":
+                return f"spent its budget of {self.budget.max_env_steps:,} env steps"
         return ""
 
     def _begin_final_evaluation(self, why: str) -> None:

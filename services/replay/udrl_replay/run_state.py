@@ -7,6 +7,7 @@ from udrl.commands import Command
 from udrl.config import Budget
 from udrl.replay_buffer import ReplayBuffer
 from udrl_proto.messages import Hello
+from udrl_proto.reports import Limit
 from udrl_replay.auditing import Auditor
 from udrl_replay.dispatching import Dispatcher
 from udrl_replay.progress import RunProgress
@@ -61,6 +62,18 @@ class RunState:
     def wall_s(self) -> float:
         """Running time, seconds; pauses between processes are not counted."""
         return time.monotonic() - self._began
+
+    def limit_reached(self) -> Limit | None:
+        """Return which limit of the budget is reached; None: neither."""
+        wanted, last = self.budget.stop_return, self.store.last_evaluation(is_final=False)
+        if (
+            wanted is not None
+            and last is not None
+            and last.iteration == self.progress.iteration
+            and last.evaluation.mean >= wanted
+        ):
+            return "stop_return"
+        return "max_env_steps" if self.progress.env_steps >= self.budget.max_env_steps else None
 
     def awaits_version(self) -> int | None:
         """Return the version that can be trained now; None: its buffer is not complete."""

@@ -74,13 +74,12 @@ function showScore({ evaluation, final_evaluation, stop_return }) {
 
 function showAlerts(known) {
   const { status } = known, { service, resume } = commands(known);
-  const limit = status.ended_because.startsWith("reached return") ? "--stop-return" : "--max-env-steps";
-  // A run that learned from a false episode cannot be resumed; its problem says so.
-  const isLost = status.problem.includes("start a new run without it");
+  const limit = status.limit_reached ? ` --${status.limit_reached.replaceAll("_", "-")} MORE` : "";
   const hints = {
     stopped: `No process is running this run. Resume it: ${resume()}`,
-    ended: `Continue training: ${resume(` ${limit} MORE`)}`,
-    failed: isLost ? "" : `Fix the cause, then resume the run: ${resume()}`,
+    ended: `Continue training: ${resume(limit)}`,
+    // A run that learned from a false episode cannot be resumed; its problem says so.
+    failed: status.deceived ? "" : `Fix the cause, then resume the run: ${resume()}`,
   };
   const isActive = status.state === "running" || status.state === "finishing";
   const isMissing = status.waiting.some((w) => w.why.includes("no learner is connected"));
