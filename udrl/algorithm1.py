@@ -116,7 +116,7 @@ def _algorithm1(
         Experience(config, generator.spec),
     )
     run.add(offline or generate_episodes(generator, sample.warm_up(), None))
-    due = evaluation_due(0, 0, run.env_steps, config.evaluation.eval_every)
+    due = evaluation_due(0, run.env_steps, config.evaluation.eval_every)
     report(run)
 
     # 3: while stopping criteria is not reached
@@ -135,7 +135,7 @@ def _algorithm1(
         if due:
             episodes = generate_episodes(generator, evaluation, behavior)
             run.evaluations[run.iteration] = summarise([e.episode_return for e in episodes])
-        due = evaluation_due(run.iteration, before, run.env_steps, config.evaluation.eval_every)
+        due = evaluation_due(before, run.env_steps, config.evaluation.eval_every)
         stop = run.env_steps >= budget.max_env_steps or _reached_stop_return(run, budget)
         report(run)
     return run

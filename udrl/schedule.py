@@ -20,15 +20,14 @@ def opened_by(completed: int, lead: int) -> range:
     )
 
 
-def evaluation_due(completed: int, steps_before: int, steps_after: int, every: int) -> bool:
-    """Return whether the first iteration opened by ``completed`` includes an evaluation.
+def evaluation_due(steps_before: int, steps_after: int, every: int) -> bool:
+    """Return whether the first iteration opened by a completed one includes an evaluation.
 
-    It does if completing ``completed`` took ``env_steps`` to or past a multiple of ``every``.
+    It does if the completed one took ``env_steps`` to or past a multiple of ``every``.
 
     Args:
-        completed: the iteration whose buffer the commands are drawn from.
-        steps_before: ``env_steps`` before this iteration.
+        steps_before: ``env_steps`` before the completed iteration; 0 before the warm-up.
         steps_after: ``env_steps`` after it.
         every: env steps between evaluations.
     """
-    return steps_after // every > (0 if completed == 0 else steps_before) // every
+    return steps_after // every > steps_before // every

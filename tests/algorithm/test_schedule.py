@@ -31,23 +31,15 @@ def test_every_iteration_is_opened_once_and_in_order(lead: int, n: int) -> None:
     assert opened == list(range(1, n + lead + 1))
 
 
-@given(st.integers(0, 500), st.integers(1, 500), st.integers(1, 100), st.integers(0, 3))
-def test_evaluation_is_due_when_a_multiple_is_passed(
-    before: int, steps: int, every: int, completed: int
-) -> None:
+@given(st.integers(0, 500), st.integers(1, 500), st.integers(1, 100))
+def test_evaluation_is_due_when_a_multiple_is_passed(before: int, steps: int, every: int) -> None:
     after = before + steps
-    first = 0 if completed == 0 else before
-    passed = [m for m in range(every, after + 1, every) if m > first]
-    assert evaluation_due(completed, before, after, every) == bool(passed)
+    passed = [m for m in range(every, after + 1, every) if m > before]
+    assert evaluation_due(before, after, every) == bool(passed)
 
 
 def test_multiple_counts_once_when_it_is_reached() -> None:
-    assert not evaluation_due(1, 80, 99, every=100)
-    assert evaluation_due(2, 99, 100, every=100)
-    assert not evaluation_due(3, 100, 199, every=100)
-    assert evaluation_due(4, 199, 450, every=100)
-
-
-def test_warm_up_counts_from_zero() -> None:
-    assert evaluation_due(0, 120, 120, every=100)
-    assert not evaluation_due(0, 80, 80, every=100)
+    assert not evaluation_due(80, 99, every=100)
+    assert evaluation_due(99, 100, every=100)
+    assert not evaluation_due(100, 199, every=100)
+    assert evaluation_due(199, 450, every=100)

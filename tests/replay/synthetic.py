@@ -161,7 +161,7 @@ def reference(lead: int, max_env_steps: int) -> Result:
             drawn_from = ReplayBuffer(settings.buffer, map(entry, buffer(source)))
             explored.append(run_commands(sample.explore(i, drawn_from)))
             before = steps[source - 1] if source else 0
-            due = evaluation_due(source, before, steps[source], settings.evaluation.eval_every)
+            due = evaluation_due(before, steps[source], settings.evaluation.eval_every)
             if due and i == opened_by(source, lead)[0]:
                 returns = [e.episode_return for e in run_commands(sample.evaluate(i, drawn_from))]
                 evaluation = summarise(returns)

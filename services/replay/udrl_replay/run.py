@@ -230,9 +230,7 @@ class StoredRun(RunState):
         self._note_iteration(len(ids), [p.entry.episode_return for p in explored], desired)
         self.store.remove_commands(ids)
 
-        due = evaluation_due(
-            iteration, steps_before, progress.env_steps, self.config.evaluation.eval_every
-        )
+        due = evaluation_due(steps_before, progress.env_steps, self.config.evaluation.eval_every)
         for opened in opened_by(iteration, self.config.lead):
             self._issue(self.sampler.explore(opened, self.buffer))
             if due:
