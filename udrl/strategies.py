@@ -138,15 +138,14 @@ STRATEGIES: dict[str, type[CommandStrategy]] = {
 }
 
 
-def make_strategy(config: Config) -> CommandStrategy:
-    """Return the strategy named by ``command_strategy``.
+def strategy_class(name: str) -> type[CommandStrategy]:
+    """Return the strategy of a name.
 
     Raises:
-        ConfigError: there is no strategy of that name, or it cannot be imported or created.
+        ConfigError: there is none, or it cannot be imported.
     """
-    name = config.commands.command_strategy
     if name in STRATEGIES:
-        return STRATEGIES[name](config)
+        return STRATEGIES[name]
     module, colon, attribute = name.partition(":")
     if not colon:
         raise ConfigError(
@@ -154,14 +153,32 @@ def make_strategy(config: Config) -> CommandStrategy:
             f"as package.module:Class"
         )
     try:
-        kind = getattr(import_module(module), attribute)
-        strategy: CommandStrategy = kind(config)
+        kind: type[CommandStrategy] = getattr(import_module(module), attribute)
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"command_strategy {name!r} cannot be imported: {type(error).__name__}: {error}; name "
+            f"a class that is importable here (PYTHONPATH)"
+        ) from error
+    return kind
+
+
+def make_strategy(config: Config) -> CommandStrategy:
+    """Return the strategy named by ``command_strategy``.
+
+    Raises:
+        ConfigError: there is no strategy of that name, or it cannot be imported or created.
+    """
+    name = config.commands.command_strategy
+    kind = strategy_class(name)
+    try:
+        return kind(config)
+    except ConfigError:
+        raise
     except (Exception, SystemExit) as error:
         raise ConfigError(
             f"command_strategy {name!r} cannot be created: {type(error).__name__}: {error}; name a "
-            f"class that is importable here (PYTHONPATH) and takes a udrl.config.Config"
+            f"class that takes a udrl.config.Config"
         ) from error
-    return strategy
 
 
 def choose_command(strategy: CommandStrategy, best: Sequence[Entry], u: float) -> tuple[float, int]:

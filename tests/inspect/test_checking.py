@@ -11,7 +11,7 @@ from gymnasium import spaces
 from tests.foreign.conventions import Plain, ResetsToObservation, register
 from tests.foreign.test_determinism import Unseeded
 from udrl.config import Config, build
-from udrl.errors import EnvironmentFault, UnsupportedEnvironment
+from udrl.errors import ConfigError, EnvironmentFault, UnsupportedEnvironment
 from udrl_inspect.checking import check_environment
 from udrl_launch.cli import cli
 
@@ -79,6 +79,11 @@ def test_unsupported_environment_is_rejected() -> None:
         checked(ResetsToObservation)
     with pytest.raises(UnsupportedEnvironment, match="no step limit"):
         check_environment(build(Config, {"environment": register(Plain, max_steps=None)}))
+
+
+def test_strategy_that_cannot_be_created_is_refused() -> None:
+    with pytest.raises(ConfigError, match="max_return is neither set nor declared"):
+        checked(Plain, command_strategy="maximum")
 
 
 def test_command_checks_the_settings_of_a_preset() -> None:

@@ -17,6 +17,12 @@ def test_preset_of_the_environment_is_the_default() -> None:
     assert settings.budget.max_env_steps == preset("CartPole-v1")["max_env_steps"]
 
 
+def test_unknown_strategy_is_refused_before_an_environment_is_made() -> None:
+    for name, message in (("own", "expected uniform, ranked"), ("not.there:Own", "PYTHONPATH")):
+        with pytest.raises(ConfigError, match=message):
+            gather("NoSuchEnvironment-v0", options={"command_strategy": name})
+
+
 def test_another_preset_can_be_selected() -> None:
     settings = gather("LunarLander-v3", preset_name="CartPole-v1", options={})
     assert settings.config.environment == "LunarLander-v3"

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 
 from udrl.acting import EpisodeGenerator
 from udrl.automatic_settings import choose, scale_fits, with_offered_mask
-from udrl.commands import CommandSampler
+from udrl.commands import CommandSampler, strategy_of
 from udrl.config import Config, change, flat, preset, preset_names
 from udrl.cost import slow_training_warning
 from udrl.determinism import environment_digest, repeated_digest
@@ -88,6 +88,7 @@ def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
         automatic: settings to choose automatically (:mod:`udrl.automatic_settings`).
 
     Raises:
+        ConfigError: the command strategy cannot be created.
         UnsupportedEnvironment: it cannot be created or is not supported.
         EnvironmentFault: it raised an exception, or returned an invalid value.
     """
@@ -105,6 +106,7 @@ def check_environment(config: Config, automatic: Collection[str] = ()) -> Check:
     env.close()
     with closing(EpisodeGenerator(fitted, 1)) as generator:
         spec = generator.spec
+        strategy_of(fitted, spec)  # raises if it cannot be created
         digest = repeated_digest(generator)
         episodes, reset_s, step_s = _play(generator, fitted)
     with closing(EpisodeGenerator(fitted, 1)) as another:

@@ -23,6 +23,7 @@ from udrl.config import (
     setting_names,
 )
 from udrl.errors import ConfigError
+from udrl.strategies import strategy_class
 
 AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 
@@ -154,8 +155,8 @@ def gather(
         assignments: the values of ``--set``.
 
     Raises:
-        ConfigError: a setting is unknown or invalid, one of ``--set`` has no effect, or
-            ``environment`` is a preset of another one.
+        ConfigError: a setting is unknown or invalid, one of ``--set`` has no effect, the command
+            strategy cannot be imported, or ``environment`` is a preset of another one.
     """
     values: dict[str, Any] = dict(stored or {})
     own = preset(environment) if environment in preset_names() else {}
@@ -198,4 +199,5 @@ def gather(
 
     config = part(Config)
     refuse_ineffective(config, assigned)
+    strategy_class(config.commands.command_strategy)  # raises if there is none
     return Settings(config, part(Budget), part(Fleet), frozenset(automatic))
