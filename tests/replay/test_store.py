@@ -67,6 +67,13 @@ def test_folder_without_a_run_is_reported(tmp_path: Path) -> None:
         Store(tmp_path)
 
 
+def test_folder_in_place_of_the_file_is_reported(tmp_path: Path) -> None:
+    (tmp_path / STORE_FILE).mkdir()
+    with pytest.raises(StoreError, match=rf"holds no run \({STORE_FILE} is not a file\)"):
+        Store(tmp_path)
+    assert not (tmp_path / "lock").exists()
+
+
 @pytest.mark.parametrize("name", ["a b", "what?", "100%", "run#1", "läufe"])
 def test_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
     create(tmp_path / name).close()

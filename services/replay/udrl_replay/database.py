@@ -55,8 +55,9 @@ class Database:
     def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
         self.run_dir = run_dir
         self._path = run_dir / STORE_FILE
-        if not self._path.exists():
-            raise StoreError(f"{run_dir} holds no run ({STORE_FILE} is missing); check the path")
+        if not self._path.is_file():
+            found = "is not a file" if self._path.exists() else "is missing"
+            raise StoreError(f"{run_dir} holds no run ({STORE_FILE} {found}); check the path")
         self.read_only = read_only
         self._lock = None if read_only else _lock(run_dir)
         try:
