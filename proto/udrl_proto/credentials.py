@@ -111,7 +111,7 @@ def load_credentials(folder: Path, role: str) -> Credentials:
         raise ConfigError(
             '--keys needs cryptography; install it with: pip install "udrl[secure]"'
         ) from error
-    own = (folder / role if (folder / role).is_dir() else folder).absolute()
+    own = (folder / role if os.path.isdir(folder / role) else folder).absolute()
     found = Credentials(own / CA, own / CERTIFICATE, own / KEY)
     certificates.check_certificate(*found, role)
     file = found.key.stat()

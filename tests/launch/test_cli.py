@@ -10,7 +10,10 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
+from udrl.errors import ConfigError, StoreError
+from udrl_launch.cli import cli
 from udrl_launch.output import escape_unprintable
 from udrl_launch.subcommands.runs_commands import _narrow
 from udrl_launch.subcommands.train_command import _options_to_repeat, train
@@ -49,6 +52,28 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_error_is_one_line_with_the_remedy(arguments: list[str], message: str) -> None:
     ended = udrl(*arguments)
     assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {message}\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["status", "{}"],
+        ["train", "CartPole-v1", "--resume", "--run-dir", "{}"],
+        ["runs", "{}"],
+        ["plot", "{}"],
+        ["play", "{}"],
+        ["export", "{}", "--onnx", "agent.onnx"],
+        ["keys", "create", "{}", "--if-missing"],
+        ["status", "--connect", "tls/127.0.0.1:1", "--keys", "{}"],
+    ],
+)
+def test_path_that_cannot_be_read_is_an_error(arguments: list[str], tmp_path: Path) -> None:
+    """A name that is too long stands for all such paths: permissions do not apply to root."""
+    impossible = str(tmp_path / ("x" * 300))
+    result = CliRunner().invoke(
+        cli, [a.format(impossible) for a in arguments], standalone_mode=False
+    )
+    assert isinstance(result.exception, ConfigError | StoreError)
 
 
 def test_error_of_a_service_has_the_same_form(tmp_path: Path) -> None:

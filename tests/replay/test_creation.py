@@ -24,7 +24,7 @@ from udrl_proto import PROTOCOL, key_expressions
 from udrl_proto.messages import Hello
 from udrl_replay import creation
 from udrl_replay.arrival import Arrival
-from udrl_replay.database import STORE_FILE
+from udrl_replay.database import STORE_FILE, exists
 from udrl_replay.progress import RunProgress
 from udrl_replay.resuming import resume
 from udrl_replay.run import StoredRun
@@ -89,13 +89,13 @@ def test_environment_that_does_not_replay_marks_the_run(
 def test_unknown_environment_creates_no_run(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedEnvironment, match="Nowhere-v0"):
         creation.create_run(tmp_path / "run", Config(environment="Nowhere-v0"))
-    assert not creation.exists(tmp_path / "run")
+    assert not exists(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_run_exists_after_its_creation(created: Store, tmp_path: Path) -> None:
-    assert creation.exists(tmp_path)
-    assert not creation.exists(tmp_path / "other")
+    assert exists(tmp_path)
+    assert not exists(tmp_path / "other")
 
 
 def test_run_is_resumed_with_its_configuration(created: Store, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def _interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_run_that_cannot_store_its_dataset_is_not_created(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         creation.create_run(tmp_path / "run", TOY)
-    assert not creation.exists(tmp_path / "run")
+    assert not exists(tmp_path / "run")
     with closing(Store.create(tmp_path / "run", progress=RunProgress())) as store:
         assert store.commands(cancelled=False) == []
 

@@ -24,7 +24,7 @@ from udrl.targets import ReturnInTime
 from udrl.weights import decode_behavior
 from udrl_inspect.hub import HUB_SCHEME, download
 from udrl_proto.messages import MAX_NUMBER, Hello
-from udrl_replay.database import STORE_FILE
+from udrl_replay.database import exists
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
@@ -126,7 +126,7 @@ def load(path: str | Path, weights: int | Literal["latest", "best"] = "latest") 
         Unreachable: the Hub does not respond.
     """
     is_on_hub = isinstance(path, str) and path.startswith(HUB_SCHEME)
-    if (Path(path) / STORE_FILE).exists() and not is_on_hub:
+    if not is_on_hub and exists(Path(path)):
         return load_agent(Path(path), weights).policy
     if weights != "latest":
         raise ConfigError(

@@ -21,7 +21,7 @@ from udrl_proto.codec import LARGEST, decode, decode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_proto.text import printable
 from udrl_replay.creation import write_config
-from udrl_replay.database import STORE_FILE
+from udrl_replay.database import exists
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import EvaluationRow, Store
 
@@ -114,7 +114,7 @@ def export_folder(agent: Agent, run_dir: Path, folder: Path, address: str | None
         InvalidData: the report is damaged.
         StoreError: the run cannot be read.
     """
-    if (folder / STORE_FILE).exists():
+    if exists(folder):
         raise ConfigError(f"{folder} is the directory of a run; use another folder")
     with closing(Store(run_dir, read_only=True)) as store:
         progress = store.fact("progress", RunProgress)

@@ -15,7 +15,7 @@ from udrl_proto import verbs
 from udrl_proto.messages import Hello
 from udrl_proto.replay_client import ReplayClient
 from udrl_proto.reports import Status, StatusRequest
-from udrl_replay.creation import exists
+from udrl_replay.database import exists
 from udrl_replay.progress import RunProgress
 from udrl_replay.reporting import Throughput, status
 from udrl_replay.run_state import RunState

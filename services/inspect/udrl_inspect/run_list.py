@@ -1,5 +1,6 @@
 """``udrl runs``: a list of runs with their states."""
 
+import os
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -53,7 +54,7 @@ def find(folder: Path) -> list[Summary]:
     Raises:
         ConfigError: the folder does not exist.
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # unlike Path.is_dir, it raises nothing
         raise ConfigError(f"{folder}: no such directory; give the folder of your runs")
     summaries = map(summarise_run, run_directories(folder))
     return sorted(summaries, key=lambda s: s.changed, reverse=True)

@@ -78,7 +78,7 @@ def has_keys(folder: Path, hosts: Iterable[str] = ()) -> bool:
         ConfigError: the keys are expired, do not match or lack a host.
     """
     files = [folder / role / name for role in ROLES for name in (CA, CERTIFICATE, KEY)]
-    if not all(file.is_file() for file in files):
+    if not all(map(os.path.isfile, files)):
         return False
     for role in ROLES:
         load_credentials(folder, role)

@@ -19,10 +19,10 @@ from udrl_proto.zenoh_transport import ZenohTransport
 from udrl_replay.creation import (
     config_of,
     create_run,
-    exists,
     no_empty_folder_left,
     write_config,
 )
+from udrl_replay.database import exists
 from udrl_replay.replay_service import ReplayService
 from udrl_replay.resuming import closed_on_error
 from udrl_replay.resuming import resume as resume_run

@@ -28,7 +28,6 @@ from udrl_proto import PROTOCOL
 from udrl_proto.codec import LARGEST, decode, encode_episode
 from udrl_proto.messages import EpisodeMessage, Hello
 from udrl_replay.arrival import inspect_episode
-from udrl_replay.database import STORE_FILE
 from udrl_replay.progress import RunProgress
 from udrl_replay.remedies import remedy
 from udrl_replay.run import StoredRun
@@ -186,8 +185,3 @@ def as_toml(value: object) -> str:
         return "[" + ", ".join(map(as_toml, value)) + "]"
     # JSON's booleans, numbers and strings are TOML's.
     return msgspec.json.encode(value).decode()
-
-
-def exists(run_dir: Path) -> bool:
-    """Return whether a directory holds a run."""
-    return (run_dir / STORE_FILE).exists()

@@ -55,9 +55,10 @@ class Database:
     def __init__(self, run_dir: Path, *, read_only: bool = False) -> None:
         self.run_dir = run_dir
         self._path = run_dir / STORE_FILE
-        if not self._path.is_file():
-            found = "is not a file" if self._path.exists() else "is missing"
-            raise StoreError(f"{run_dir} holds no run ({STORE_FILE} {found}); check the path")
+        found = exists(run_dir)
+        if not (found and self._path.is_file()):
+            why = "is not a file" if found else "is missing"
+            raise StoreError(f"{run_dir} holds no run ({STORE_FILE} {why}); check the path")
         self.read_only = read_only
         self._lock = None if read_only else _lock(run_dir)
         try:
@@ -291,6 +292,22 @@ def _unusable(run_dir: Path, error: OSError | sqlite3.Error) -> StoreError:
     what_to_do = remedy(error, "use a writable directory")
     reason = error.strerror if isinstance(error, OSError) else error
     return StoreError(f"run directory {run_dir}: {reason}; {what_to_do}")
+
+
+def exists(run_dir: Path) -> bool:
+    """Return whether a directory holds a run.
+
+    Raises:
+        StoreError: the directory cannot be read.
+    """
+    try:
+        (run_dir / STORE_FILE).stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        what_to_do = remedy(error, "name a directory that you can read")
+        raise StoreError(f"run directory {run_dir}: {error.strerror}; {what_to_do}") from error
+    return True
 
 
 def is_locked(run_dir: Path) -> bool:

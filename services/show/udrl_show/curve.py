@@ -22,7 +22,7 @@ from udrl.file_endings import check_ending
 from udrl_inspect.run_list import run_directories
 from udrl_proto.messages import Hello
 from udrl_proto.text import printable
-from udrl_replay.database import STORE_FILE
+from udrl_replay.database import exists
 from udrl_replay.store import EvaluationRow, Store
 from udrl_show import pictures
 from udrl_show.styles import line_style
@@ -197,7 +197,7 @@ def _lines(places: Iterable[Path]) -> tuple[list[Line], list[str]]:
     missing: list[str] = []
     drawn: set[Path] = set()
     for place in places:
-        is_run = any((place / name).exists() for name in (_METRICS, STORE_FILE))
+        is_run = exists(place) or (place / _METRICS).exists()
         below = [] if is_run else list(run_directories(place))
         by_settings: dict[bytes, list[Line]] = {}
         for run_dir in below or [place]:

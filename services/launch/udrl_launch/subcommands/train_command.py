@@ -30,7 +30,8 @@ from udrl_launch.subcommands.settings_options import gather_settings, settings_o
 from udrl_launch.training_run import Adviser, Watchers, run_training
 from udrl_proto.reports import Status
 from udrl_proto.text import printable
-from udrl_replay.creation import directory_name, exists
+from udrl_replay.creation import directory_name
+from udrl_replay.database import exists
 from udrl_show.curve import draw_curve
 from udrl_show.display import Display
 from udrl_show.prometheus import Exporter
