@@ -12,6 +12,7 @@ import udrl
 from udrl.errors import ConfigError, RunFailed, StoreError, UdrlError
 from udrl_inspect.agents import load_agent
 from udrl_inspect.exporting import export_folder
+from udrl_inspect.inspection import read_status
 from udrl_launch import api
 from udrl_proto.reports import EvaluationStatus, IterationStatus, Status
 from udrl_replay.creation import create_run
@@ -101,6 +102,21 @@ def test_failed_run_calls_on_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(RunFailed, match="crashed"):
         udrl.train("CartPole-v1", run_dir=tmp_path / "run", resume=True, on_end=ends.append)
     assert len(ends) == 1
+
+
+def test_exception_of_a_callback_stops_the_run_without_on_end(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    ends: list[Status] = []
+
+    def broken(iteration: IterationStatus) -> None:
+        raise ZeroDivisionError
+
+    create_run(run_dir, small()).close()
+    with pytest.raises(ZeroDivisionError):
+        udrl.train(
+            "CartPole-v1", run_dir=run_dir, resume=True, on_iteration=broken, on_end=ends.append
+        )
+    assert (ends, read_status(run_dir).state) == ([], "stopped")
 
 
 @pytest.mark.parametrize("false", [False, np.False_])

@@ -96,7 +96,8 @@ def train(
             strings, such as ``"3M"``.
 
     If one of ``callbacks``, ``on_iteration`` or ``on_evaluation`` returns False, the run is stopped
-    and can be resumed.
+    and can be resumed. So it is if one raises an exception, which is passed on; ``on_end`` is then
+    not called.
 
     Raises:
         ConfigError: a setting is unknown or invalid.
