@@ -49,7 +49,7 @@ def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
         ConfigError: the endpoint is malformed, or its protocol does not fit ``secure``.
     """
     match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or not 0 < int(match["port"]) < 65536:
+    if match is None or not 0 < int(match["port"]) < 65536 or not _can_be_resolved(match["host"]):
         raise ConfigError(
             f"endpoint {endpoint!r}: expected tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447, or with "
             f"--keys tls/HOST:PORT"
@@ -65,6 +65,15 @@ def check_endpoint(endpoint: str, *, secure: bool = False) -> str:
             f"tls/{endpoint.removeprefix('tcp/')}"
         )
     return endpoint
+
+
+def _can_be_resolved(host: str) -> bool:
+    """Return whether the resolver accepts a name: the parts have 1 to 63 characters."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return True
 
 
 def _host_and_port(endpoint: str) -> tuple[str, int]:

@@ -61,6 +61,8 @@ def test_endpoint_that_does_not_match_the_keys_is_rejected_with_the_remedy() -> 
         "tcp/:7447",
         "tcp/::1:7447",
         "tcp/a b:7447",
+        "tcp/a..b:7447",
+        f"tcp/{64 * 'a'}.org:7447",
         "udp/127.0.0.1:7447",
         "tcp/127.0.0.1:7447?x=1",
         "tcp/127.0.0.1:7447\n",

@@ -32,7 +32,7 @@ FULL = msgspec.structs.replace(
 
 def scraped(status: Status | None) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
     with closing(Exporter(lambda: status, "127.0.0.1", 0)) as exporter:
-        url = f"http://127.0.0.1:{exporter.port}/metrics"
+        url = exporter.address
         with urllib.request.urlopen(url, timeout=10) as answer:
             text = answer.read().decode()
     return {
@@ -97,6 +97,21 @@ def test_port_in_use_is_reported() -> None:
         pytest.raises(ConfigError, match=f"port {first.port}: .*a free port"),
     ):
         Exporter(lambda: None, "127.0.0.1", first.port)
+
+
+def test_address_of_the_metrics_is_a_url() -> None:
+    try:
+        exporter = Exporter(lambda: None, "::1", 0)
+    except ConfigError:
+        pytest.skip("this machine has no IPv6")
+    with closing(exporter), urllib.request.urlopen(exporter.address, timeout=10) as answer:
+        assert answer.status == 200
+
+
+def test_invalid_host_is_reported() -> None:
+    for host in ("a..b", 64 * "a", "nowhere.invalid"):
+        with pytest.raises(ConfigError, match=f"metrics on {host}, port 0: .*an address of this"):
+            Exporter(lambda: None, host, 0)
 
 
 def test_outdated_status_is_not_exported_as_current() -> None:

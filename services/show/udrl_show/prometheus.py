@@ -148,6 +148,7 @@ class Exporter:
 
     Attributes:
         port: the port that is listened on.
+        address: the address of the metrics.
 
     Raises:
         ConfigError: the extra is not installed, or the address cannot be used.
@@ -164,12 +165,15 @@ class Exporter:
         registry.register(StatusCollector(get))
         try:
             self._server, self._thread = start_http_server(port, host, registry)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
+            reason = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(
-                f"metrics on {host}, port {port}: {error.strerror}; choose an address of this "
+                f"metrics on {host}, port {port}: {reason}; choose an address of this "
                 f"machine and a free port, or port 0"
             ) from error
         self.port: int = self._server.server_port
+        shown = f"[{host}]" if ":" in host else host
+        self.address = f"http://{shown}:{self.port}/metrics"
 
     def close(self) -> None:
         """Stop serving."""

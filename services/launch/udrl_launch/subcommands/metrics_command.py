@@ -46,7 +46,7 @@ def metrics(
 
     def service(stop: threading.Event) -> None:
         with closing(Exporter(partial(_known_status, where, keys), host, port)) as exporter:
-            click.echo(f"metrics: http://{host}:{exporter.port}/metrics")
+            click.echo(f"metrics: {exporter.address}")
             stop.wait()
 
     return run_service(service)

@@ -113,7 +113,7 @@ def train(
             if metrics_port is not None:
                 exporter = Exporter(watchers.latest, metrics_host, metrics_port)
                 stack.enter_context(closing(exporter))
-                click.echo(f"metrics: http://{metrics_host}:{exporter.port}/metrics", err=True)
+                click.echo(f"metrics: {exporter.address}", err=True)
             run_logs = stack.enter_context(opened(logs, run_dir))
             for run_log in run_logs:
                 watchers.add(run_log)
