@@ -355,7 +355,8 @@ def test_checkpoint_of_the_run_can_be_selected(client: TestClient, ended_run: Pa
     "request_",
     ["", "[]", '{"do": "fly"}', '{"do": "start"}', json.dumps(start(desired_return="much")),
      json.dumps(start(seed=-1)), json.dumps(start(temperature=-1.0)),
-     json.dumps(start(surplus=1, desired_horizon=2**40))],
+     json.dumps(start(surplus=1, desired_horizon=2**40)),
+     '{"do": "step", "surplus": ' + 4000 * "["],
 )  # fmt: skip
 def test_invalid_requests_are_reported(client: TestClient, request_: str) -> None:
     with client.websocket_connect("/stage") as socket:

@@ -541,6 +541,24 @@ def test_labels_of_an_axis_differ(
     assert shown == [["0", "0.00001", "0.00002"], ["0", "0.5", "1.0"], ["0", "1.0M", "2.5M"]]
 
 
+def test_endpoint_in_a_command_is_quoted_if_a_shell_would_expand_it(
+    obedient: Path, board: Callable[..., str], pages: Callable[..., Page]
+) -> None:
+    page = pages(board(obedient))
+    shown = page.evaluate(
+        """async () => {
+            const { commands } = await import("./run.js");
+            const status = { environment: "CartPole-v1" };
+            const of = (endpoint) => commands({ place: { run_dir: "", endpoint }, status });
+            return ["tcp/[::1]:7447", "tcp/a:7447"].map((at) => of(at).service("actor"));
+        }"""
+    )
+    assert shown == [
+        "udrl actor --connect 'tcp/[::1]:7447'",
+        "udrl actor --connect tcp/a:7447",
+    ]
+
+
 def test_quarantined_actors_are_listed(
     board: Callable[..., str], pages: Callable[..., Page], ended_run: Path, tmp_path: Path
 ) -> None:

@@ -235,7 +235,7 @@ async def _listen(socket: WebSocket, stage: Stage) -> None:
         try:
             if not stage.request(msgspec.json.decode(text, type=StageRequest)):
                 problem = "too many requests at once"
-        except (msgspec.ValidationError, msgspec.DecodeError) as error:
+        except (msgspec.ValidationError, msgspec.DecodeError, RecursionError) as error:
             problem = f"invalid request: {error}"
         if problem:
             await socket.send_text(as_json(StageProblem(problem=problem)).decode())

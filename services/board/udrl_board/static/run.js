@@ -11,7 +11,7 @@ export function commands({ place, status }) {
   const word = (text) => (/^[\w./:-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
   const directory = run_dir ? word(run_dir) : "RUN_DIR";
   return {
-    service: (role) => `udrl ${role} --connect ${endpoint || "ENDPOINT"}${keys}`,
+    service: (role) => `udrl ${role} --connect ${endpoint ? word(endpoint) : "ENDPOINT"}${keys}`,
     obedience: `udrl obedience ${directory}`,
     resume: (more = "") => `udrl train ${word(status.environment)} --run-dir ${directory} --resume${more}${keys}`,
   };
