@@ -175,6 +175,21 @@ def test_unresponsive_service_is_not_queried_again_at_once(
         wait_for(lambda: directory.status().actors and not directory.doubt(), "a reply")
 
 
+def test_new_run_at_the_place_of_a_removed_one_is_queried(
+    cli: Callable[..., Cli], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(source, "_SILENT_S", 0.0)
+    endpoint, run_dir = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run"
+    with closing(Directory(run_dir)) as directory:
+        for _ in range(2):
+            process = cli(*arguments(TOY, 10_000_000, run_dir), "--listen", endpoint)
+            wait_for(lambda: (s := live_status(run_dir)) and s.actors, "an actor")
+            wait_for(lambda: directory.status().actors, "the service to be queried")
+            process.process.terminate()
+            process.finish()
+            shutil.rmtree(run_dir)
+
+
 # Access.
 
 

@@ -231,7 +231,7 @@ class Directory:
         self._run_dir = run_dir
         self._keys_dir = keys_dir
         self._stored = Stored(run_dir)
-        self._served: tuple[str, Served] | None = None
+        self._served: tuple[Address, Served] | None = None
         self._silent_since = float("-inf")
         self._silent_because = ""
         self._lock = threading.Lock()
@@ -296,15 +296,20 @@ class Directory:
 
     def _service(self) -> Served | None:
         """Return the run's replay service; None if the run is not served."""
-        endpoint = served_at(self._run_dir)
+        address = self._address()
         with self._lock:
-            if self._served is not None and self._served[0] != endpoint:
+            if self._served is not None and self._served[0] != address:
                 self._served[1].close()
                 self._served = None
-            if endpoint is None:
+            if address is None:
                 return None
             if self._served is None:
-                run_id = self._stored.hello().run_id
-                address = Address(endpoint, run_id, REPLY_S, self._keys_dir)
-                self._served = endpoint, Served(address)
+                self._served = address, Served(address)
             return self._served[1]
+
+    def _address(self) -> Address | None:
+        """Return the address of the run in the directory, which may have replaced another one."""
+        endpoint = served_at(self._run_dir)
+        if endpoint is None:
+            return None
+        return Address(endpoint, self._stored.hello().run_id, REPLY_S, self._keys_dir)
