@@ -3,9 +3,11 @@
 import importlib
 import re
 import shlex
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import click
 import gymnasium as gym
@@ -15,6 +17,7 @@ import udrl.environments  # noqa: F401 - registers environments
 from tests.markdown import PAGES, ROOT, Page, anchors, files, make_targets, text_of
 from udrl.config import Budget, Config, parse_assignment, setting_names
 from udrl.errors import UdrlError
+from udrl.strategies import CommandStrategy
 from udrl_experiments.protocol import TASKS, StudyPlan, parse_seeds
 from udrl_launch.cli import cli
 from udrl_launch.settings import Fleet, gather
@@ -119,7 +122,13 @@ def placeholder(word: str) -> str:
 
 
 @each_page
-def test_commands_in_the_documentation_are_valid(page: Path) -> None:
+def test_commands_in_the_documentation_are_valid(
+    page: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The reader's own module, whose source is on the page.
+    own = ModuleType("patient")
+    monkeypatch.setattr(own, "Patient", CommandStrategy, raising=False)
+    monkeypatch.setitem(sys.modules, "patient", own)
     for command in commands_in(page):
         program, *arguments = command
         program = program.rpartition("/")[2]
