@@ -70,9 +70,12 @@ class SearchSpace(NamedTuple):
 
 def shipped_space(environment: str) -> SearchSpace:
     """Return the space of Appendix B for one of the paper's environments."""
-    name = f"{environment}.toml"
-    text = (resources.files("udrl_experiments") / "spaces" / name).read_text(encoding="utf-8")
-    return _space(environment, tomllib.loads(text), name)
+    spaces = resources.files("udrl_experiments") / "spaces"
+    own, baselines = (
+        tomllib.loads((spaces / f"{name}.toml").read_text(encoding="utf-8"))
+        for name in (environment, "baselines")
+    )
+    return _space(environment, own | baselines, f"{environment}.toml")
 
 
 def read_space(environment: str, file: Path) -> SearchSpace:

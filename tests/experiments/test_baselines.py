@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.behavior import BehaviorFunction
 from udrl.commands import Command, CommandSampler
-from udrl.config import Config, KeywordValue, build, read_toml
+from udrl.config import Config, KeywordValue, build
 from udrl.environments.making import make_environment
 from udrl.environments.specification import specify
 from udrl.errors import ConfigError, InvalidData
@@ -27,6 +27,7 @@ from udrl_experiments import baselines, policies
 from udrl_experiments.baselines import Baseline, train_baseline
 from udrl_experiments.protocol import TASKS, BaselineAlgorithm, Task
 from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.search_space import shipped_space
 from udrl_experiments.tuned import PpoHyperparameters, complete, tuned
 from udrl_inspect.csv_tables import read
 
@@ -390,15 +391,13 @@ def test_missing_stable_baselines3_is_reported(
 @pytest.mark.parametrize("environment", ["LunarLander-v3", "LunarLanderSparse-v3", "TakeCover-v0"])
 @pytest.mark.parametrize("algorithm", ["DQN", "A2C"])
 def test_shipped_hyperparameters_are_in_the_papers_lists(algorithm: Any, environment: str) -> None:
-    spaces = read_toml(Path(baselines.__file__).parent / "spaces" / f"{environment}.toml")
+    space = shipped_space(environment)
     chosen, networks = tuned(algorithm, environment)
     complete(algorithm, chosen)
     for name, value in networks.items():
-        assert value in spaces["networks"][name], name
-    lists = spaces[algorithm]
-    for name, values in lists.items():
+        assert value in space.networks[name], name
+    for name, values in space.lists[algorithm].items():
         if name == "learning_rate":
-            values = np.logspace(*values["logspace"])
             assert np.isclose(values, chosen[name], rtol=1e-3).any()
         else:
             assert chosen[name] in values, name

@@ -52,7 +52,7 @@ def test_installed_wheel_trains(site: Path) -> None:
 def test_wheel_ships_presets_and_types_but_no_tests(site: Path) -> None:
     files = {str(path.relative_to(site)) for path in site.rglob("*") if path.is_file()}
     assert {f"udrl/presets/{n}.toml" for n in ("CartPole-v1", "LunarLander-v3")} <= files
-    spaces = {f"udrl_experiments/spaces/{n}.toml" for n in ("LunarLander-v3", "TakeCover-v0")}
+    spaces = {f"udrl_experiments/spaces/{n}.toml" for n in ("LunarLander-v3", "baselines")}
     assert spaces | {"udrl_experiments/tuned.toml"} <= files
     packages = (
         "udrl", "udrl_proto", "udrl_actor", "udrl_learner", "udrl_replay", "udrl_inspect",
