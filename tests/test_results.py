@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.markdown import ROOT, text_of
-from udrl_experiments.jobs import read_job
 from udrl_experiments.records import EvaluationRecord, Obtained, agent_name
+from udrl_experiments.runs import is_finished, read_job
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_inspect.csv_tables import read
 
@@ -38,7 +38,7 @@ def test_kept_runs_are_recognised() -> None:
     for folder in RUNS:
         job = read_job(folder)
         assert folder == job.folder(RESULTS)
-        assert job.done(RESULTS)
+        assert is_finished(job, RESULTS)
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)

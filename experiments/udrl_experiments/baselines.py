@@ -20,16 +20,16 @@ from torch import Tensor
 from udrl.acting import EpisodeGenerator, generate_episodes
 from udrl.atomic_files import replacing
 from udrl.commands import CommandSampler
-from udrl.config import Config, KeywordValue, change
+from udrl.config import change
 from udrl.errors import ConfigError, Interrupted, InvalidData
 from udrl.evaluation import Evaluation, summarise
 from udrl.frame_stack import FrameStack
 from udrl.inference import Acting
 from udrl.numerics import resolve_arithmetic
 from udrl.replay_buffer import Entry, ReplayBuffer
-from udrl_experiments.protocol import BaselineAlgorithm
+from udrl_experiments.jobs import Job
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.tuned import DqnHyperparameters, Hyperparameters, complete
+from udrl_experiments.tuned import complete
 from udrl_inspect.csv_tables import write
 
 if TYPE_CHECKING:
@@ -37,32 +37,6 @@ if TYPE_CHECKING:
 
 #: Number of environments of an evaluation. The result does not depend on it.
 _ENVIRONMENTS = 16
-
-
-class Baseline(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Specification of a baseline's run.
-
-    Attributes:
-        algorithm: the algorithm.
-        config: environment and its step limit, ``frame_stack``, ``convolutions``, ``hidden``, seed,
-            evaluations (DQN always acts greedily in them) and device. Other settings are ignored.
-        hyperparameters: those of the algorithm's class in :mod:`udrl_experiments.tuned` that differ
-            from their defaults.
-
-    Raises:
-        ConfigError: a hyperparameter is unknown or invalid.
-    """
-
-    algorithm: BaselineAlgorithm
-    config: Config
-    hyperparameters: dict[str, KeywordValue] = {}
-
-    def __post_init__(self) -> None:
-        self.complete()
-
-    def complete(self) -> Hyperparameters:
-        """Return all hyperparameters."""
-        return complete(self.algorithm, self.hyperparameters)
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,31 +54,25 @@ class _State(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def train_baseline(
-    baseline: Baseline,
-    max_env_steps: int,
-    folder: Path,
-    *,
-    exploration_steps: int | None = None,
-    stop: threading.Event | None = None,
+    job: Job, folder: Path, stop: threading.Event | None = None
 ) -> list[EvaluationRecord]:
     """Train, or resume the run in a folder, with an evaluation every ``eval_every`` env steps.
 
-    A larger ``max_env_steps`` extends a finished run. A run is resumed from its last evaluation,
-    without bit-identical results: episodes in progress are lost, and random numbers differ.
+    Training ends at the first update that reaches ``max_env_steps``; a larger one extends a
+    finished run. A run is resumed from its last evaluation, without bit-identical results: episodes
+    in progress are lost, and random numbers differ.
 
     Args:
-        baseline: specification of the run.
-        max_env_steps: training ends at the first update that reaches it, with an evaluation.
+        job: the run. A resumed run keeps its original ``exploration_steps``. DQN always acts
+            greedily in evaluations.
         folder: folder of this run only. Each evaluation adds a row to ``evaluations.csv``.
-        exploration_steps: env steps over which DQN's exploration rate decreases. None:
-            ``exploration_fraction`` of ``max_env_steps``. A resumed run keeps its original value.
         stop: ends training early. Steps since the last evaluation are lost.
 
     Returns:
         All evaluations of the run.
 
     Raises:
-        ConfigError: Stable-Baselines3 is not installed.
+        ConfigError: Stable-Baselines3 is not installed, or a hyperparameter is unknown or invalid.
         UnsupportedEnvironment: the environment cannot be created or is not supported.
         EnvironmentFault: the environment failed repeatedly in an evaluation.
         InvalidData: the state in the folder is damaged.
@@ -114,13 +82,14 @@ def train_baseline(
     _require_stable_baselines3()
     from udrl_experiments import policies
 
+    algorithm = job.algorithm
+    assert algorithm != "UDRL"
+    hyperparameters = complete(algorithm, job.hyperparameters)
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    config, hyperparameters = resolve_arithmetic(baseline.config), baseline.complete()
+    config = resolve_arithmetic(job.config)
     path, table = folder / "state.safetensors", folder / "evaluations.csv"
-    if exploration_steps is None and isinstance(hyperparameters, DqnHyperparameters):
-        exploration_steps = round(hyperparameters.exploration_fraction * max_env_steps)
-    state = _State(exploration_steps=exploration_steps or 0, counters={}, rows=[])
+    state = _State(exploration_steps=job.exploration_steps, counters={}, rows=[])
     tensors: dict[str, Tensor] = {}
     if path.exists():
         state, tensors = _load(path)
@@ -131,7 +100,7 @@ def train_baseline(
 
     with contextlib.ExitStack() as opened:
         model = policies.make(
-            baseline.algorithm, msgspec.structs.asdict(hyperparameters), config, part=len(rows)
+            algorithm, msgspec.structs.asdict(hyperparameters), config, part=len(rows)
         )
         assert model.env is not None
         opened.callback(model.env.close)
@@ -144,13 +113,13 @@ def train_baseline(
         opened.callback(generator.close)
         (shape,) = FrameStack(generator.spec.observation_space, config.network.frame_stack).shapes
         every = config.evaluation.eval_every
-        while (env_steps := model.num_timesteps) < max_env_steps:
+        while (env_steps := model.num_timesteps) < job.max_env_steps:
             due = (env_steps // every + 1) * every
-            _learn(model, min(due, max_env_steps) - env_steps, stop)
+            _learn(model, min(due, job.max_env_steps) - env_steps, stop)
             policy = policies.ModelPolicy(model, shape)
-            evaluation = _evaluate(baseline, generator, policy, len(rows) + 1)
+            evaluation = _evaluate(job, generator, policy, len(rows) + 1)
             row = EvaluationRecord(
-                environment=config.environment, algorithm=baseline.algorithm, variant="",
+                environment=config.environment, algorithm=algorithm, variant="",
                 seed=config.seed, env_steps=model.num_timesteps,
                 wall_s=time.monotonic() - began, mean=evaluation.mean, std=evaluation.std,
                 episodes=evaluation.episodes,
@@ -187,12 +156,10 @@ def _learn(model: "Model", env_steps: int, stop: threading.Event) -> None:
         raise Interrupted(f"stopped after {model.num_timesteps:,} env steps")
 
 
-def _evaluate(
-    baseline: Baseline, generator: EpisodeGenerator, policy: Acting, number: int
-) -> Evaluation:
+def _evaluate(job: Job, generator: EpisodeGenerator, policy: Acting, number: int) -> Evaluation:
     """Evaluate a policy as UDRL is evaluated in an iteration ``number``."""
-    config = baseline.config
-    if baseline.algorithm == "DQN":
+    config = job.config
+    if job.algorithm == "DQN":
         config = change(config, eval_temperature=0.0)
     sampler = CommandSampler(config, generator.spec)
     # Desired returns and horizons come from the buffer. The policy ignores them.

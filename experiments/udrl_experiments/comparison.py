@@ -5,20 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from udrl.config import Config, KeywordValue, flat
 from udrl_experiments import figures
-from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import (
-    TASKS,
-    BaselineAlgorithm,
-    Participant,
-    StudyPlan,
-    Task,
-)
+from udrl_experiments.jobs import Job, make_job
+from udrl_experiments.protocol import TASKS, Participant, StudyPlan, Task
 from udrl_experiments.records import PAPER, EvaluationRecord, agent_name
+from udrl_experiments.runs import finished_run
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
 from udrl_experiments.study import Study, StudyFolders
-from udrl_experiments.tuned import DqnHyperparameters, complete, tuned
+from udrl_experiments.tuned import tuned
 from udrl_inspect.csv_tables import read, write
 
 #: File names, without suffix, of the table and the figure for each x axis.
@@ -55,44 +49,14 @@ def job(task: Task, plan: StudyPlan, participant: Participant, seed: int) -> Job
     """Return a participant's run on a task."""
     if participant == "UDRL" or participant == "UDRL-paper":
         paper = participant == "UDRL-paper"
-        return Job(
-            algorithm="UDRL",
-            settings=flat(plan.config(task, seed, paper=paper)),
-            max_env_steps=plan.steps(task),
-            variant=PAPER if paper else "",
-        )
+        config = plan.config(task, seed, paper=paper)
+        return make_job("UDRL", config, plan.steps(task), variant=PAPER if paper else "")
     chosen = tuned(participant, task.environment)
-    given = plan.assigned(())
-    networks = {name: value for name, value in chosen.networks.items() if name not in given}
-    config = plan.baseline(task, seed, **networks)
-    return baseline(participant, config, chosen.hyperparameters, plan.steps(task, participant))
-
-
-def baseline(
-    algorithm: BaselineAlgorithm,
-    config: Config,
-    hyperparameters: dict[str, KeywordValue],
-    max_env_steps: int,
-    variant: str = "",
-) -> Job:
-    """Return a run of an algorithm other than UDRL.
-
-    Args:
-        algorithm: the algorithm.
-        config: environment, networks, seed and evaluations.
-        hyperparameters: those that differ from the defaults.
-        max_env_steps: length of the run. DQN's exploration depends on it.
-        variant: as in :class:`~udrl_experiments.jobs.Job`.
-    """
-    chosen = complete(algorithm, hyperparameters)
-    explored = chosen.exploration_fraction if isinstance(chosen, DqnHyperparameters) else 0.0
-    return Job(
-        algorithm=algorithm,
-        settings=flat(config),
-        hyperparameters=hyperparameters,
-        exploration_steps=round(explored * max_env_steps),
-        max_env_steps=max_env_steps,
-        variant=variant,
+    return make_job(
+        participant,
+        plan.config(task, seed, defaults=chosen.networks),
+        plan.steps(task, participant),
+        hyperparameters=chosen.hyperparameters,
     )
 
 
@@ -102,7 +66,7 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFol
     Returns:
         One line for each curve, with its last point.
     """
-    rows: list[EvaluationRecord] = [row for job in jobs for row in job.evaluations(folders.root)]
+    rows = [row for job in jobs for row in finished_run(job, folders.root).evaluations]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
     write(folders.folder / "evaluations.csv", EvaluationRecord, rows)
     write(folders.folder / "curves.csv", CurvePoint, points)
@@ -121,13 +85,12 @@ def report_wall_time(jobs: Sequence[Job], task: Task, title: str, folders: Study
 
     The figure names the machine. Nothing is written if no run's machine is known.
     """
-    machines = {job.name: job.machine(folders.root) for job in jobs}
-    known = Counter(machine for machine in machines.values() if machine is not None)
+    runs = [finished_run(job, folders.root) for job in jobs]
+    known = Counter(run.machine for run in runs if run.machine is not None)
     if not known:
         return
     ((machine, _),) = known.most_common(1)
-    here = [job for job in jobs if machines[job.name] == machine]
-    rows = [row for job in here for row in job.evaluations(folders.root)]
+    rows = [row for run in runs if run.machine == machine for row in run.evaluations]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
     write(folders.folder / "curves-wall-time.csv", CurvePoint, points)
     draw_curves(folders.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")

@@ -17,9 +17,11 @@ from udrl.atomic_files import write_atomically
 from udrl.config import Budget
 from udrl.errors import RunFailed, RunInUse, UdrlError
 from udrl_experiments import baselines
-from udrl_experiments.jobs import ERROR_PREFIX, Job, has_state, read_job
+from udrl_experiments.jobs import Job
+from udrl_experiments.processes import ERROR_PREFIX
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.runs import has_state, read_job
 from udrl_inspect.csv_tables import read, write
 from udrl_launch.process import die_with_parent, log_to_stderr, run_service
 from udrl_launch.settings import Fleet, Settings
@@ -87,15 +89,7 @@ def _run_job(job: Job, folder: Path, stop: threading.Event) -> None:
         rows = {row.env_steps: row for row in (*kept, *_evaluations(job, folder / "run", status))}
         write(table, EvaluationRecord, (rows[steps] for steps in sorted(rows)))
     else:
-        baselines.train_baseline(
-            baselines.Baseline(
-                algorithm=job.algorithm, config=job.config, hyperparameters=job.hyperparameters
-            ),
-            job.max_env_steps,
-            folder,
-            stop=stop,
-            exploration_steps=job.exploration_steps,
-        )
+        baselines.train_baseline(job, folder, stop)
     done = {"max_env_steps": job.max_env_steps, **provenance()}
     write_atomically(folder / "done.json", msgspec.json.format(msgspec.json.encode(done)) + b"\n")
 

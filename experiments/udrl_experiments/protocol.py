@@ -1,7 +1,7 @@
 """The protocol of all studies (section 3.2), at the paper's scale and at one for two cores."""
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -87,7 +87,7 @@ class StudyPlan(NamedTuple):
 
     Attributes:
         scale: sets the defaults of seeds and steps.
-        seeds: seeds of the runs; None: 1 to 20 at the paper's scale, 1 to 3 at the small scale.
+        seeds: seeds of the runs; None: the scale's.
         max_env_steps: length of each run; None: the scale's.
         assignments: ``NAME=VALUE``, changes to UDRL's presets.
     """
@@ -97,11 +97,11 @@ class StudyPlan(NamedTuple):
     max_env_steps: int | None = None
     assignments: tuple[str, ...] = ()
 
-    def seeds_of_runs(self) -> tuple[int, ...]:
-        """Return the seeds of the runs."""
+    def seeds_of_runs(self, paper: int = 20, small: int = 3) -> tuple[int, ...]:
+        """Return the seeds of the runs, by default from 1 to a number that depends on the scale."""
         if self.seeds is not None:
             return self.seeds
-        return tuple(range(1, 21 if self.scale == "paper" else 4))
+        return tuple(range(1, 1 + (paper if self.scale == "paper" else small)))
 
     def steps(self, task: Task, algorithm: Algorithm = "UDRL") -> int:
         """Return the length of a run in env steps."""
@@ -111,14 +111,23 @@ class StudyPlan(NamedTuple):
             return PAPER_STEPS
         return task.small_steps if algorithm == "UDRL" else task.small_baseline_steps
 
-    def config(self, task: Task, seed: int, *, paper: bool = False, **changes: Any) -> Config:
+    def config(
+        self,
+        task: Task,
+        seed: int,
+        *,
+        paper: bool = False,
+        defaults: Mapping[str, Any] = {},
+        **changes: Any,
+    ) -> Config:
         """Return the settings of a UDRL run: the preset, with changes and the plan's assignments.
 
         Args:
             task: the task, which determines environment and preset.
             seed: seed of the run.
             paper: use the preset that has only what is in the paper.
-            changes: changes to the preset that the study makes.
+            defaults: settings in place of the preset's, which assignments may change.
+            changes: settings of the study, which assignments must not change.
 
         Raises:
             ConfigError: a setting is unknown or invalid.
@@ -127,20 +136,7 @@ class StudyPlan(NamedTuple):
         given = self.assigned(own)
         values = preset(f"{task.environment}-paper" if paper else task.environment)
         del values["max_env_steps"]
-        return build(Config, values | {"eval_every": EVAL_EVERY} | given | own)
-
-    def baseline(self, task: Task, seed: int, **changes: Any) -> Config:
-        """Return the settings of a run of another algorithm, those that it shares with UDRL.
-
-        Args:
-            task: the task, which determines environment and networks.
-            seed: seed of the run.
-            changes: changes to the preset that the study makes.
-
-        Raises:
-            ConfigError: a setting is unknown or invalid.
-        """
-        return shared(self.config(task, seed, **changes))
+        return build(Config, values | {"eval_every": EVAL_EVERY, **defaults} | given | own)
 
     def assigned(self, own: Collection[str]) -> dict[str, Any]:
         """Return the plan's assignments as a dictionary.

@@ -11,8 +11,9 @@ from typing import Any
 import msgspec
 
 from udrl.errors import ConfigError, Interrupted, RunFailed, UdrlError, Unreachable
-from udrl_experiments import jobs
-from udrl_experiments.jobs import INTERRUPTED, Job
+from udrl_experiments.jobs import Job
+from udrl_experiments.processes import INTERRUPTED, run_jobs
+from udrl_experiments.runs import unfinished
 
 #: Cores that Ray reserves for a run.
 _CORES = 2
@@ -35,11 +36,11 @@ def run_jobs_on_ray(
     stop: threading.Event,
     echo: Callable[[str], None],
 ) -> None:
-    """Run all jobs that are not done, like :func:`udrl_experiments.jobs.run_jobs`, on Ray Tune.
+    """Run all jobs that are not finished on Ray Tune.
 
-    With ``RAY_ADDRESS`` set, the runs go to that cluster, and ``root`` must be a folder that all
-    its machines share. Finished runs are recognised by their files; nothing that Ray writes is
-    read.
+    Otherwise it is like :func:`udrl_experiments.processes.run_jobs`. With ``RAY_ADDRESS`` set, the
+    runs go to that cluster, and ``root`` must be a folder that all its machines share. Finished
+    runs are recognised by their files; nothing that Ray writes is read.
 
     A failed run does not end the search, because some hyperparameters may be unusable.
 
@@ -49,7 +50,7 @@ def run_jobs_on_ray(
         RunFailed: every run failed.
         Interrupted: ``stop`` was set.
     """
-    waiting = {job.name: job for job in jobs.merge_jobs(planned) if not job.done(root)}
+    waiting = {job.name: job for job in unfinished(planned, root)}
     if not waiting:
         return
     tune = _import_tune()
@@ -61,13 +62,13 @@ def run_jobs_on_ray(
 
     watch = _watch(tune, stop, lambda name: echo(waiting[name].described), report_failure)
 
-    def run_trial(config: dict[str, str]) -> dict[str, int | str]:
+    def run_trial(config: dict[str, str]) -> dict[str, str]:
         job = msgspec.json.decode(config["job"], type=Job)
         try:
-            jobs.run_jobs([job], root, 1, threading.Event(), lambda text: None)
-            return {"evaluations": len(job.evaluations(root))}
+            run_jobs([job], root, 1, threading.Event(), lambda text: None)
         except (UdrlError, OSError) as error:  # Ray would print the traceback
             return {"failure": str(error)}
+        return {"failure": ""}
 
     echo(f"{len(waiting)} runs on Ray Tune, {side_by_side} at a time")
     with _ray(side_by_side):

@@ -1,70 +1,30 @@
 """Random search over the paper's spaces or over one of your own (Appendix B)."""
 
-import json
-import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from itertools import groupby
-from operator import itemgetter
+from itertools import chain
 from pathlib import Path
-from statistics import fmean
 from typing import NamedTuple
-
-import msgspec
 
 from udrl.acting import EpisodeGenerator
 from udrl.actions import Categorical
-from udrl.atomic_files import write_atomically
 from udrl.automatic_settings import resolve_automatic
-from udrl.config import AUTOMATIC, Config, build, change, flat
+from udrl.config import AUTOMATIC, Config, build, change
 from udrl.errors import ConfigError
 from udrl.spaces import Image, Vector
-from udrl_experiments.comparison import baseline
-from udrl_experiments.jobs import Job
-from udrl_experiments.protocol import (
-    EVAL_EVERY,
-    PAPER_STEPS,
-    Algorithm,
-    StudyPlan,
-    Task,
-    shared,
-)
+from udrl_experiments.contest import Configuration, Contest, Scored, file_name
+from udrl_experiments.jobs import Job, make_job
+from udrl_experiments.protocol import EVAL_EVERY, PAPER_STEPS, Algorithm, StudyPlan, Task, shared
 from udrl_experiments.ray_tune import run_jobs_on_ray
 from udrl_experiments.search_space import SearchSpace, read_space, shipped_space
-from udrl_experiments.statistics import score
 from udrl_experiments.study import Study, StudyFolders
-from udrl_experiments.tuned import complete
 from udrl_inspect.csv_tables import write
 from udrl_launch.settings import gather
-from udrl_replay.creation import as_toml
 
 #: Configurations per algorithm and env steps per run at the small scale.
 SMALL_CONFIGURATIONS = 8
 SMALL_SEARCH_STEPS = 500_000
-
-
-class Scored(msgspec.Struct, frozen=True, kw_only=True):
-    """The score of a configuration.
-
-    Attributes:
-        environment: Gymnasium's id.
-        algorithm: the algorithm.
-        configuration: number of the configuration, which determines its settings.
-        seeds: number of runs.
-        score: mean of the last 20 evaluations (Appendix B), mean over the runs; none if a run
-            failed.
-        settings: drawn settings, as JSON.
-        final_score: the same of the longer runs in the final; none for other configurations.
-    """
-
-    environment: str
-    algorithm: str
-    configuration: int
-    seeds: int
-    score: float | None
-    settings: str
-    final_score: float | None = None
 
 
 class Final(NamedTuple):
@@ -77,20 +37,6 @@ class Final(NamedTuple):
 
     configurations: int
     max_env_steps: int
-
-
-class Subject(NamedTuple):
-    """An environment of a search.
-
-    Attributes:
-        space: the search space.
-        algorithms: algorithms whose configurations are drawn.
-        config: settings of a UDRL run, before a seed and drawn settings are set.
-    """
-
-    space: SearchSpace
-    algorithms: tuple[Algorithm, ...]
-    config: Config
 
 
 def search_tasks(
@@ -112,14 +58,14 @@ def search_tasks(
     Raises:
         ConfigError: an algorithm is not in the space, or a setting is unknown or invalid.
     """
-    subjects = []
-    for task in tasks:
+    contests: list[Contest] = []
+    for task in dict.fromkeys(tasks):
         space = shipped_space(task.environment)
         chosen = _chosen(space, algorithms)
         plan.assigned(_drawn_settings(space, chosen))
         config = plan.config(task, 1, paper=True, eval_seeds="search")
-        subjects.append(Subject(space, chosen, config))
-    return _study("search", plan, subjects, configurations, final)
+        contests += _contests(plan, space, config, chosen, configurations, final)
+    return _study("search", contests, final)
 
 
 def search_environment(
@@ -172,8 +118,8 @@ def search_environment(
             f"{environment} with {', '.join(others)}: expected discrete actions and one vector or "
             f"image as observation; search with --algorithm UDRL"
         )
-    subject = Subject(space, chosen, config)
-    return _study(f"search-{_file_name(environment)}", plan, [subject], configurations, final)
+    contests = _contests(plan, space, config, chosen, configurations, final)
+    return _study(f"search-{file_name(environment)}", contests, final)
 
 
 def _chosen(space: SearchSpace, algorithms: Sequence[Algorithm]) -> tuple[Algorithm, ...]:
@@ -193,40 +139,46 @@ def _drawn_settings(space: SearchSpace, algorithms: Sequence[Algorithm]) -> set[
     return {"environment", "seed", "eval_seeds", *space.networks, *drawn}
 
 
-def _study(
-    name: str,
+def _contests(
     plan: StudyPlan,
-    subjects: Sequence[Subject],
+    space: SearchSpace,
+    config: Config,
+    algorithms: Sequence[Algorithm],
     configurations: int | None,
     final: Final | None,
-) -> Study:
-    """Return the study of a search; for the arguments see :func:`search_tasks`."""
-    by_environment = {subject.space.environment: subject for subject in subjects}
-
-    def runs_of(environment: str, algorithm: Algorithm, number: int, steps: StudyPlan) -> list[Job]:
-        subject = by_environment[environment]
-        seeds = _seeds(plan, subject.space)
-        return [_job(steps, subject, algorithm, number, seed) for seed in seeds]
-
-    jobs = {
-        (environment, algorithm, number): runs_of(environment, algorithm, number, plan)
-        for environment, subject in by_environment.items()
-        for algorithm in subject.algorithms
-        for number in range(_configurations(plan, subject.space, configurations))
-    }
-
-    longest = max((run.max_env_steps for runs in jobs.values() for run in runs), default=0)
-    if final is not None and final.max_env_steps <= longest:
+) -> list[Contest]:
+    """Return a contest for each algorithm; for the arguments see :func:`search_tasks`."""
+    paper = plan.scale == "paper"
+    steps = plan.max_env_steps or (PAPER_STEPS if paper else SMALL_SEARCH_STEPS)
+    if final is not None and final.max_env_steps <= steps:
         raise ConfigError(
-            f"--final-env-steps {final.max_env_steps}: expected more than the {longest:,} of each "
+            f"--final-env-steps {final.max_env_steps}: expected more than the {steps:,} of each "
             f"configuration before; raise it, or lower --max-env-steps"
         )
+    n = configurations or (space.configurations if paper else None) or SMALL_CONFIGURATIONS
 
-    def in_final(environment: str, algorithm: Algorithm, number: int) -> list[Job]:
-        if final is None:
-            return []
-        longer = plan._replace(max_env_steps=final.max_env_steps)
-        return runs_of(environment, algorithm, number, longer)
+    def runs(algorithm: Algorithm, number: int, max_env_steps: int) -> list[Job]:
+        return [
+            _job(space, config, algorithm, number, seed, max_env_steps)
+            for seed in plan.seeds_of_runs(space.seeds, 1)
+        ]
+
+    return [
+        Contest(config, algorithm, [
+            Configuration(
+                number,
+                space.draw(algorithm, number),
+                runs(algorithm, number, steps),
+                [] if final is None else runs(algorithm, number, final.max_env_steps),
+            )
+            for number in range(n)
+        ])
+        for algorithm in algorithms
+    ]  # fmt: skip
+
+
+def _study(name: str, contests: Sequence[Contest], final: Final | None) -> Study:
+    """Return the study of a search."""
 
     def run_all(
         planned: Sequence[Job],
@@ -236,119 +188,44 @@ def _study(
         echo: Callable[[str], None],
     ) -> None:
         run_jobs_on_ray(planned, root, side_by_side, stop, echo)
-        if final is not None and (best := _finalists(jobs, final.configurations, root)):
-            longer = [run for key in best for run in in_final(*key)]
+        if final is not None:
+            best = [one for contest in contests for one in contest.best(final.configurations, root)]
+            longer = [run for one in best for run in one.longer_runs]
             run_jobs_on_ray(longer, root, side_by_side, stop, echo)
 
     def report(folders: StudyFolders) -> str:
         # A finalist's score also counts evaluations of its longer run, so the finalists may differ
         # from those that were run. What was run is reported.
-        rows = [
-            Scored(
-                environment=environment,
-                algorithm=algorithm,
-                configuration=number,
-                seeds=len(runs),
-                score=_score(runs, folders.root),
-                settings=json.dumps(by_environment[environment].space.draw(algorithm, number)),
-                final_score=_score(in_final(environment, algorithm, number), folders.root),
-            )
-            for (environment, algorithm, number), runs in jobs.items()
-        ]
-        write(folders.folder / "scores.csv", Scored, rows)
+        rows = [contest.scores(folders.root) for contest in contests]
+        write(folders.folder / "scores.csv", Scored, chain.from_iterable(rows))
         return "\n".join(
-            _write_preset(folders.folder, rows, subject, algorithm)
-            for subject in subjects
-            for algorithm in subject.algorithms
+            contest.write_preset(folders.folder, scores)
+            for contest, scores in zip(contests, rows, strict=True)
         )
 
-    planned = [run for runs in jobs.values() for run in runs]
-    possible = [run for key in jobs for run in in_final(*key)]
+    drawn = [one for contest in contests for one in contest.configurations]
+    planned = [run for one in drawn for run in one.runs]
+    possible = [run for one in drawn for run in one.longer_runs]
     return Study(name, planned, report, run_all, needs=("ray",), possible=possible)
 
 
-def _finalists(
-    jobs: Mapping[tuple[str, Algorithm, int], Sequence[Job]], most: int, root: Path
-) -> list[tuple[str, Algorithm, int]]:
-    """Return the configurations with the best scores, ``most`` of each environment and algorithm.
-
-    Args:
-        jobs: runs of each configuration, ordered by environment and algorithm.
-        most: number of configurations.
-        root: folder of the runs.
-    """
-    found: list[tuple[str, Algorithm, int]] = []
-    for _, keys in groupby(jobs, key=itemgetter(0, 1)):
-        scores = {key: value for key in keys if (value := _score(jobs[key], root)) is not None}
-        found += sorted(scores, key=lambda key: -scores[key])[:most]
-    return found
-
-
-def _seeds(plan: StudyPlan, space: SearchSpace) -> tuple[int, ...]:
-    if plan.seeds is not None:
-        return plan.seeds
-    return tuple(range(1, 1 + (space.seeds if plan.scale == "paper" else 1)))
-
-
-def _configurations(plan: StudyPlan, space: SearchSpace, given: int | None) -> int:
-    if given is not None:
-        return given
-    return (space.configurations if plan.scale == "paper" else None) or SMALL_CONFIGURATIONS
-
-
-def _job(plan: StudyPlan, subject: Subject, algorithm: Algorithm, number: int, seed: int) -> Job:
+def _job(
+    space: SearchSpace,
+    config: Config,
+    algorithm: Algorithm,
+    number: int,
+    seed: int,
+    max_env_steps: int,
+) -> Job:
     """Return the run of a configuration with one seed."""
-    steps = plan.max_env_steps or (PAPER_STEPS if plan.scale == "paper" else SMALL_SEARCH_STEPS)
-    space, variant = subject.space, f"configuration {number}"
     drawn = space.draw(algorithm, number)
     networks = {name: drawn.pop(name) for name in space.networks}
     with space.errors_of("networks"):
-        config = change(subject.config, seed=seed, **networks)
+        config = change(config, seed=seed, **networks)
     with space.errors_of(algorithm):
         if algorithm == "UDRL":
-            settings = flat(change(config, **drawn))
-            return Job(algorithm=algorithm, settings=settings, max_env_steps=steps, variant=variant)
-        complete(algorithm, drawn)
-    return baseline(algorithm, shared(config), drawn, steps, variant)
-
-
-def _score(runs: Sequence[Job], root: Path) -> float | None:
-    """Return the mean score of a configuration's runs; None if there are none, or one failed."""
-    if not runs or not all(run.done(root) for run in runs):
-        return None
-    return fmean(score([row.mean for row in run.evaluations(root)]) for run in runs)
-
-
-def _write_preset(
-    folder: Path, rows: Sequence[Scored], subject: Subject, algorithm: Algorithm
-) -> str:
-    """Write the best configuration to a TOML file, and return its text.
-
-    UDRL's can be passed to ``udrl train --config``. It has all settings but the seeds, because the
-    environment's preset may differ from the one of the search.
-    """
-    environment = subject.space.environment
-    kind = (environment, algorithm)
-    of_kind = [row for row in rows if (row.environment, row.algorithm) == kind]
-    scored = [(row.final_score, row) for row in of_kind if row.final_score is not None] or [
-        (row.score, row) for row in of_kind if row.score is not None
-    ]
-    if not scored:
-        return f"# {algorithm}, {environment}: every configuration has a failed run"
-    value, best = max(scored, key=lambda pair: pair[0])
-    drawn = json.loads(best.settings)
-    if algorithm == "UDRL":
-        settings = flat(change(subject.config, **drawn))
-        values = {name: v for name, v in settings.items() if name not in ("seed", "eval_seeds")}
-    else:
-        values = {"environment": environment, **drawn}
-    text = f"# Configuration {best.configuration}: score {value:.1f}, seeds: {best.seeds}.\n"
-    text += "".join(f"{name} = {as_toml(value)}\n" for name, value in values.items())
-    path = folder / f"{algorithm.lower()}-{_file_name(environment)}.toml"
-    write_atomically(path, text.encode())
-    return f"# {path}\n{text}"
-
-
-def _file_name(environment: str) -> str:
-    """Return an environment's id as part of a file name."""
-    return re.sub(r"[^\w.-]+", "-", environment)
+            config, drawn = change(config, **drawn), {}
+        return make_job(
+            algorithm, config, max_env_steps,
+            hyperparameters=drawn, variant=f"configuration {number}",
+        )  # fmt: skip

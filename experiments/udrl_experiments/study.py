@@ -12,9 +12,11 @@ from udrl.atomic_files import write_atomically
 from udrl.errors import ConfigError, InvalidData
 from udrl.file_remedies import file_remedy
 from udrl.strategies import make_strategy
-from udrl_experiments.jobs import Job, copy_finished, require_runs, run_jobs
+from udrl_experiments.jobs import Job
+from udrl_experiments.processes import run_jobs
 from udrl_experiments.protocol import TASKS
 from udrl_experiments.provenance import provenance
+from udrl_experiments.runs import copy_finished, require_runs
 
 
 class StudyFolders(NamedTuple):
@@ -36,7 +38,7 @@ class Study(NamedTuple):
         name: name of the study's folder and command.
         jobs: the runs that the study needs.
         report: writes tables and figures of the finished runs; returns a summary as text.
-        run_jobs: runs the jobs; see :func:`udrl_experiments.jobs.run_jobs`.
+        run_jobs: runs the jobs; see :func:`udrl_experiments.processes.run_jobs`.
         needs: modules that the study needs, in addition to those of its runs.
         shares_runs: whether the study uses runs of other studies.
         possible: longer runs that the study may choose later. They are copied if they are finished

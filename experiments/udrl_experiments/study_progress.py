@@ -8,6 +8,7 @@ from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
 from udrl_experiments.jobs import Job, merge_jobs
 from udrl_experiments.records import EvaluationRecord, agent_name
+from udrl_experiments.runs import finished_run, is_finished
 from udrl_experiments.study import read_study
 from udrl_inspect.csv_tables import read
 from udrl_inspect.inspection import read_status
@@ -42,8 +43,8 @@ def job_progress(job: Job, root: Path) -> JobProgress:
         root: folder of the folder ``runs``.
     """
     folder = job.folder(root)
-    if job.done(root):
-        last = job.evaluations(root)[-1]
+    if is_finished(job, root):
+        last = finished_run(job, root).evaluations[-1]
         steps = min(last.env_steps, job.max_env_steps)
         return JobProgress(job, "done", steps, last.wall_s, last.mean)
     try:

@@ -7,10 +7,9 @@ a study of other strategies for exploratory commands (section 6). ``lead`` is no
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from udrl.config import flat
 from udrl.strategies import STRATEGIES
 from udrl_experiments.comparison import report_curves, report_wall_time
-from udrl_experiments.jobs import Job
+from udrl_experiments.jobs import make_job
 from udrl_experiments.protocol import StudyPlan, Task
 from udrl_experiments.study import Study, StudyFolders
 
@@ -59,12 +58,7 @@ def _variants(
         plan = plan._replace(max_env_steps=SMALL_STEPS)
     jobs = {
         task: [
-            Job(
-                algorithm="UDRL",
-                settings=flat(plan.config(task, seed, **changes)),
-                max_env_steps=plan.steps(task),
-                variant=variant,
-            )
+            make_job("UDRL", plan.config(task, seed, **changes), plan.steps(task), variant=variant)
             for variant, changes in variants.items()
             for seed in plan.seeds_of_runs()
         ]

@@ -24,7 +24,8 @@ from udrl.errors import ConfigError, InvalidData
 from udrl.frame_stack import FrameStack
 from udrl.replay_buffer import Entry, ReplayBuffer
 from udrl_experiments import baselines, policies
-from udrl_experiments.baselines import Baseline, train_baseline
+from udrl_experiments.baselines import train_baseline
+from udrl_experiments.jobs import Job, make_job
 from udrl_experiments.protocol import TASKS, BaselineAlgorithm, Task
 from udrl_experiments.records import EvaluationRecord
 from udrl_experiments.search_space import shipped_space
@@ -82,22 +83,28 @@ def _environments() -> Iterator[None]:
     del gym.registry["Balance-v0"], gym.registry["Pictures-v0"]
 
 
-def baseline(algorithm: str, **changes: Any) -> Baseline:
+def baseline(
+    algorithm: BaselineAlgorithm,
+    max_env_steps: int = 600,
+    hyperparameters: dict[str, KeywordValue] | None = None,
+    **changes: Any,
+) -> Job:
     settings = {"environment": "Balance-v0", "hidden": [16, 8], "eval_every": 200} | changes
     config = build(Config, {"eval_episodes": 4} | settings)
-    return msgspec.convert(
-        {"algorithm": algorithm, "config": config, "hyperparameters": FAST[algorithm]}, Baseline
-    )
+    chosen = FAST[algorithm] if hyperparameters is None else hyperparameters
+    return make_job(algorithm, config, max_env_steps, hyperparameters=chosen)
 
 
-def pictures(algorithm: str) -> Baseline:
+def pictures(algorithm: BaselineAlgorithm, max_env_steps: int = 600) -> Job:
     return baseline(
-        algorithm, environment="Pictures-v0", frame_stack=7, convolutions=[4, 5], hidden=[16, 8]
+        algorithm, max_env_steps, environment="Pictures-v0", frame_stack=7, convolutions=[4, 5]
     )
 
 
-def made(of: Baseline) -> policies.Model:
-    return policies.make(of.algorithm, msgspec.structs.asdict(of.complete()), of.config)
+def made(job: Job) -> policies.Model:
+    assert job.algorithm != "UDRL"
+    chosen = complete(job.algorithm, job.hyperparameters)
+    return policies.make(job.algorithm, msgspec.structs.asdict(chosen), job.config)
 
 
 def held(folder: Path) -> dict[str, Tensor]:
@@ -129,12 +136,13 @@ def stop_after(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )  # fmt: skip
 def test_baseline_learns(
-    algorithm: str, hyperparameters: dict[str, KeywordValue], steps: int, tmp_path: Path
+    algorithm: BaselineAlgorithm,
+    hyperparameters: dict[str, KeywordValue],
+    steps: int,
+    tmp_path: Path,
 ) -> None:
-    plain = baseline(algorithm, hidden=[64, 64], eval_every=steps // 2, eval_episodes=20)
-    rows = train_baseline(
-        msgspec.structs.replace(plain, hyperparameters=hyperparameters), steps, tmp_path
-    )
+    changes: dict[str, Any] = {"hidden": [64, 64], "eval_every": steps // 2, "eval_episodes": 20}
+    rows = train_baseline(baseline(algorithm, steps, hyperparameters, **changes), tmp_path)
     assert [row.env_steps for row in rows] == [steps // 2, steps]
     assert rows[-1].mean > 60  # random actions: 22
     assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
@@ -144,8 +152,8 @@ def test_baseline_learns(
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_baseline_trains_on_images(algorithm: str, tmp_path: Path) -> None:
-    rows = train_baseline(pictures(algorithm), 450, tmp_path)
+def test_baseline_trains_on_images(algorithm: BaselineAlgorithm, tmp_path: Path) -> None:
+    rows = train_baseline(pictures(algorithm, 450), tmp_path)
     assert [row.env_steps for row in rows][:2] == [200, 400]
     assert 450 <= rows[-1].env_steps < 460
     assert all(row.mean == 20 for row in rows)
@@ -153,9 +161,9 @@ def test_baseline_trains_on_images(algorithm: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("make", [baseline, pictures])
-def test_networks_equal_the_behavior_functions(algorithm: str, make: Any) -> None:
+def test_networks_equal_the_behavior_functions(algorithm: BaselineAlgorithm, make: Any) -> None:
     """With an open gate, both are the same function of the same layers."""
-    wanted: Baseline = make(algorithm)
+    wanted: Job = make(algorithm)
     if algorithm != "DQN":
         wanted = msgspec.structs.replace(wanted, hyperparameters={"activation": "relu"})
     model, config = made(wanted), wanted.config
@@ -209,9 +217,9 @@ def test_training_inputs_are_the_most_recent_frames() -> None:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_reset_seeds_are_from_the_ranges(algorithm: str, tmp_path: Path) -> None:
+def test_reset_seeds_are_from_the_ranges(algorithm: BaselineAlgorithm, tmp_path: Path) -> None:
     config = baseline(algorithm).config
-    train_baseline(baseline(algorithm), 400, tmp_path)
+    train_baseline(baseline(algorithm, 400), tmp_path)
     in_training = [s for s in seeds if s is not None and 1_000_000 <= s < 10_000_000]
     in_evaluation = [s for s in seeds if s is not None and 1 <= s < 500_000]
     assert len(in_training) + len(in_evaluation) == len(seeds)
@@ -224,13 +232,13 @@ def test_reset_seeds_are_from_the_ranges(algorithm: str, tmp_path: Path) -> None
 
 
 def test_search_uses_its_own_reset_seeds(tmp_path: Path) -> None:
-    train_baseline(baseline("A2C", eval_seeds="search"), 200, tmp_path)
+    train_baseline(baseline("A2C", 200, eval_seeds="search"), tmp_path)
     assert sum(500_000 <= (s or 0) < 1_000_000 for s in seeds) == 4
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_evaluations_act_like_udrl(
-    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algorithm: BaselineAlgorithm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     temperatures: list[float] = []
 
@@ -242,14 +250,14 @@ def test_evaluations_act_like_udrl(
         return episodes
 
     monkeypatch.setattr(baselines, "generate_episodes", watched)
-    train_baseline(baseline(algorithm), 200, tmp_path)
+    train_baseline(baseline(algorithm, 200), tmp_path)
     assert temperatures == [float(algorithm != "DQN")] * 4
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_evaluations_do_not_change_training(algorithm: str, tmp_path: Path) -> None:
-    often = train_baseline(baseline(algorithm), 400, tmp_path / "often")
-    once = train_baseline(baseline(algorithm, eval_every=400), 400, tmp_path / "once")
+def test_evaluations_do_not_change_training(algorithm: BaselineAlgorithm, tmp_path: Path) -> None:
+    often = train_baseline(baseline(algorithm, 400), tmp_path / "often")
+    once = train_baseline(baseline(algorithm, 400, eval_every=400), tmp_path / "once")
     assert (len(often), len(once)) == (2, 1)
     tensors = held(tmp_path / "often")
     others = held(tmp_path / "once")
@@ -260,12 +268,12 @@ def test_evaluations_do_not_change_training(algorithm: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("make", [baseline, pictures])
 def test_resumed_run_equals_an_uninterrupted_one(
-    algorithm: str, make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algorithm: BaselineAlgorithm, make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         stop_after(2, patch)
         with pytest.raises(Stopped):
-            train_baseline(make(algorithm), 600, tmp_path)
+            train_baseline(make(algorithm), tmp_path)
     saved = held(tmp_path)
 
     restored: list[dict[str, Tensor]] = []
@@ -278,7 +286,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
 
     original = policies.restore
     monkeypatch.setattr(policies, "restore", restore)
-    rows = train_baseline(make(algorithm), 600, tmp_path)
+    rows = train_baseline(make(algorithm), tmp_path)
     assert [row.env_steps for row in rows] == [200, 400, 600]
     assert rows == read(tmp_path / "evaluations.csv", EvaluationRecord)
     assert 0 < rows[0].wall_s < rows[1].wall_s < rows[2].wall_s
@@ -292,10 +300,8 @@ def test_resumed_run_equals_an_uninterrupted_one(
 
 
 def test_full_replay_buffer_is_restored(tmp_path: Path) -> None:
-    small = msgspec.structs.replace(
-        baseline("DQN"), hyperparameters=FAST["DQN"] | {"buffer_size": 150, "n_steps": 3}
-    )
-    train_baseline(small, 200, tmp_path)
+    small = baseline("DQN", 200, FAST["DQN"] | {"buffer_size": 150, "n_steps": 3})
+    train_baseline(small, tmp_path)
     model, saved = made(small), held(tmp_path)
     policies.restore(model, saved, {"num_timesteps": 0, "_n_updates": 0, "_n_calls": 0,
                                     "_episode_num": 0, "pos": 50})  # fmt: skip
@@ -323,8 +329,8 @@ def test_run_resumes_after_a_kill_while_saving(
 
     monkeypatch.setattr(safetensors.torch, "save_file", save)
     with pytest.raises(Stopped):
-        train_baseline(baseline("DQN"), 600, tmp_path)
-    rows = train_baseline(baseline("DQN"), 600, tmp_path)
+        train_baseline(baseline("DQN"), tmp_path)
+    rows = train_baseline(baseline("DQN"), tmp_path)
     assert [row.env_steps for row in rows] == [200, 400, 600]
 
 
@@ -342,17 +348,16 @@ def test_extended_run_keeps_its_exploration_schedule(
         assert model.exploration_rate == pytest.approx(rate)
 
     monkeypatch.setattr(policies, "set_exploration", set_exploration)
-    train_baseline(baseline("DQN"), 100, tmp_path / "fraction")
-    train_baseline(baseline("DQN"), 100, tmp_path / "said", exploration_steps=250)
-    rows = train_baseline(baseline("DQN"), 400, tmp_path / "said", exploration_steps=999)
-    assert explored == [10, 250, 250]
+    train_baseline(baseline("DQN", 100), tmp_path)
+    rows = train_baseline(baseline("DQN", 400), tmp_path)
+    assert explored == [10, 10]
     assert [row.env_steps for row in rows] == [100, 200, 400]
-    assert train_baseline(baseline("DQN"), 300, tmp_path / "said") == rows
+    assert train_baseline(baseline("DQN", 300), tmp_path) == rows
 
 
 @pytest.mark.parametrize("damage", ["shorter", "other tensors", "no state"])
 def test_damaged_state_is_rejected(damage: str, tmp_path: Path) -> None:
-    train_baseline(baseline("DQN"), 200, tmp_path)
+    train_baseline(baseline("DQN", 200), tmp_path)
     path = tmp_path / "state.safetensors"
     if damage == "shorter":
         path.write_bytes(path.read_bytes()[:-1])
@@ -361,22 +366,7 @@ def test_damaged_state_is_rejected(damage: str, tmp_path: Path) -> None:
             metadata = file.metadata() if damage == "other tensors" else None
         safetensors.torch.save_file({"odd": torch.zeros(1)}, path, metadata)
     with pytest.raises(InvalidData, match=rf"{path}.*delete the folder {tmp_path}"):
-        train_baseline(baseline("DQN"), 400, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("hyperparameters", "message"),
-    [
-        ({"rms_prop_decay": 0.9}, "unknown hyperparameter 'rms_prop_decay' of DQN.*batch_size"),
-        ({"gamma": 1.5}, "gamma = 1.5"),
-        ({"activation": "step"}, "activation = 'step'"),
-    ],
-)
-def test_invalid_hyperparameters_are_rejected(
-    hyperparameters: dict[str, KeywordValue], message: str
-) -> None:
-    with pytest.raises(ConfigError, match=message):
-        msgspec.structs.replace(baseline("DQN"), hyperparameters=hyperparameters)
+        train_baseline(baseline("DQN", 400), tmp_path)
 
 
 def test_missing_stable_baselines3_is_reported(
@@ -384,7 +374,7 @@ def test_missing_stable_baselines3_is_reported(
 ) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(ConfigError, match=r'pip install "udrl\[studies\]"'):
-        train_baseline(baseline("DQN"), 100, tmp_path / "run")
+        train_baseline(baseline("DQN", 100), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from tests.experiments.finished_runs import finish
 from udrl.config import flat, preset
 from udrl_experiments import study_command
-from udrl_experiments.comparison import baseline, comparison, job
+from udrl_experiments.comparison import comparison, job
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import DEFAULT_PARTICIPANTS, TASKS, StudyPlan, Task
 from udrl_experiments.provenance import Machine
@@ -32,14 +32,6 @@ def test_papers_preset_is_a_participant_with_the_papers_settings(
     del shipped["max_env_steps"]
     assert settings.items() >= shipped.items()
     assert participant.name != job(task, PLAN, "UDRL", 1).name
-
-
-def test_dqn_explores_for_a_share_of_the_run_by_default_too() -> None:
-    config = PLAN.baseline(TASKS["lander"], 1)
-    short, long = (baseline("DQN", config, {"gamma": 0.98}, n) for n in (100_000, 1_000_000))
-    assert (short.exploration_steps, long.exploration_steps) == (10_000, 100_000)
-    assert short.name != long.name
-    assert baseline("A2C", config, {}, 100_000).exploration_steps == 0
 
 
 def test_tuned_networks_are_used_unless_others_are_given() -> None:

@@ -61,14 +61,11 @@ def test_settings_of_the_protocol_cannot_be_changed(name: str) -> None:
         StudyPlan(assignments=(f"{name}=1",)).config(TASKS["lander"], 1, lead=2)
 
 
-def test_baselines_do_not_depend_on_udrls_settings() -> None:
-    usual = StudyPlan().baseline(TASKS["lander"], 3)
-    other = StudyPlan(
-        assignments=("last_few=7", "lead=3", "command_strategy=record", "batch_size=9")
-    )
-    assert other.baseline(TASKS["lander"], 3) == usual
-    shared = StudyPlan(assignments=("hidden=[8]",)).baseline(TASKS["lander"], 3)
-    assert (shared.network.hidden, shared.seed, shared.environment) == ((8,), 3, "LunarLander-v3")
+def test_assignments_change_defaults_of_the_study() -> None:
+    hidden = {"hidden": [8]}
+    assert StudyPlan().config(TASKS["lander"], 1, defaults=hidden).network.hidden == (8,)
+    plan = StudyPlan(assignments=("hidden=[9]",))
+    assert plan.config(TASKS["lander"], 1, defaults=hidden).network.hidden == (9,)
 
 
 def test_step_counts_may_have_suffixes() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from udrl.config import Config, build, flat
 from udrl.errors import Interrupted, RunFailed
-from udrl_experiments import jobs
+from udrl_experiments import processes, ray_tune
 from udrl_experiments.jobs import Job
 from udrl_experiments.ray_tune import run_jobs_on_ray
 
@@ -67,7 +67,7 @@ def test_each_failed_run_is_one_line_with_its_cause(
 ) -> None:
     for name in ("RAY_AIR_NEW_OUTPUT", "TUNE_PRINT_ALL_TRIAL_ERRORS"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(jobs, "_PROGRAM", ("-c", "raise ValueError('no luck')"))
+    monkeypatch.setattr(processes, "_PROGRAM", ("-c", "raise ValueError('no luck')"))
     lines: list[str] = []
     with pytest.raises(
         RunFailed, match=r"no run succeeded; the first failed: .*exit code 1: ValueError: no luck"
@@ -87,7 +87,7 @@ def test_error_of_ray_is_its_first_line(tmp_path: Path, monkeypatch: pytest.Monk
     def die(*arguments: Any) -> None:
         raise RuntimeError("The actor died unexpectedly.\n\tclass_name: ImplicitFunc")
 
-    monkeypatch.setattr(jobs, "run_jobs", die)
+    monkeypatch.setattr(ray_tune, "run_jobs", die)
     lines: list[str] = []
     with pytest.raises(RunFailed, match=r"the first failed: The actor died unexpectedly\.$"):
         run_jobs_on_ray(JOBS[:1], tmp_path, 1, threading.Event(), lines.append)
@@ -101,8 +101,7 @@ def test_some_failed_runs_do_not_fail_the_search(
         if planned[0].max_env_steps == 1000:
             raise RunFailed("no luck")
 
-    monkeypatch.setattr(jobs, "run_jobs", fail_once)
-    monkeypatch.setattr(Job, "evaluations", lambda job, root: [])
+    monkeypatch.setattr(ray_tune, "run_jobs", fail_once)
     lines: list[str] = []
     run_jobs_on_ray(JOBS, tmp_path, 1, threading.Event(), lines.append)
     assert [line for line in lines if line.startswith("failed")] == [

@@ -15,10 +15,11 @@ from udrl.config import change, read_toml
 from udrl.errors import ConfigError, UnsupportedEnvironment
 from udrl_experiments import search as search_module
 from udrl_experiments import study_command
+from udrl_experiments.contest import Scored
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import TASKS, StudyPlan
 from udrl_experiments.records import EvaluationRecord
-from udrl_experiments.search import Final, Scored, search_environment, search_tasks
+from udrl_experiments.search import Final, search_environment, search_tasks
 from udrl_experiments.search_space import read_space, shipped_space
 from udrl_experiments.study import StudyFolders
 from udrl_inspect.csv_tables import read, write

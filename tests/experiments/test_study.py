@@ -15,6 +15,7 @@ from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
 from udrl_experiments.provenance import provenance
 from udrl_experiments.records import EvaluationRecord
+from udrl_experiments.runs import finished_run, is_finished
 from udrl_experiments.study import Study, StudyFolders, run_study
 from udrl_inspect.csv_tables import write
 
@@ -161,7 +162,7 @@ def test_runs_are_taken_from_other_folders(
     (folder / "done.json").write_text('{"max_env_steps": 100}')
 
     def report(place: StudyFolders) -> str:
-        return str(job(1).evaluations(place.root)[0].mean)
+        return str(finished_run(job(1), place.root).evaluations[0].mean)
 
     study = Study("try", [job(1)], report, lambda *_: None, shares_runs=shares_runs)
     output = run_study(
@@ -190,8 +191,8 @@ def test_longer_runs_are_taken_from_other_folders_if_finished(tmp_path: Path) ->
         study, here, side_by_side=1, resume=False, stop=threading.Event(),
         echo=lambda text: None, runs_from=[tmp_path / "other"],
     )  # fmt: skip
-    assert [one.done(here) for one in possible] == [True, False]
-    assert [job(seed).done(here) for seed in (1, 2)] == [True, True]
+    assert [is_finished(one, here) for one in possible] == [True, False]
+    assert [is_finished(job(seed), here) for seed in (1, 2)] == [True, True]
 
 
 def test_source_without_runs_creates_no_study(world: World, tmp_path: Path) -> None:
