@@ -11,15 +11,11 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mlflow
 import msgspec
 import pytest
-import wandb
-from mlflow.entities import Run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
 
 import udrl
 from udrl.errors import ConfigError
@@ -29,6 +25,11 @@ from udrl_show.run_log import Logged, RunLog
 from udrl_show.run_logs import WRITERS, opened
 from udrl_show.scalars import Scalar
 from whole_run import TOY, Cli, arguments, wait_for
+
+# Tests import mlflow and wandb themselves: together they take two seconds, in every process that
+# collects tests.
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 #: (env steps, value) by tag.
 Series = dict[str, list[tuple[int, float]]]
@@ -40,7 +41,8 @@ def _local_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
     yield
-    wandb.teardown()
+    if (wandb := sys.modules.get("wandb")) is not None:
+        wandb.teardown()
 
 
 @pytest.fixture
@@ -82,6 +84,8 @@ def assert_same(found: Series, expected: Series) -> None:
 
 def records(folder: Path) -> Iterator[Any]:
     """Yield the records of an offline run; its file is LevelDB's log after seven bytes."""
+    from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
+
     (path,) = folder.glob("*.wandb")
     data, at, parts = path.read_bytes(), 7, b""
     while at + 7 <= len(data):
@@ -169,7 +173,7 @@ def test_resumed_run_continues_at_weights_and_biases(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     served = ServedRun()
-    monkeypatch.setattr(wandb, "init", served.init)
+    monkeypatch.setattr("wandb.init", served.init)
     text = truncate_metrics(run_dir, 0.5)
     assert log(run_dir, "wandb", stopped=True) == [served.url]
     half = len(served.rows)
@@ -190,8 +194,10 @@ def test_resumed_run_continues_at_weights_and_biases(
     }
 
 
-def mlflow_run(place: str) -> tuple[Run, Series]:
+def mlflow_run(place: str) -> tuple["Run", Series]:
     """Return the only run of the experiment, and its metrics."""
+    import mlflow
+
     client = mlflow.MlflowClient()
     experiment = client.get_experiment_by_name("udrl")
     assert experiment is not None
