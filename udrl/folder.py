@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from udrl.atomic_files import write_atomically
 from udrl.config import Configured, FlatSettings, flat
 from udrl.environments.specification import EnvironmentSpec
 from udrl.errors import ConfigError, InvalidData, InvalidWeights, UdrlError
@@ -80,14 +81,14 @@ def save_folder(folder: Path, policy: Policy, card: str) -> None:
     described = msgspec.json.format(msgspec.json.encode(description), indent=2)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / _WEIGHTS).write_bytes(encode_weights(policy.behavior.weights))
-        (folder / _DESCRIPTION).write_bytes(described + b"\n")
-        (folder / _CARD).write_text(card, encoding="utf-8")
+        write_atomically(folder / _WEIGHTS, encode_weights(policy.behavior.weights))
+        write_atomically(folder / _DESCRIPTION, described + b"\n")
+        write_atomically(folder / _CARD, card.encode())
         if policy.config.network.behavior is not None:
-            (folder / _GRAPH).write_bytes(policy.behavior.graph)
+            write_atomically(folder / _GRAPH, policy.behavior.graph)
     except OSError as error:
         what_to_do = file_remedy(error, "choose a writable folder")
-        raise ConfigError(f"{error.filename or folder}: {error.strerror}; {what_to_do}") from error
+        raise ConfigError(f"{folder}: {error.strerror}; {what_to_do}") from error
 
 
 def load_folder(folder: str | Path) -> Policy:

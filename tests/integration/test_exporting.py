@@ -1,5 +1,6 @@
 """``udrl export`` and its output."""
 
+import errno
 import os
 import re
 import subprocess
@@ -14,9 +15,11 @@ from click.testing import CliRunner
 from huggingface_hub import ModelCard
 
 import udrl
+from udrl.config import change
 from udrl.errors import ConfigError, UdrlError
 from udrl.evaluation import return_text
 from udrl_inspect.agents import load_agent
+from udrl_inspect.exporting import export_folder
 from udrl_inspect.inspection import read_status
 from udrl_launch.cli import cli as command_line
 from udrl_replay.store import Store
@@ -93,6 +96,42 @@ def test_earlier_weights_have_their_own_evaluation(ended_run: Path, tmp_path: Pa
     # The command does not end with these weights, and the card must not claim so.
     assert f"version {version} of this command's run has bit-identical weights" in card
     assert "this command trains bit-identical weights" not in card
+
+
+def test_card_states_the_temperature_of_its_results_and_uses_it(
+    ended_run: Path, folder: Path, tmp_path: Path
+) -> None:
+    sampled = (folder / "README.md").read_text()
+    assert "steps at temperature 1, after" in sampled
+    assert "policy.predict(observation, desired_return, desired_horizon)\n" in sampled
+    agent = load_agent(ended_run)
+    greedy = agent._replace(config=change(agent.config, eval_temperature=0.0))
+    export_folder(greedy, ended_run, tmp_path / "greedy")
+    card = (tmp_path / "greedy" / "README.md").read_text()
+    assert "steps at temperature 0, after" in card
+    assert "policy.predict(observation, desired_return, desired_horizon, temperature=0.0)" in card
+
+
+@pytest.mark.parametrize("option", ["--onnx", "--folder"])
+def test_full_disk_leaves_an_earlier_export_unchanged(
+    option: str, ended_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "agent.onnx" if option == "--onnx" else tmp_path / "agent"
+    export(ended_run, option, place)
+    files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+    before = [path.read_bytes() for path in files]
+    write = Path.write_bytes
+
+    def fills_the_disk(path: Path, content: bytes) -> None:
+        write(path, content[:10])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", fills_the_disk)
+    with pytest.raises(ConfigError, match="No space left"):
+        export(ended_run, option, place)
+    monkeypatch.undo()
+    assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == files
+    assert [path.read_bytes() for path in files] == before
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -6,6 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from udrl import folder as folders
+from udrl.atomic_files import write_atomically
 from udrl.config import change
 from udrl.datasets import write_dataset
 from udrl.errors import ConfigError, StoreError
@@ -91,7 +92,7 @@ observation, _ = env.reset(seed=1)
 policy.reset()
 desired_return, desired_horizon, over = policy.desired_return, policy.desired_horizon, False
 while not over:
-    action = policy.predict(observation, desired_return, desired_horizon)
+    action = policy.predict(observation, desired_return, desired_horizon{sampling})
     observation, reward, terminated, truncated, _ = env.step(action)
     desired_return, desired_horizon = desired_return - float(reward), desired_horizon - 1
     over = terminated or truncated
@@ -154,7 +155,7 @@ def export_model(agent: Agent, path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(agent.behavior.model)
+        write_atomically(path, agent.behavior.model)
     except OSError as error:
         what_to_do = file_remedy(error, "choose a writable file")
         raise ConfigError(f"{path}: {error.strerror}; {what_to_do}") from error
@@ -213,6 +214,8 @@ def _card(
     again: str,
 ) -> str:
     environment = agent.config.environment
+    temperature = agent.config.evaluation.eval_temperature
+    sampling = "" if temperature == 1 else f", temperature={temperature}"  # 1 is the default
     results, index = "These weights were not evaluated.", ""
     if found is not None:
         mean, std, low, high, episodes = found.evaluation
@@ -221,7 +224,7 @@ def _card(
             f"**Mean return {return_text(mean)}** (95 % interval {return_text(low)} to "
             f"{return_text(high)}, standard deviation {return_text(std)}, {episodes} episodes with "
             f"unseen seeds) for a desired return of {return_text(found.desired_return)} within "
-            f"{found.desired_horizon} steps, after "
+            f"{found.desired_horizon} steps at temperature {temperature:g}, after "
             f"{found.env_steps:,} env steps of training."
         )
     return _CARD.format(
@@ -229,7 +232,7 @@ def _card(
         index=index,
         results=results,
         obedience="" if report is None else _OBEDIENCE.format(report=markdown(report)),
-        example=_EXAMPLE.format(address=address),
+        example=_EXAMPLE.format(address=address, sampling=sampling),
         needs="udrl[hub]" if address.startswith(HUB_SCHEME) else "udrl",
         command=shlex.join(
             ["udrl", "train", environment, "--preset", "none", "--config", "config.toml"]
