@@ -8,8 +8,10 @@ exports contain the last observation twice.
 import logging
 import re
 import warnings
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from shutil import rmtree
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -215,8 +217,11 @@ def write_dataset(
         )
     minari = _minari()
     from minari.data_collector import EpisodeBuffer
+    from minari.storage import get_dataset_path
 
     form = _form(config, spec)
+    for conversion in (form.observations, form.actions):
+        _check_keys(name, conversion.declared)
     buffers = [
         EpisodeBuffer(
             id=number,
@@ -231,7 +236,7 @@ def write_dataset(
         for number, e in enumerate(episodes)
     ]
     try:
-        with warnings.catch_warnings():
+        with _removed_on_failure(get_dataset_path(name)), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about missing metadata, e.g. the author
             minari.create_dataset_from_buffers(
                 name,
@@ -248,6 +253,36 @@ def write_dataset(
         raise ConfigError(
             f"dataset {name!r}: {error}; choose another name, or a new version"
         ) from error
+
+
+@contextmanager
+def _removed_on_failure(folder: Path) -> Iterator[None]:
+    """Remove a new folder if the block raises: an incomplete dataset would occupy the name."""
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _check_keys(name: str, space: spaces.Space[Any]) -> None:
+    """Raise :class:`ConfigError` for keys that HDF5 cannot store; it reads them as paths."""
+    inner: Iterable[spaces.Space[Any]] = ()
+    if isinstance(space, spaces.Dict):
+        keys: Iterable[Any] = space.spaces  # not always strings
+        for key in keys:
+            if not isinstance(key, str) or key in ("", ".") or "/" in key:
+                raise ConfigError(
+                    f"dataset {name!r}: its files cannot store the key {key!r} of {space}; "
+                    f"expected a string without /; rename it in the environment"
+                )
+        inner = space.spaces.values()
+    elif isinstance(space, spaces.Tuple):
+        inner = space.spaces
+    for one in inner:
+        _check_keys(name, one)
 
 
 def _lists(arrays: Any) -> Any:

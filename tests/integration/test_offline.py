@@ -1,5 +1,6 @@
 """Datasets: exported, read by Minari itself, and used to start a run."""
 
+import re
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -10,6 +11,7 @@ import minari
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from minari.dataset._storages.hdf5_storage import HDF5Storage
 from msgspec.structs import replace
 
 from udrl.acting import EpisodeGenerator, generate_episodes
@@ -22,7 +24,7 @@ from udrl.environments.making import make_environment
 from udrl.environments.specification import EnvironmentSpec, specify
 from udrl.episode import Episode
 from udrl.errors import ConfigError, OtherConfiguration
-from udrl.spaces import Image, Vector
+from udrl.spaces import Image, Leaf, Record, Vector
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_launch.cli import cli as command_line
 from udrl_launch.settings import Fleet, Settings
@@ -148,6 +150,30 @@ def test_dataset_of_another_environment_is_rejected(spec: EnvironmentSpec, messa
     write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
     with pytest.raises(ConfigError, match=message):
         read_dataset("some/ours-v0", small(), spec)
+
+
+@pytest.mark.parametrize("key", ["a/b", "", ".", 0])
+def test_key_that_files_of_datasets_cannot_store_is_rejected(key: Any, tmp_path: Path) -> None:
+    inner = (Leaf(("eyes", key), Vector(size=2)), Leaf(("eyes", "other"), Vector(size=2)))
+    spec = replace(VECTOR, observation_space=Record(inner))
+    with pytest.raises(ConfigError, match=rf"cannot store the key {re.escape(repr(key))} of"):
+        write_dataset("some/ours-v0", [], small(), spec)
+    assert not (tmp_path / "datasets").exists()
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_interrupted_export_leaves_the_name_free(
+    error: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(HDF5Storage, "update_episodes", fails)
+        with pytest.raises((ConfigError, KeyboardInterrupt)):
+            write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
+    write_dataset("some/ours-v0", some_episodes(VECTOR), small(), VECTOR)
+    assert len(list(minari.load_dataset("some/ours-v0"))) == 3
 
 
 @pytest.mark.parametrize(
