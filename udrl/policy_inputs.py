@@ -82,7 +82,14 @@ def _commands(
     desired_return: npt.ArrayLike, desired_horizon: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.float64], int | None]:
     """Return commands, float64 [n, 2], and n; for a single command [1, 2], and None."""
-    values = np.asarray(desired_return, np.float64), np.asarray(desired_horizon, np.float64)
+    try:
+        values = np.asarray(desired_return, np.float64), np.asarray(desired_horizon, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidData(
+            f"desired return {describe(desired_return)}, desired horizon "
+            f"{describe(desired_horizon)}: {error}; pass numbers, or one for each observation of a "
+            f"batch"
+        ) from error
     try:
         desired = np.stack(np.broadcast_arrays(*values), axis=-1)
     except ValueError:

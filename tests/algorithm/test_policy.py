@@ -115,6 +115,13 @@ def test_observation_that_is_impossible_in_training_is_rejected(
         policy_of(config, spec).predict(seen, 1.0, 1)
 
 
+@pytest.mark.parametrize("desired", ["much", [1.0, [2.0]], 1j, 10**400])
+def test_command_that_is_no_number_is_rejected(desired: Any) -> None:
+    for command in ((desired, 1), (1.0, desired)):
+        with pytest.raises(InvalidData, match=r"desired return .*; pass numbers, or one for each"):
+            policy().predict(SEEN, *command)
+
+
 @pytest.mark.parametrize("temperature", [-1.0, math.nan, math.inf])
 def test_temperature_is_a_finite_nonnegative_number(temperature: float) -> None:
     with pytest.raises(InvalidData, match="temperature"):
