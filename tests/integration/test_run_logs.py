@@ -18,7 +18,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import udrl
-from udrl.errors import ConfigError
+from udrl.errors import ConfigError, StoreError, UnsupportedEnvironment
 from udrl_inspect.inspection import read_status, settings_of
 from udrl_show.event_files import FOLDER
 from udrl_show.run_log import Logged, RunLog
@@ -308,6 +308,28 @@ def test_missing_extra_is_reported(
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match=rf'pip install "udrl\[{name}\]"'):
         WRITERS[name](tmp_path)
+
+
+def test_refused_run_keeps_the_event_files_of_the_directory(run_dir: Path, tmp_path: Path) -> None:
+    series = event_files(run_dir)
+    before = sorted((run_dir / FOLDER).iterdir())
+    with pytest.raises(StoreError, match="holds a run already"):
+        udrl.train("CartPole-v1", run_dir=run_dir, log="tensorboard")
+    assert sorted((run_dir / FOLDER).iterdir()) == before
+    assert_same(event_files(run_dir), series)
+    with pytest.raises(UnsupportedEnvironment):
+        udrl.train("NoSuch-v0", run_dir=tmp_path / "new", log="tensorboard")
+    assert not (tmp_path / "new").exists()
+
+
+def test_unwritable_event_files_do_not_end_the_training(
+    run_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (run_dir / FOLDER).write_text("in the way")
+    assert log(run_dir, "tensorboard") == [""]
+    (message,) = caplog.messages
+    assert "the log for tensorboard failed, and the run continues without it" in message
+    assert "make it a writable folder" in message
 
 
 def test_log_that_cannot_be_opened_is_rejected_before_the_run(

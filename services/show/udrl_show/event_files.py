@@ -22,7 +22,7 @@ class EventFiles:
         run_dir: the run's directory.
 
     Raises:
-        ConfigError: the extra is not installed, or the folder cannot be written.
+        ConfigError: the extra is not installed.
     """
 
     def __init__(self, run_dir: Path) -> None:
@@ -36,20 +36,29 @@ class EventFiles:
                 'event files need tensorboard; install it with: pip install "udrl[tensorboard]"'
             ) from error
         self._event, self._summary, self._hyperparameters = Event, Summary, hparams_pb
+        self._open = EventFileWriter
+        self._folder = run_dir / FOLDER
         self._began = 0.0
-        folder = run_dir / FOLDER
-        self.place = str(folder)
-        try:
-            for old in folder.glob("events.out.tfevents.*"):
-                old.unlink()
-            self._writer: Any = EventFileWriter(str(folder))
-        except OSError as error:
-            what_to_do = file_remedy(error, "make it a writable folder")
-            raise ConfigError(f"{folder}: {error.strerror}; {what_to_do}") from error
+        self._writer: Any = None
+        self.place = ""
 
     def begin(self, run_id: str, settings: dict[str, Any], began: float) -> Logged:
-        """Write the settings."""
+        """Replace older files, and write the settings.
+
+        Not earlier: until the run is served, its directory may belong to another process.
+
+        Raises:
+            ConfigError: the folder cannot be written.
+        """
         self._began = began
+        try:
+            for old in self._folder.glob("events.out.tfevents.*"):
+                old.unlink()
+            self._writer = self._open(str(self._folder))
+        except OSError as error:
+            what_to_do = file_remedy(error, "make it a writable folder")
+            raise ConfigError(f"{self._folder}: {error.strerror}; {what_to_do}") from error
+        self.place = str(self._folder)
         values = {
             name: value if isinstance(value, bool | int | float | str) else json.dumps(value)
             for name, value in settings.items()
@@ -72,4 +81,5 @@ class EventFiles:
 
     def close(self) -> None:
         """Close the file."""
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
