@@ -5,10 +5,11 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -38,10 +39,10 @@ from udrl_launch.settings import Fleet, Settings
 from udrl_launch.training_run import run_training
 from udrl_replay.progress import RunProgress
 from udrl_replay.store import Store
-from udrl_show import curve
+from udrl_show import curve, pictures
 from udrl_show.curve import compare
 from udrl_show.playing import with_seeds
-from whole_run import digests, reference, small, toy
+from whole_run import Cli, digests, reference, small, toy
 
 
 def call(*arguments: object) -> str:
@@ -194,6 +195,21 @@ def test_video_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> 
     assert (tmp_path / name).stat().st_size > 1000
 
 
+def test_interrupted_video_is_finished(
+    ended_run: Path, tmp_path: Path, cli: Callable[..., Cli]
+) -> None:
+    film = tmp_path / "film.mp4"
+    playing = cli("play", str(ended_run), "--episodes", "100000", "--video", str(film))
+    stdout = playing.process.stdout
+    assert stdout is not None
+    while not (line := stdout.readline()).startswith("seed"):
+        assert line, "play ended early"
+    os.killpg(playing.process.pid, signal.SIGINT)  # as Ctrl-C does, to ffmpeg too
+    code, _, err = playing.finish()
+    assert code == 130, err
+    assert imageio_ffmpeg.count_frames_and_secs(film)[0] > 1
+
+
 def test_wrong_extension_is_rejected_before_anything_is_loaded(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     for arguments, message in [
@@ -269,6 +285,24 @@ def test_several_runs_are_plotted_in_one_figure(ended_run: Path, tmp_path: Path)
         compare([ended_run], tmp_path / "picture.bmp")
     with pytest.raises(StoreError, match="give the directory of a run"):
         compare([tmp_path], tmp_path / "picture.png")
+
+
+def test_names_of_runs_are_drawn_as_they_are(
+    ended_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [r"cost$\5$", "_hidden"]  # not a formula, and not left out of the legend
+    runs = [shutil.copytree(ended_run, tmp_path / "runs" / name) for name in names]
+    figures: list[Any] = []
+    save = pictures.save
+
+    def save_and_keep(figure: Any, picture: Path) -> None:
+        save(figure, picture)
+        figures.append(figure)
+
+    monkeypatch.setattr(pictures, "save", save_and_keep)
+    call("plot", *runs, "--output", tmp_path / "both.svg")
+    drawn = [text.get_text() for text in figures[0].axes[0].get_legend().get_texts()]
+    assert drawn == [f"runs/{name}" for name in names]
 
 
 def test_old_final_evaluation_of_an_extended_run_keeps_its_wall_time(

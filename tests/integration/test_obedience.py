@@ -85,6 +85,14 @@ def test_output_is_one_document_and_reproducible(run_dir: Path) -> None:
     assert (run_dir / "obedience.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_report_is_stored_even_if_the_figure_fails(run_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    figure = tmp_path / "file" / "figure.png"
+    with pytest.raises(ConfigError, match="choose a writable file"):
+        call("obedience", run_dir, "--episodes", 2, "--points", 2, "--output", figure)
+    assert load_report(run_dir) is not None
+
+
 def test_custom_tolerance(obedient: Path) -> None:
     agent = load_agent(obedient)
     plan = plan_commands(agent, points=5, episodes=10, temperature=0.0)

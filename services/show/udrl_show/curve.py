@@ -234,11 +234,14 @@ def _add(lines: list[Line], curve: Curve) -> None:
 
 
 def _names(curves: Sequence[Curve]) -> list[str]:
-    """Return unique names of runs: as few of the last parts of their paths as possible."""
+    """Return unique names of runs: as few of the last parts of their paths as possible.
+
+    None begins with an underscore, because matplotlib leaves such names out of legends.
+    """
     parts = [curve.run_dir.resolve().parts for curve in curves]
     for n in range(1, max(map(len, parts))):
         names = [printable("/".join(p[-n:])) for p in parts]
-        if len(set(names)) == len(set(parts)):
+        if len(set(names)) == len(set(parts)) and not any(name[0] == "_" for name in names):
             return names
     return [printable(curve.run_dir) for curve in curves]
 

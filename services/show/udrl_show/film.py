@@ -145,6 +145,7 @@ class Film:
             return subprocess.Popen(  # noqa: S603 - the library's own program
                 [self._ffmpeg(), *arguments],
                 stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._ffmpeg_log,
+                process_group=0,  # Ctrl-C ends the episode, and the video of it is finished
             )  # fmt: skip
         except (OSError, RuntimeError) as error:
             self._path.unlink(missing_ok=True)

@@ -40,11 +40,15 @@ def empty(panels: int = 1) -> "tuple[Figure, list[Axes]]":
 
 
 def save(figure: "Figure", picture: Path) -> None:
-    """Write a figure atomically.
+    """Write a figure atomically. Dollar signs in its texts are not formulas, but parts of names.
 
     Raises:
         ConfigError: the file cannot be written.
     """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     try:
         picture.parent.mkdir(parents=True, exist_ok=True)
         with replacing(picture) as unfinished:

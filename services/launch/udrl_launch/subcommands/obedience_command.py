@@ -88,10 +88,10 @@ def obedience(
     else:
         for paragraph in obedience_text.table(report).splitlines():
             print_text(paragraph)
-    if output is not None:
-        draw_obedience(report, output)
     for problem in _write_files(run_dir, report, draws=output is None):
         click.echo(problem, err=True)
+    if output is not None:
+        draw_obedience(report, output)
     return 0
 
 
