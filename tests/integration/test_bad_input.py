@@ -1,11 +1,14 @@
 """Bad input is rejected within five seconds, with the value, what was expected, and the remedy."""
 
+import logging
 import socket
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from udrl_launch.cli import run
 from whole_run import TOY, Cli, arguments, free_port, live_status, wait_for
 
 #: Importing torch takes a second or two on a busy machine, before anything can be checked.
@@ -44,7 +47,6 @@ def refusal(process: Cli) -> tuple[int, str]:
         (["train", "--seed", "x", "CartPole-v1"], "--seed"),
         (["replay", "CartPole-v1"], "--listen ENDPOINT or --connect ENDPOINT"),
         (["replay", "CartPole-v1", "--listen", "tcp/0.0.0.0:7447"], "--insecure"),
-        (["actor", "--connect", "7447"], "tcp/HOST:PORT"),
         (["status", "nowhere"], "nowhere holds no run"),
         (["evaluate", "nowhere"], "nowhere holds no run"),
         (["evaluate", "nowhere", "--weights", "new"], "latest, best or a version number"),
@@ -52,12 +54,27 @@ def refusal(process: Cli) -> tuple[int, str]:
     ],
 )
 def test_bad_argument_is_rejected_with_the_remedy(
-    given: list[str], expected: str, cli: Callable[..., Cli]
+    given: list[str],
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    code, error = refusal(cli(*given))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(logging.getLogger("udrl"), "handlers", [])
+    began = time.monotonic()
+    code = run(given)
+    assert time.monotonic() - began < PROMPT_S
     assert code == 2 or "nowhere" in given
     assert code != 0
-    assert expected in error
+    assert expected in capsys.readouterr().err
+
+
+def test_bad_endpoint_is_rejected_with_the_remedy(cli: Callable[..., Cli]) -> None:
+    """In its own process, because an actor changes its priority before."""
+    code, error = refusal(cli("actor", "--connect", "7447"))
+    assert code == 2
+    assert "tcp/HOST:PORT" in error
 
 
 @pytest.fixture

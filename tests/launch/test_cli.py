@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from udrl.errors import ConfigError, StoreError
-from udrl_launch.cli import cli
+from udrl_launch.cli import cli, run
 from udrl_launch.output import escape_unprintable
 from udrl_launch.subcommands.runs_commands import _narrow
 from udrl_launch.subcommands.train_command import _options_to_repeat, train
@@ -49,9 +49,11 @@ def udrl(*arguments: str) -> subprocess.CompletedProcess[str]:
         ),
     ],
 )
-def test_error_is_one_line_with_the_remedy(arguments: list[str], message: str) -> None:
-    ended = udrl(*arguments)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", f"udrl: error: {message}\n")
+def test_error_is_one_line_with_the_remedy(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    assert capsys.readouterr() == ("", f"udrl: error: {message}\n")
 
 
 @pytest.mark.parametrize(
@@ -86,10 +88,13 @@ def test_error_of_a_service_has_the_same_form(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["keys"]])
-def test_group_without_a_subcommand_shows_its_help(arguments: list[str]) -> None:
-    ended = udrl(*arguments)
-    assert ended.stderr.startswith("Usage: ")
-    assert "Commands:" in ended.stderr
+def test_group_without_a_subcommand_shows_its_help(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("Usage: ")
+    assert "Commands:" in error
 
 
 def in_a_terminal(columns: int, *arguments: str) -> str:

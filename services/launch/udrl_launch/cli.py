@@ -5,7 +5,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -49,7 +49,7 @@ _GROUP = "udrl.commands"
 
 
 def main() -> NoReturn:
-    """Run the command line. Errors are shown without a traceback."""
+    """Run the command line of this process, and exit."""
     # Before NumPy is imported: its threads wait for each other by spinning, on cores that other
     # processes of the run need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -59,27 +59,32 @@ def main() -> NoReturn:
         faulthandler.enable()  # a crash in native code leaves the traceback of every thread
     if "--json" in sys.argv and not {"--help", "-h"} & set(sys.argv):
         output.keep_for_json()
+    code = run(sys.argv[1:])
+    # Not sys.exit: Zenoh's threads may still be in a callback, and if the interpreter shuts down
+    # under them, the process occasionally aborts after all its work is done. No command relies on
+    # exit handlers.
+    output.flush()
+    os._exit(code)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run a command, and return its exit code. Errors are shown without a traceback."""
     try:
-        code = cli(prog_name="udrl", standalone_mode=False)
+        return cli(args=list(arguments), prog_name="udrl", standalone_mode=False) or 0
     except BrokenPipeError:  # e.g. `| head`
-        code = 0
+        return 0
     except UdrlError as error:
         output.print_error(error)
-        code = error.exit_code
+        return error.exit_code
     except click.ClickException as error:
         message = error.format_message()
         if message.startswith("Usage: "):  # the help of a group without a command
             click.echo(message, err=True)
         else:
             output.print_error(_one_line(error))
-        code = error.exit_code
+        return error.exit_code
     except click.Abort:
-        code = 130
-    # Not sys.exit: Zenoh's threads may still be in a callback, and if the interpreter shuts down
-    # under them, the process occasionally aborts after all its work is done. No command relies on
-    # exit handlers.
-    output.flush()
-    os._exit(code or 0)
+        return 130
 
 
 def _one_line(error: click.ClickException) -> str:
