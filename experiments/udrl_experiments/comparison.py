@@ -71,7 +71,7 @@ def report_curves(jobs: Sequence[Job], task: Task, title: str, folders: StudyFol
     write(folders.folder / "evaluations.csv", EvaluationRecord, rows)
     write(folders.folder / "curves.csv", CurvePoint, points)
     write(folders.folder / "reached.csv", Reached, reached(rows, task.thresholds))
-    draw_curves(folders.folder, title, task.landmarks)
+    draw_curves(folders.folder, title, task)
     last = {(point.algorithm, point.variant): point for point in points}
     return "\n".join(
         f"{title}: {agent_name(*agent)}: mean return {end.mean:.1f} after {end.env_steps:,} "
@@ -93,18 +93,19 @@ def report_wall_time(jobs: Sequence[Job], task: Task, title: str, folders: Study
     rows = [row for run in runs if run.machine == machine for row in run.evaluations]
     points = curves(rows, jobs[0].config.evaluation.eval_every)
     write(folders.folder / "curves-wall-time.csv", CurvePoint, points)
-    draw_curves(folders.folder, f"{title}\nruns on: {machine}", task.landmarks, "wall_s")
+    draw_curves(folders.folder, f"{title}\nruns on: {machine}", task, "wall_s")
 
 
 def draw_curves(
     folder: Path,
     title: str,
-    landmarks: Mapping[str, float],
+    task: Task,
     x: Literal["env_steps", "wall_s"] = "env_steps",
 ) -> None:
     """Draw the curves from their table."""
     table, picture = _FILES[x]
     points = read(folder / f"{table}.csv", CurvePoint)
-    figures.save(
-        figures.learning_curves(points, title, x=x, references=landmarks), folder / picture
+    figure = figures.learning_curves(
+        points, title, x=x, references=task.landmarks, lowest=task.lowest
     )
+    figures.save(figure, folder / picture)

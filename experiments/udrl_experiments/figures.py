@@ -34,6 +34,7 @@ def learning_curves(
     *,
     x: Literal["env_steps", "wall_s"] = "env_steps",
     references: Mapping[str, float] | None = None,
+    lowest: float = -math.inf,
 ) -> "Figure":
     """Draw mean returns with 95 % bootstrap intervals (Figures 4 and 5), one line per agent.
 
@@ -44,6 +45,7 @@ def learning_curves(
         title: title of the figure.
         x: quantity on the x axis.
         references: returns of horizontal lines, by label.
+        lowest: return below which nothing is shown; the axis then says so.
 
     Raises:
         ConfigError: there are no points, or matplotlib is not installed.
@@ -74,6 +76,9 @@ def learning_curves(
         # Ten markers per line, shifted so that they do not hide each other.
         step = max(1, len(line) // 10)
         axes.plot(at, mean, label=label, markevery=(step * rank // len(lines), step), **style)
+    if axes.get_ylim()[0] < lowest:
+        axes.set_ylim(bottom=lowest)
+        axes.set_ylabel(f"mean return (lower than {lowest:g}: not shown)")
     ends = [getattr(line[-1], x) for line in lines.values()]
     if max(ends) > _MUCH_LONGER * min(ends):
         axes.set_xscale("log")

@@ -34,6 +34,7 @@ class Task:
         small_baseline_steps: env steps of a run of another algorithm at the small scale.
         desired_returns: desired returns of trained agents in the study of section 3.5.
         landmarks: returns that the paper names, by label.
+        lowest: lowest return in figures; well below that of random actions.
         thresholds: mean returns whose first evaluation is reported (``reached.csv``).
         module: module that the environment needs.
     """
@@ -44,6 +45,7 @@ class Task:
     small_baseline_steps: int
     desired_returns: tuple[float, ...]
     landmarks: dict[str, float]
+    lowest: float
     thresholds: tuple[float, ...]
     module: str
 
@@ -54,15 +56,16 @@ _SMALL = 3_000_000, 1_000_000
 TASKS = {
     "lander": Task(
         "LunarLander-v3", "LunarLander", *_SMALL, tuple(range(-150, 301, 25)), _LANDING,
-        (100.0, 150.0, 200.0), "Box2D",
+        -500.0, (100.0, 150.0, 200.0), "Box2D",
     ),
     "sparse": Task(
         "LunarLanderSparse-v3", "LunarLanderSparse", *_SMALL, tuple(range(-150, 301, 25)),
-        _LANDING, (100.0, 150.0, 200.0), "Box2D",
+        _LANDING, -500.0, (100.0, 150.0, 200.0), "Box2D",
     ),
     "takecover": Task(
         "TakeCover-v0", "TakeCover", 300_000, 100_000,
-        tuple(range(100, 2101, 200)), {"solved": 750.0}, (300.0, 500.0, 750.0), "vizdoom",
+        tuple(range(100, 2101, 200)), {"solved": 750.0}, 0.0, (300.0, 500.0, 750.0),
+        "vizdoom",
     ),
 }  # fmt: skip
 

@@ -127,6 +127,15 @@ def test_references_are_labelled_lines() -> None:
     assert list(labelled(figure)) == ["UDRL (20 seeds)"]
 
 
+@pytest.mark.parametrize(("lowest", "is_cut"), [(-300.0, True), (-1000.0, False)])
+def test_very_low_returns_do_not_flatten_the_others(lowest: float, is_cut: bool) -> None:
+    bad = [msgspec.structs.replace(p, mean=-500.0, low=-600.0, high=-400.0) for p in curve("DQN")]
+    (axes,) = learning_curves([*curve(), *bad], "LunarLanderSparse", lowest=lowest).axes
+    assert (axes.get_ylim()[0] == lowest) == is_cut
+    assert (axes.get_ylabel() == "mean return (lower than -300: not shown)") == is_cut
+    assert axes.get_ylim()[1] > 40
+
+
 def test_algorithms_have_fixed_styles() -> None:
     def style(line: Line2D) -> tuple[str, object, object]:
         return to_hex(line.get_color()), line.get_linestyle(), line.get_marker()
