@@ -470,9 +470,13 @@ def test_number_of_stages_is_limited(client: TestClient, monkeypatch: pytest.Mon
         next(moments(first))
         with client.websocket_connect("/stage") as second:
             assert "try again later" in second.receive_json()["problem"]
-    with client.websocket_connect("/stage") as third:
-        third.send_json(start(paused=True))
-        assert next(moments(third))["step"] == 0
+
+    def is_accepted() -> bool:
+        with client.websocket_connect("/stage") as third:
+            third.send_json(start(paused=True))
+            return next(moments(third)).get("step") == 0
+
+    wait_for(is_accepted, "the first stage to end")  # its thread closes the environment
 
 
 def test_stage_counts_while_it_creates_an_environment_for_a_viewer_that_left(
