@@ -11,9 +11,10 @@ import msgspec
 
 from udrl.atomic_files import write_atomically
 from udrl.config import Config, change, flat
+from udrl.errors import InvalidData
 from udrl_experiments.jobs import Job
 from udrl_experiments.protocol import Algorithm
-from udrl_experiments.runs import finished_run, is_finished
+from udrl_experiments.runs import finished_run
 from udrl_experiments.statistics import score
 from udrl_replay.creation import as_toml
 
@@ -122,9 +123,12 @@ class Contest(NamedTuple):
 
 def _score(runs: Sequence[Job], root: Path) -> float | None:
     """Return the mean score of a configuration's runs; None if there are none, or one failed."""
-    if not runs or not all(is_finished(run, root) for run in runs):
+    try:
+        finished = [finished_run(run, root) for run in runs]
+    except InvalidData:
         return None
-    return fmean(score([row.mean for row in finished_run(run, root).evaluations]) for run in runs)
+    scores = [score([row.mean for row in run.evaluations]) for run in finished]
+    return fmean(scores) if scores else None
 
 
 def file_name(environment: str) -> str:

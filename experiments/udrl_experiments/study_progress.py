@@ -1,14 +1,15 @@
 """Progress of studies and their runs (``udrl study show``)."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from udrl.errors import ConfigError, UdrlError
+from udrl.errors import ConfigError, InvalidData, UdrlError
 from udrl.evaluation import return_text
 from udrl_experiments.jobs import Job, merge_jobs
 from udrl_experiments.records import EvaluationRecord, agent_name
-from udrl_experiments.runs import finished_run, is_finished
+from udrl_experiments.runs import finished_run
 from udrl_experiments.study import read_study
 from udrl_inspect.csv_tables import read
 from udrl_inspect.inspection import read_status
@@ -43,7 +44,7 @@ def job_progress(job: Job, root: Path) -> JobProgress:
         root: folder of the folder ``runs``.
     """
     folder = job.folder(root)
-    if is_finished(job, root):
+    with suppress(InvalidData):  # not finished
         last = finished_run(job, root).evaluations[-1]
         steps = min(last.env_steps, job.max_env_steps)
         return JobProgress(job, "done", steps, last.wall_s, last.mean)

@@ -65,10 +65,10 @@ class RunState:
 
     def limit_reached(self) -> Limit | None:
         """Return which limit of the budget is reached; None: neither."""
-        wanted, last = self.budget.stop_return, self.store.last_evaluation(is_final=False)
+        wanted = self.budget.stop_return
         if (
             wanted is not None
-            and last is not None
+            and (last := self.store.last_evaluation(is_final=False)) is not None
             and last.iteration == self.progress.iteration
             and last.evaluation.mean >= wanted
         ):
