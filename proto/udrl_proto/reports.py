@@ -84,7 +84,7 @@ class EvaluationStatus(Message, frozen=True, kw_only=True):
 
 
 class AuditStatus(Message, frozen=True, kw_only=True):
-    """Episodes that are re-run by a second actor and compared."""
+    """Episodes that are rerun by a second actor and compared."""
 
     rate: float
     agreed: Number

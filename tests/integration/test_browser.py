@@ -161,7 +161,7 @@ def test_live_run_appears_and_its_curve_grows(
         heads = one.locator("#actor-table th").all_text_contents()
         cells = one.locator("#actor-table tbody td").all_text_contents()
         shown = dict(zip(heads, cells, strict=True))
-        assert (shown["re-runs"], shown["failures"], shown["environments"]) == ("0", "0", "16")
+        assert (shown["reruns"], shown["failures"], shown["environments"]) == ("0", "0", "16")
     for _ in range(3):
         points = page.locator("#curve").get_attribute("data-points")
         grown = page.locator(f'#curve[data-points]:not([data-points="{points}"])')
