@@ -43,9 +43,9 @@ TASKS = {
         "Blackjack-v1", 60_000, {"eval_episodes": 5_000, "max_episode_steps": 20}
     ),
     "CliffWalking": DefaultsTask("CliffWalking-v1", 60_000, {"max_episode_steps": 200}),
-    "Taxi": DefaultsTask("Taxi-v4", 600_000, {}),
+    "Taxi": DefaultsTask("Taxi-v4", 200_000, {}),
     "CartPole": DefaultsTask("CartPole-v1", 100_000, {}),
-    "Acrobot": DefaultsTask("Acrobot-v1", 250_000, {}),
+    "Acrobot": DefaultsTask("Acrobot-v1", 100_000, {}),
     "MountainCar": DefaultsTask("MountainCar-v0", 150_000, {}),
     "LunarLander": DefaultsTask("LunarLander-v3", 200_000, {}),
     "LunarLanderSparse": DefaultsTask("LunarLanderSparse-v3", 200_000, {}),
