@@ -1,4 +1,5 @@
 import importlib
+import signal
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,9 @@ if find_spec("Box2D") is not None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("Box2D")
+
+# Shells ignore SIGINT in background jobs, whose children would ignore it too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run, and no deadline, because machines are sometimes slow.
 hypothesis.settings.register_profile("udrl", derandomize=True, deadline=None)

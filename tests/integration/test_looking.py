@@ -195,8 +195,13 @@ def test_video_may_have_any_name(ended_run: Path, tmp_path: Path, name: str) -> 
     assert (tmp_path / name).stat().st_size > 1000
 
 
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_video_is_finished(
-    ended_run: Path, tmp_path: Path, cli: Callable[..., Cli]
+    number: signal.Signals,
+    expected: int,
+    ended_run: Path,
+    tmp_path: Path,
+    cli: Callable[..., Cli],
 ) -> None:
     film = tmp_path / "film.mp4"
     playing = cli("play", str(ended_run), "--episodes", "100000", "--video", str(film))
@@ -204,9 +209,9 @@ def test_interrupted_video_is_finished(
     assert stdout is not None
     while not (line := stdout.readline()).startswith("seed"):
         assert line, "play ended early"
-    os.killpg(playing.process.pid, signal.SIGINT)  # as Ctrl-C does, to ffmpeg too
+    os.killpg(playing.process.pid, number)  # as Ctrl-C does, to ffmpeg too
     code, _, err = playing.finish()
-    assert code == 130, err
+    assert code == expected, err
     assert imageio_ffmpeg.count_frames_and_secs(film)[0] > 1
 
 

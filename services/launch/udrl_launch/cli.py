@@ -17,6 +17,7 @@ from udrl.errors import UdrlError
 from udrl.version import __version__
 from udrl_launch import output
 from udrl_launch.paths import extend_module_path
+from udrl_launch.signals import Terminated
 
 #: The commands of this package and the modules that hold them, in the order of the help.
 _COMMANDS = {
@@ -83,8 +84,8 @@ def run(arguments: Sequence[str]) -> int:
         else:
             output.print_error(_one_line(error))
         return error.exit_code
-    except click.Abort:
-        return 130
+    except click.Abort as abort:
+        return 143 if isinstance(abort.__cause__, Terminated) else 130
 
 
 def _one_line(error: click.ClickException) -> str:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM for a service in the main thread, which native code may block."""
+"""SIGINT and SIGTERM for services and commands, whose main thread may be in native code."""
 
 import contextlib
 import logging
@@ -7,7 +7,8 @@ import signal
 import socket
 import sys
 import threading
-from typing import Self
+from collections.abc import Iterator
+from typing import NoReturn, Self
 
 log = logging.getLogger("udrl")
 
@@ -92,6 +93,28 @@ class Signals:
             signal.set_wakeup_fd(-1)
             active._restore()
             active._close()
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ends a command as SIGINT does, but with its own exit code."""
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Raise :class:`Terminated` when SIGTERM arrives.
+
+    Without a handler, pygame takes SIGTERM for the event that a window is closed, also if there is
+    no window, and the process does not end.
+    """
+    previous = signal.signal(signal.SIGTERM, _raise_terminated)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _raise_terminated(number: int, frame: object) -> NoReturn:
+    raise Terminated
 
 
 os.register_at_fork(after_in_child=Signals.reset_in_child)

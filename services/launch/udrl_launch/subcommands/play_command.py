@@ -11,6 +11,7 @@ from udrl_inspect.agents import Agent, evaluation_commands, load_agent
 from udrl_inspect.greedy import caution
 from udrl_launch.output import print_json, print_text
 from udrl_launch.paths import shown
+from udrl_launch.signals import terminable
 from udrl_launch.subcommands.options import (
     DESIRED_HORIZON,
     DESIRED_RETURN,
@@ -87,12 +88,13 @@ def play(
         )
     screen = Window if opens_window else None
     obtained: list[float] = []
-    for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
-        obtained.append(rollout.episode_return)
-        if as_json:
-            print_json(_record(agent, rollout))
-        else:
-            click.echo(_line(rollout))
+    with terminable():
+        for rollout in play_episodes(agent, commands, video=video, open_screen=screen):
+            obtained.append(rollout.episode_return)
+            if as_json:
+                print_json(_record(agent, rollout))
+            else:
+                click.echo(_line(rollout))
     if warning := caution(agent, run_dir, command, obtained):
         click.echo(warning, err=True)
     if video is not None and not as_json:
