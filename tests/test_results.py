@@ -1,11 +1,13 @@
 """Figures and tables of the results pages are generated from the CSV files beside them."""
 
 import re
+from collections import defaultdict
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 
-from tests.markdown import ROOT, text_of
+from tests.markdown import ROOT, section, tables, text_of
 from udrl_experiments.records import EvaluationRecord, Obtained, agent_name
 from udrl_experiments.runs import is_finished, read_job
 from udrl_experiments.statistics import CurvePoint, Reached, curves, reached
@@ -31,14 +33,58 @@ def test_tables_match_the_evaluations(folder: Path) -> None:
     points = read(folder / "curves.csv", CurvePoint)
     assert points == curves(rows, EVERY)
     found = read(folder / "reached.csv", Reached)
+    assert found
     assert found == reached(rows, sorted({row.threshold for row in found}))
 
 
 def test_kept_runs_are_recognised() -> None:
+    assert RUNS
     for folder in RUNS:
         job = read_job(folder)
         assert folder == job.folder(RESULTS)
         assert is_finished(job, RESULTS)
+
+
+def evaluations_at(study: str) -> dict[int, dict[str, float]]:
+    """Return mean returns by the env steps at which they were due, and by seed."""
+    found: dict[int, dict[str, float]] = defaultdict(dict)
+    rows = read(RESULTS / study / "evaluations.csv", EvaluationRecord)
+    for row in sorted(rows, key=lambda row: row.env_steps):
+        found[row.env_steps // EVERY * EVERY].setdefault(str(row.seed), row.mean)
+    return found
+
+
+@pytest.mark.parametrize(("number", "study"), [(0, "lander"), (1, "sparse")])
+def test_table_of_seeds_has_the_evaluations(number: int, study: str) -> None:
+    of_seeds = [t for t in tables(section("docs/results.md", "## Landers")) if t[0][0] == "seed"]
+    header, *rows = of_seeds[number]
+    found = evaluations_at(study)
+    assert {row[0] for row in rows} == {*found[100_000], "mean"}
+    for seed, *cells in rows:
+        for head, cell in zip(header[1:], cells, strict=True):
+            millions = re.search(r"([\d.]+)M", head)
+            assert millions is not None
+            at = found[round(float(millions[1]) * 1e6)]
+            expected = fmean(at.values()) if seed == "mean" else at[seed]
+            assert float(cell.strip("*")) == round(expected), (seed, head)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+@pytest.mark.parametrize(
+    ("environment", "study"), [("LunarLander", "lander"), ("LunarLanderSparse", "sparse")]
+)
+def test_summary_has_the_evaluations(page: str, environment: str, study: str) -> None:
+    (row,) = re.findall(
+        rf"^\| (?:\[{environment}\]\(#landers\), UDRL|{environment}) \|.* after 1M.*$",
+        text_of(page),
+        flags=re.MULTILINE,
+    )
+    said = re.search(r"(\d+) after 1M(?: env steps)?\*{0,2} \((\d+) to (\d+), (\w+) seeds\)", row)
+    assert said is not None
+    mean, low, high, seeds = said.groups()
+    at = evaluations_at(study)[1_000_000].values()
+    assert [int(mean), int(low), int(high)] == [round(v) for v in (fmean(at), min(at), max(at))]
+    assert {"seven": 7, "nine": 9}[seeds] == len(at)
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=name)
@@ -57,6 +103,11 @@ def test_sensitivity_has_100_episodes_per_point(table: Path) -> None:
     assert len(rows) == len(seeds) * len({row.desired_return for row in rows})
     picture = table.with_suffix(".svg").read_text(encoding="utf-8")
     assert all(f"seed {seed}" in picture for seed in seeds)
+
+
+def test_studies_are_kept() -> None:
+    assert STUDIES
+    assert list(RESULTS.glob("sensitivity*/*.csv"))
 
 
 def test_every_figure_is_shown_and_every_shown_file_exists() -> None:
