@@ -59,10 +59,15 @@ def test_request_may_be_answered_from_another_thread(ends: Ends) -> None:
 def test_undeclared_key_and_dropped_query_get_no_reply(ends: Ends) -> None:
     service, client = ends
     assert ask(client) == []
-    declared = service.declare_queryable(KEY, lambda query: query.drop())
+    dropping = service.declare_queryable(KEY, lambda query: query.drop())
     assert ask(client) == []
+    dropping.undeclare()
+    declared = service.declare_queryable(
+        KEY, lambda query: query.reply(EncodedReply(b"!", is_problem=False))
+    )
+    wait_for(lambda: ask(client) == [EncodedReply(b"!", is_problem=False)], "the reply")
     declared.undeclare()
-    assert ask(client) == []
+    wait_for(lambda: ask(client) == [], "the end of the replies", WAIT_S)
 
 
 def test_unanswered_request_times_out(ends: Ends) -> None:
@@ -85,6 +90,16 @@ def test_publication_reaches_subscribers_until_they_undeclare(ends: Ends) -> Non
     wait_for(is_heard, "the publication")
     assert heard.get() == b"news"
     subscription.undeclare()
+    later: queue.Queue[bytes] = queue.Queue()
+    again = client.subscribe(KEY, later.put)
+
+    def is_heard_again() -> bool:
+        service.publish(KEY, b"more")
+        return b"more" in later.queue
+
+    wait_for(is_heard_again, "the publication")
+    again.undeclare()
+    assert b"more" not in heard.queue
 
 
 def test_presence_changes_are_reported(ends: Ends) -> None:
@@ -100,4 +115,10 @@ def test_presence_changes_are_reported(ends: Ends) -> None:
     early.undeclare()
     assert seen.get(timeout=WAIT_S) == Presence(f"{ALIVE}/early", here=False)
     watching.undeclare()
+    rest: queue.Queue[Presence] = queue.Queue()
+    other = service.watch("udrl/5/run/alive/*/*", rest.put)
     late.undeclare()
+    assert rest.get(timeout=WAIT_S) == Presence(f"{ALIVE}/late", here=True)
+    assert rest.get(timeout=WAIT_S) == Presence(f"{ALIVE}/late", here=False)
+    other.undeclare()
+    assert seen.empty()
